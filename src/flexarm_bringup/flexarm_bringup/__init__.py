@@ -1,0 +1,1 @@
+"""Case study, reports and command line of flexarm."""

@@ -1,0 +1,1 @@
+"""Laws, observers and trajectories for arms with flexible links; ROS only in `nodes`."""

@@ -1,0 +1,228 @@
+"""Controller of an arm: reference, composite control, limits, and what happens when a state is bad."""
+
+from enum import IntEnum
+
+import numpy as np
+from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.parameters import Parameter
+
+from .arm_observer import check_finite
+from .samples import SampleOrder
+from .trajectory import ReferenceGenerator, Verdict
+
+#: Parameters of the controller that belong to no single law.
+PARAMETERS = (
+    Parameter(
+        "torque_limit",
+        "float_array",
+        [0.0],
+        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's.",
+        unit="N m",
+        low=0.0,
+        high=1e6,
+        length="joints",
+    ),
+    Parameter(
+        "torque_rate_limit",
+        "float_array",
+        [0.0],
+        "Largest change of torque per second, against the last torque sent; 0.0: none.",
+        unit="N m/s",
+        low=0.0,
+        high=1e9,
+        length="joints",
+    ),
+)
+
+START_TOLERANCE = Parameter(
+    "start_tolerance",
+    "float",
+    0.01,
+    "How far a first point at time 0 may lie from the reference; farther is refused.",
+    unit="rad",
+    low=0.0,
+    high=10.0,
+    read_only=True,
+)
+
+
+class Supervisor(IntEnum):
+    """States as in CompositeState."""
+
+    INACTIVE = 0
+    READY = 1
+    TRACKING = 2
+    HOLDING = 3
+    STOPPING = 4
+    FAULT = 5
+
+
+class ArmController:
+    """One composite controller: samples in, torques out, without ROS.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm as the controller knows it.
+    law : CompositeControl
+        May be replaced whole between two samples.
+    settings : mapping
+        Checked values of `PARAMETERS`.
+    start_tolerance : float
+        [rad], see `START_TOLERANCE`.
+
+    Attributes
+    ----------
+    torque : ndarray, shape (n,)
+        What to send [N m]; zero when not `enabled`.
+    enabled : bool
+        Whether the torque may be applied, or each joint's safe action is to be taken.
+    state : Supervisor
+    saturated : bool
+        A limit was met at this sample.
+    """
+
+    def __init__(self, model, law, settings, start_tolerance=0.01):
+        n = model.n_joints
+        self.model, self.law = model, law
+        self.reference = ReferenceGenerator(model.joint_names, start_tolerance)
+        self.torque = np.zeros(n)
+        self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
+        self.enabled, self.saturated = False, False
+        self.state = Supervisor.INACTIVE
+        self._state_reason, self._trajectory_reason = "", ""
+        self._order = SampleOrder()
+        self._last_ns = 0
+        self.configure(settings)
+
+    def configure(self, settings):
+        """Take new limits; call between two samples."""
+        from_file = np.array([j.limits.torque for j in self.model.arm.joints])
+        wanted = np.array(settings["torque_limit"])
+        limit = np.where(wanted > 0.0, np.minimum(wanted, from_file), from_file)
+        rate = np.array(settings["torque_rate_limit"])
+        rate = np.where(rate > 0.0, rate, np.inf)
+        self._limit, self._rate_limit = limit, rate
+        self._rate_limited = bool(np.isfinite(rate).any())
+
+    @property
+    def torque_limit(self):
+        """Limit in force, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
+        return self._limit
+
+    @property
+    def trajectory_id(self):
+        """Number of the last accepted trajectory; 0: none yet."""
+        return self.reference.accepted_id
+
+    @property
+    def reason(self):
+        """Why the last state or the last trajectory was refused; empty if neither was."""
+        return self._state_reason or self._trajectory_reason
+
+    def refuse(self, reason):
+        """Note a trajectory that was refused before it could be offered."""
+        self._trajectory_reason = reason
+
+    def offer(self, trajectory):
+        """Offer a trajectory.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+
+        Returns
+        -------
+        Verdict
+            Refusals are kept in `reason`; repeats are none.
+        """
+        if self.state in (Supervisor.INACTIVE, Supervisor.FAULT):
+            verdict = Verdict(False, f"no valid state: {self._state_reason or 'none yet'}", 0)
+        else:
+            verdict = self.reference.offer(trajectory)
+        if verdict.accepted:
+            self._trajectory_reason = ""
+        elif not verdict.repeat:
+            self._trajectory_reason = verdict.reason
+        return verdict
+
+    def step(self, sample):
+        """Answer one estimated state; the control path.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            With amplitude and rate.
+
+        Returns
+        -------
+        bool
+            `enabled`. Every sample is answered; a repeated (session, sequence) from what was answered before.
+        """
+        try:
+            fresh = self._accept(sample)
+        except MessageError as error:
+            self.disable(str(error))
+            return False
+        if not fresh:
+            return self.enabled
+        reference = self.reference
+        reference.sample(sample.stamp_ns)
+        q, qd = sample.position, sample.velocity
+        np.subtract(reference.position, q, out=self.position_error)
+        np.subtract(reference.velocity, qd, out=self.velocity_error)
+        u = self.law.step(q, qd, sample.amplitude, sample.rate, reference)
+        if not np.isfinite(u).all():
+            i = int(np.argmin(np.isfinite(u)))
+            self.disable(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
+            return False
+        self._limited(u, 1e-9 * (sample.stamp_ns - self._last_ns))
+        self._last_ns = sample.stamp_ns
+        self.enabled = True
+        if reference.active:
+            self.state = Supervisor.TRACKING
+        elif self.state != Supervisor.READY or reference.finished:
+            self.state = Supervisor.HOLDING
+        return True
+
+    def disable(self, reason, state=Supervisor.INACTIVE):
+        """Send no torque until a valid state comes; the present trajectory is given up.
+
+        The next valid state is where the arm is held.
+        """
+        self.enabled, self.state, self._state_reason = False, state, reason
+        self.torque[:] = 0.0
+        self.saturated = False
+
+    def _accept(self, sample):
+        """Whether the sample is a new one; raises for one that can't be used."""
+        check_finite(sample.position, self.model.joint_names, "joint_position")
+        check_finite(sample.velocity, self.model.joint_names, "joint_velocity")
+        if sample.amplitude is None or sample.rate is None:
+            what = "modal_amplitude" if sample.amplitude is None else "modal_rate"
+            raise MessageError(f"{what} is not known yet")
+        check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
+        check_finite(sample.rate, self.model.mode_names, "modal_rate")
+        verdict = self._order.judge(sample)
+        if verdict == SampleOrder.REPEAT and self.state != Supervisor.INACTIVE:
+            return False
+        if verdict == SampleOrder.STALE:
+            raise MessageError(
+                f"state {sample.sequence} is not newer than {self._order.sequence}: the stream went back"
+            )
+        if verdict == SampleOrder.RESTART or self.state == Supervisor.INACTIVE:
+            self.reference.start(sample.position, sample.stamp_ns)
+            self.state = Supervisor.READY
+            self.torque[:] = 0.0
+            self._last_ns = sample.stamp_ns
+        self._state_reason = ""
+        return True
+
+    def _limited(self, u, dt):
+        """Torque within its size and rate, into `torque`."""
+        previous = self.torque.copy() if self._rate_limited else None
+        np.clip(u, -self._limit, self._limit, out=self.torque)
+        if self._rate_limited:
+            step = self._rate_limit * dt
+            np.clip(self.torque, previous - step, previous + step, out=self.torque)
+        self.saturated = bool((self.torque != u).any())

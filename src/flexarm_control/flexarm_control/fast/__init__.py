@@ -1,0 +1,1 @@
+"""Fast control laws: what damps the bending around its quasi-steady state. One law per file."""

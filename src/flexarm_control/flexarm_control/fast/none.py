@@ -1,0 +1,22 @@
+"""No fast control: the slow control alone."""
+
+import numpy as np
+
+from .base import FastLaw
+
+
+class NoFastLaw(FastLaw):
+    """u_fast = 0."""
+
+    needs_deflections = False
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self._zero = np.zeros(model.n_joints)
+
+    def torque(self, z_f):
+        return self._zero
+
+    @property
+    def K_f(self):
+        return np.zeros((self.model.n_joints, 2 * self.model.n_modes))

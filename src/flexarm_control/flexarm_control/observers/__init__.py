@@ -1,0 +1,1 @@
+"""Observers: what reconstructs the rates of the deflections. One observer per file."""

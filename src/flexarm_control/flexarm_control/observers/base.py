@@ -1,0 +1,59 @@
+"""What an observer is."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+
+class Observer(ABC):
+    """Reconstructs modal rates (and may smooth amplitudes) from samples of modal amplitudes.
+
+    Registered by name in the entry-point group ``flexarm.observers``. Design work is done in the
+    constructor; `update` runs on the control path.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm as the observer believes it to be.
+    parameters : dict
+        Checked values of `PARAMETERS`, arrays at full length.
+
+    Attributes
+    ----------
+    amplitude, rate : ndarray, shape (m,)
+        The estimate.
+    innovation : ndarray, shape (m,) or (0,)
+        Measured minus predicted amplitude, where the observer predicts one.
+    covariance_diagonal : ndarray, shape (2m,) or (0,)
+        Where the observer has one.
+    converged : bool
+        Whether the estimate may be used for control.
+    """
+
+    #: Declared parameters, named ``observer.<name>`` in the observer node.
+    PARAMETERS = ()
+
+    def __init__(self, model, parameters):
+        self.model = model
+        self.parameters = dict(parameters)
+        m = model.n_modes
+        self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        self.innovation = np.zeros(0)
+        self.covariance_diagonal = np.zeros(0)
+        self.converged = False
+
+    def reset(self):
+        """Forget the past; the next sample is the first."""
+        self.converged = False
+
+    @abstractmethod
+    def update(self, sample, dt):
+        """Take one sample.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            Finite amplitudes, joint positions and velocities; torque may be NaN, rate may be None.
+        dt : float
+            True time since the last sample [s]; 0.0 for the first one.
+        """

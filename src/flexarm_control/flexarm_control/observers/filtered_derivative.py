@@ -1,0 +1,61 @@
+r"""The paper's reconstructing filter: a derivative behind a first-order low-pass.
+
+.. math:: \hat{\dot\delta}(s) = \frac{\omega_c s}{s + \omega_c}\,\delta(s)
+
+discretised exactly for a deflection that moves linearly between samples, with the sample's own time step h:
+
+.. math::
+    \hat{\dot\delta}_k = s_k + (\hat{\dot\delta}_{k-1} - s_k)\,e^{-\omega_c h},
+    \qquad s_k = (\delta_k - \delta_{k-1})/h .
+
+It needs no model. It delays a rate of frequency w by about 1/omega_c + h/2, and amplifies noise by omega_c.
+(Sangveraphunsiri 1984 after Siciliano & Book 1986.)
+"""
+
+import numpy as np
+from flexarm_dynamics.parameters import Parameter
+
+from .base import Observer
+
+
+class FilteredDerivative(Observer):
+    """First-order filtered derivative; see the module."""
+
+    PARAMETERS = (
+        Parameter(
+            "bandwidth",
+            "float",
+            1000.0,
+            "Corner frequency of the filtered derivative.",
+            unit="rad/s",
+            low=1.0,
+            high=1e6,
+        ),
+    )
+
+    #: Time constants after which the start is forgotten.
+    SETTLING = 5.0
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.bandwidth = self.parameters["bandwidth"]
+        self._elapsed = -1.0
+
+    def reset(self):
+        super().reset()
+        self._elapsed = -1.0
+
+    def update(self, sample, dt):
+        if self._elapsed < 0.0:
+            self.amplitude[:] = sample.amplitude
+            self.rate[:] = 0.0
+            self._elapsed = 0.0
+            return
+        slope = (sample.amplitude - self.amplitude) / dt
+        self.rate -= slope
+        self.rate *= np.exp(-self.bandwidth * dt)
+        self.rate += slope
+        self.amplitude[:] = sample.amplitude
+        if not self.converged:
+            self._elapsed += dt
+            self.converged = self._elapsed * self.bandwidth >= self.SETTLING

@@ -1,0 +1,199 @@
+"""Motions in closed form, and their points for a `trajectory_msgs/JointTrajectory`.
+
+Each goes from rest to rest along theta(t) = start + angle sigma(s), s = t / T, sigma from 0 to 1.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from flexarm_dynamics.errors import TrajectoryError
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A motion of n joints, at rest before 0 and after `duration`.
+
+    Attributes
+    ----------
+    start : (n,) array
+        Positions at t = 0 [rad].
+    angle : (n,) array
+        How far each joint goes [rad].
+    duration : float
+        T [s].
+    shape : tuple of 3 functions
+        sigma, sigma' and sigma'' of s in [0, 1], elementwise [-].
+    """
+
+    start: np.ndarray
+    angle: np.ndarray
+    duration: float
+    shape: tuple[Callable, Callable, Callable]
+
+    def position(self, t) -> np.ndarray:
+        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
+        return self.start + self._shape(t, 0)
+
+    def velocity(self, t) -> np.ndarray:
+        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
+        return self._shape(t, 1)
+
+    def acceleration(self, t) -> np.ndarray:
+        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
+        return self._shape(t, 2)
+
+    def _shape(self, t, order):
+        # Rest to rest: beyond either end sigma stays, and its derivatives are 0 as at the end.
+        s = np.clip(np.asarray(t, dtype=float) / self.duration, 0.0, 1.0)
+        return self.shape[order](s)[..., None] * (self.angle / self.duration**order)
+
+
+def paper_profile(duration=2.0, angle=np.pi / 2, start=0.0) -> Profile:
+    """Return the motion of the case study of Siciliano & Book (1986), section 5 (fig. 2).
+
+    theta_dot = (angle / T) [1 + sin(2 pi t / T - pi / 2)] = (angle / T) [1 - cos(2 pi t / T)]
+
+    which integrates to theta = angle [s - sin(2 pi s) / (2 pi)], s = t / T. With the defaults
+    this is 45 [1 + sin(2 pi t / T - pi / 2)] deg/s, from 0 to 90 deg in 2 s. The paper prints 90
+    in the place of 45: the mean of the bracket is 1, so 90 deg/s over 2 s would go to 180 deg,
+    while the text ends at 90 deg and designs the fast control for 90 deg.
+
+    Parameters
+    ----------
+    duration : float
+        T [s].
+    angle : float or (n,) array_like
+        How far each joint goes [rad]; a float is one joint.
+    start : float or (n,) array_like
+        Positions at t = 0 [rad].
+
+    Returns
+    -------
+    Profile
+        The motion; its acceleration is 0 at both ends.
+
+    Raises
+    ------
+    TrajectoryError
+        If the duration is not above 0, something is not finite, or the shapes differ.
+    """
+    start, angle, duration = _checked(start, angle, duration, "angle")
+    turn = 2.0 * np.pi
+    return Profile(
+        start,
+        angle,
+        duration,
+        (
+            lambda s: s - np.sin(turn * s) / turn,
+            lambda s: 2.0 * np.sin(np.pi * s) ** 2,  # 1 - cos(2 pi s), without cancellation
+            lambda s: turn * np.sin(turn * s),
+        ),
+    )
+
+
+def quintic(start, end, duration) -> Profile:
+    """Return the point-to-point motion with zero velocity and acceleration at both ends.
+
+    sigma = 10 s^3 - 15 s^4 + 6 s^5, the polynomial of least degree with these ends, e.g.
+    Biagiotti & Melchiorri (2008), section 2.1.6.
+
+    Parameters
+    ----------
+    start, end : float or (n,) array_like
+        Positions at t = 0 and t = T [rad]; floats are one joint.
+    duration : float
+        T [s].
+
+    Returns
+    -------
+    Profile
+        The motion.
+
+    Raises
+    ------
+    TrajectoryError
+        If the duration is not above 0, something is not finite, or the shapes differ.
+    """
+    start, end, duration = _checked(start, end, duration, "end")
+    return Profile(
+        start,
+        end - start,
+        duration,
+        (
+            lambda s: s**3 * (10.0 + s * (-15.0 + s * 6.0)),
+            lambda s: 30.0 * (s * (1.0 - s)) ** 2,
+            lambda s: 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
+        ),
+    )
+
+
+class SampledProfile(NamedTuple):
+    """A profile's points, all fields given: quintic interpolation.
+
+    Attributes
+    ----------
+    times : (k,) array
+        Times from the start, the first 0 [s].
+    positions, velocities, accelerations : (k, n) arrays
+        The motion at these times [rad], [rad/s], [rad/s^2].
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+    accelerations: np.ndarray
+
+
+def sample(profile, n_points) -> SampledProfile:
+    """Return a profile at equally spaced times, both ends included.
+
+    Parameters
+    ----------
+    profile : Profile
+        The motion.
+    n_points : int
+        k, at least 2.
+
+    Returns
+    -------
+    SampledProfile
+        Times, positions, velocities and accelerations.
+
+    Raises
+    ------
+    TrajectoryError
+        If there are fewer than 2 points.
+    """
+    if not isinstance(n_points, int | np.integer) or n_points < 2:
+        raise TrajectoryError(f"n_points is {n_points!r}: give an integer of at least 2")
+    times = np.linspace(0.0, profile.duration, n_points)
+    return SampledProfile(
+        times, profile.position(times), profile.velocity(times), profile.acceleration(times)
+    )
+
+
+def _checked(start, other, duration, other_name):
+    """Return `start` and `other` as (n,) arrays of one length, and the duration as a float."""
+    try:
+        duration = float(duration)
+        start, other = np.broadcast_arrays(
+            np.atleast_1d(np.array(start, dtype=float)), np.atleast_1d(np.array(other, dtype=float))
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TrajectoryError(
+            f"start, {other_name}, duration: {error}; give a number or one per joint for the "
+            "first two, a number of seconds for the duration"
+        ) from None
+    if start.ndim != 1:
+        raise TrajectoryError(
+            f"start and {other_name} have shape {start.shape}: give (n,), one number per joint"
+        )
+    if not 0.0 < duration < np.inf:
+        raise TrajectoryError(f"duration is {duration} s: it must be finite and above 0")
+    for name, values in (("start", start), (other_name, other)):
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise TrajectoryError(f"{name}[{bad[0]}] is {values[bad[0]]} rad: it must be finite")
+    return start, other, duration

@@ -1,0 +1,73 @@
+"""One sample of the arm, as plain arrays: what observers and controllers work on."""
+
+import numpy as np
+
+
+class ArmSample:
+    """What was measured at one instant, in the arm file's order, SI.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of measurement [ns].
+    session, sequence : int
+        Which run of the source, and which sample of it.
+    position, velocity, torque : ndarray, shape (n,)
+        Joint position [rad], velocity [rad/s], torque applied until now [N m] (NaN: unknown).
+    strain : ndarray, shape (gauges,) or None
+        Surface strain [-].
+    amplitude, rate : ndarray, shape (m,) or None
+        Modal amplitudes [m, rad] and rates [m/s, rad/s]; None where not known.
+    velocity_known : bool
+        False where the source gave no joint velocity.
+    """
+
+    __slots__ = (
+        "amplitude",
+        "position",
+        "rate",
+        "sequence",
+        "session",
+        "stamp_ns",
+        "strain",
+        "torque",
+        "velocity",
+        "velocity_known",
+    )
+
+    def __init__(self, n_joints, n_modes=0, n_gauges=0):
+        self.stamp_ns, self.session, self.sequence = 0, 0, 0
+        self.position, self.velocity = np.zeros(n_joints), np.zeros(n_joints)
+        self.torque = np.full(n_joints, np.nan)
+        self.strain = np.zeros(n_gauges) if n_gauges else None
+        self.amplitude = np.zeros(n_modes) if n_modes else None
+        self.rate = None
+        self.velocity_known = True
+
+    @property
+    def key(self):
+        """(session, sequence): equal for a sample that was sent again."""
+        return self.session, self.sequence
+
+
+class SampleOrder:
+    """Tells new samples from repeats, restarts and those out of order; by number, never by a clock."""
+
+    NEW, REPEAT, RESTART, STALE = range(4)
+
+    def __init__(self):
+        self.session, self.sequence, self.stamp_ns = None, -1, 0
+
+    def judge(self, sample):
+        """Class of `sample`; NEW and RESTART are remembered as the last one."""
+        if sample.session != self.session:
+            verdict = self.RESTART
+        elif sample.sequence == self.sequence:
+            return self.REPEAT
+        elif sample.sequence < self.sequence or sample.stamp_ns <= self.stamp_ns:
+            return self.STALE
+        else:
+            verdict = self.NEW
+        self.session, self.sequence = sample.session, sample.sequence
+        self.stamp_ns = sample.stamp_ns
+        return verdict

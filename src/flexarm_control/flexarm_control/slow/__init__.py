@@ -1,0 +1,1 @@
+"""Slow control laws: what tracks the trajectory as if the arm were rigid. One law per file."""

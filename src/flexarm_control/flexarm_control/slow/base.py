@@ -1,0 +1,67 @@
+"""What a slow control law is."""
+
+from abc import ABC, abstractmethod
+
+from flexarm_dynamics.parameters import Parameter
+
+KP = Parameter(
+    "kp",
+    "float_array",
+    [6.25],
+    "Position gain of the reference model: -Lambda_0 of (14), k_p of (17).",
+    unit="1/s^2",
+    low=0.0,
+    high=1e6,
+    length="joints",
+)
+KV = Parameter(
+    "kv",
+    "float_array",
+    [5.0],
+    "Velocity gain of the reference model: -Lambda_1 of (14), k_v of (17).",
+    unit="1/s",
+    low=0.0,
+    high=1e4,
+    length="joints",
+)
+
+
+class SlowLaw(ABC):
+    """Slow control u_slow of (12), designed on the slow subsystem (10).
+
+    A law is registered by name in the entry-point group ``flexarm.slow_laws``. All design work is done in
+    the constructor; `torque` runs on the control path.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm.
+    parameters : dict
+        Checked values of `PARAMETERS`, arrays at full length.
+    """
+
+    #: Declared parameters, named ``slow.<name>`` in the controller node.
+    PARAMETERS = ()
+
+    def __init__(self, model, parameters):
+        self.model = model
+        self.parameters = dict(parameters)
+
+    @abstractmethod
+    def torque(self, q, qd, reference, terms):
+        """Slow torque.
+
+        Parameters
+        ----------
+        q, qd : ndarray, shape (n,)
+            Joint position [rad] and velocity [rad/s].
+        reference : object
+            With `position`, `velocity`, `acceleration`, each (n,) [rad, rad/s, rad/s^2].
+        terms : Terms
+            Terms of (2) at (q, qd), without deflections.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            [N m]
+        """

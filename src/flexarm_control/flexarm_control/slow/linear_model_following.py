@@ -1,0 +1,55 @@
+r"""Linear model following, (17) of Siciliano & Book (1986), for any number of joints.
+
+.. math::
+    \bar u = B^{-1}(q)\,[\ddot\theta_{ref} + k_v(\dot\theta_{ref} - \dot\theta) + k_p(\theta_{ref} - \theta)]
+
+with B of the slow subsystem (10), whose inverse is the rigid arm's inertia: `m11` for one link. Print
+multiplies by ``1/h11`` instead, with H = M^-1: the slow poles are then not where they were designed
+(-2.14 +- 0.88j instead of the double pole -2.5 on the paper's arm). ``gain: h11`` reproduces that.
+
+Assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. Else use `model_following`.
+"""
+
+import numpy as np
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+from .base import KP, KV, SlowLaw
+
+
+class LinearModelFollowing(SlowLaw):
+    """The law (17); see the module."""
+
+    PARAMETERS = (
+        KP,
+        KV,
+        Parameter(
+            "gain",
+            "string",
+            "m11",
+            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as print has it.",
+            choices=("m11", "h11"),
+        ),
+    )
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.kp = np.array(self.parameters["kp"])
+        self.kv = np.array(self.parameters["kv"])
+        self.printed = self.parameters["gain"] == "h11"
+        self._cached = (None, None)
+
+    def B_inverse(self, terms):
+        """The matrix in front of the bracket of (17), shape (n, n) [kg m^2]."""
+        if self._cached[0] is not terms.M:  # M of (2) is one object as long as it is constant
+            n = terms.n
+            B = terms.H[:n, :n] if self.printed else slow_subsystem(terms)[1]
+            self._cached = (terms.M, np.linalg.inv(B))
+        return self._cached[1]
+
+    def torque(self, q, qd, reference, terms):
+        v = reference.position - q
+        v *= self.kp
+        v += self.kv * (reference.velocity - qd)
+        v += reference.acceleration
+        return self.B_inverse(terms) @ v

@@ -1,0 +1,39 @@
+r"""Model following with compensation, the general form (13)-(14) of Siciliano & Book (1986).
+
+.. math::
+    \bar u &= B^\dagger(\bar x)\,[-a(\bar x) + v], \qquad
+    v = \Lambda_0 q + \Lambda_1\dot q + \hat u, \\
+    \hat u &= \ddot\theta_{ref} - \Lambda_0\theta_{ref} - \Lambda_1\dot\theta_{ref},
+
+the last line being the inverse of the reference model (14). The slow subsystem (10) then follows the
+reference perfectly: the error obeys e'' = Lambda_1 e' + Lambda_0 e, with Lambda_0 = -diag(kp) and
+Lambda_1 = -diag(kv), and stays zero once it is.
+
+Assumes that a(x) and B(x) are known: gravity, friction and payload as in the arm file.
+"""
+
+import numpy as np
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+from .base import KP, KV, SlowLaw
+
+
+class ModelFollowing(SlowLaw):
+    """The law (13) with (14); see the module."""
+
+    PARAMETERS = (KP, KV)
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.Lambda0 = -np.array(self.parameters["kp"])
+        self.Lambda1 = -np.array(self.parameters["kv"])
+
+    def torque(self, q, qd, reference, terms):
+        u_hat = (
+            reference.acceleration
+            - self.Lambda0 * reference.position
+            - self.Lambda1 * reference.velocity
+        )
+        v = self.Lambda0 * q + self.Lambda1 * qd + u_hat
+        a, B = slow_subsystem(terms)
+        return np.linalg.solve(B, v - a)

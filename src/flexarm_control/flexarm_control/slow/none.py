@@ -1,0 +1,12 @@
+"""No slow control: the fast control alone holds the deflections; the joint drifts."""
+
+import numpy as np
+
+from .base import SlowLaw
+
+
+class NoSlowLaw(SlowLaw):
+    """u_slow = 0."""
+
+    def torque(self, q, qd, reference, terms):
+        return np.zeros(self.model.n_joints)

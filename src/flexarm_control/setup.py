@@ -1,0 +1,38 @@
+from setuptools import find_packages, setup
+
+name = "flexarm_control"
+
+setup(
+    name=name,
+    version="0.1.0",
+    description="Slow and fast laws, composite control, observers and trajectories for arms with flexible links, and the nodes observer and controller.",
+    license="Apache-2.0",
+    maintainer="flexarm maintainers",
+    maintainer_email="maintainers@flexarm.invalid",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
+        (f"share/{name}", ["package.xml"]),
+    ],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "observer = flexarm_control.nodes.observer:main",
+            "controller = flexarm_control.nodes.controller:main",
+        ],
+        "flexarm.slow_laws": [
+            "none = flexarm_control.slow.none:NoSlowLaw",
+            "linear_model_following = flexarm_control.slow.linear_model_following:LinearModelFollowing",
+            "model_following = flexarm_control.slow.model_following:ModelFollowing",
+        ],
+        "flexarm.fast_laws": [
+            "none = flexarm_control.fast.none:NoFastLaw",
+            "lqr = flexarm_control.fast.lqr:Lqr",
+        ],
+        "flexarm.observers": [
+            "true_rates = flexarm_control.observers.true_rates:TrueRates",
+            "filtered_derivative = flexarm_control.observers.filtered_derivative:FilteredDerivative",
+            "luenberger = flexarm_control.observers.luenberger:Luenberger",
+        ],
+    },
+)

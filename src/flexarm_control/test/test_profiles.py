@@ -1,0 +1,119 @@
+"""Profiles: closed forms against hand-computed values, their integrals and each other."""
+
+import numpy as np
+import pytest
+from flexarm_control.profiles import paper_profile, quintic, sample
+from flexarm_control.trajectory import ReferenceGenerator, validate
+from flexarm_dynamics.errors import TrajectoryError
+from scipy.integrate import quad
+
+S = 10**9  # [ns]
+PROFILES = [
+    paper_profile(),
+    paper_profile(3.0, [0.5, -1.0], [0.1, 0.2]),
+    quintic(0.2, -1.3, 0.7),
+    quintic([0.0, 1.0], [2.0, 1.0], 5.0),
+]
+
+
+def test_the_paper_profile_is_45_degrees_per_second_and_ends_at_90_degrees():
+    profile = paper_profile()
+    t = np.linspace(0.0, 2.0, 101)
+    expected = np.radians(45.0 * (1.0 + np.sin(2.0 * np.pi * t / 2.0 - np.pi / 2.0)))
+    np.testing.assert_allclose(profile.velocity(t)[:, 0], expected, atol=1e-15)
+    # by hand: at T / 2 the half of the way, twice the mean speed, no acceleration; at T / 4
+    # 90 (1/4 - 1 / (2 pi)) deg, 45 deg/s, 45 pi deg/s^2
+    np.testing.assert_allclose(np.degrees(profile.position(1.0)), [45.0], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(profile.velocity(1.0)), [90.0], rtol=1e-14)
+    np.testing.assert_allclose(profile.acceleration(1.0), [0.0], atol=1e-15)
+    quarter = 90.0 * (0.25 - 0.5 / np.pi)
+    np.testing.assert_allclose(np.degrees(profile.position(0.5)), [quarter], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(profile.velocity(0.5)), [45.0], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(profile.acceleration(0.5)), [45.0 * np.pi], rtol=1e-14)
+    np.testing.assert_allclose(np.degrees(profile.position(2.0)), [90.0], rtol=1e-14)
+
+
+def test_the_quintic_has_its_hand_computed_middle():
+    profile = quintic([0.0, 1.0], [1.0, -1.0], 2.0)
+    np.testing.assert_allclose(profile.position(1.0), [0.5, 0.0], atol=1e-15)
+    np.testing.assert_allclose(profile.velocity(1.0), [15 / 16, -15 / 8], rtol=1e-14)
+    np.testing.assert_allclose(profile.position(0.5), [53 / 512, 1 - 53 / 256], rtol=1e-14)
+    np.testing.assert_allclose(profile.acceleration(0.5), [45 / 32, -45 / 16], rtol=1e-14)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_velocity_and_acceleration_integrate_to_position_and_velocity(profile):
+    for joint in range(profile.start.size):
+        for t in np.linspace(0.1, 1.0, 4) * profile.duration:
+            way = quad(lambda x, j=joint: profile.velocity(x)[j], 0.0, t, epsabs=1e-13)[0]
+            gain = quad(lambda x, j=joint: profile.acceleration(x)[j], 0.0, t, epsabs=1e-13)[0]
+            assert profile.position(t)[joint] - profile.start[joint] == pytest.approx(
+                way, abs=1e-12
+            )
+            assert profile.velocity(t)[joint] == pytest.approx(gain, abs=1e-12)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_profiles_rest_at_and_beyond_both_ends(profile):
+    for t, position in (
+        (-1.0, profile.start),
+        (0.0, profile.start),
+        (profile.duration, profile.start + profile.angle),
+        (profile.duration + 1.0, profile.start + profile.angle),
+    ):
+        np.testing.assert_allclose(profile.position(t), position, rtol=1e-15)
+        np.testing.assert_allclose(profile.velocity(t), 0.0, atol=1e-15)
+        np.testing.assert_allclose(profile.acceleration(t), 0.0, atol=1e-14)
+
+
+def test_shapes_follow_the_times_and_the_joints():
+    profile = paper_profile(angle=[1.0, 2.0, 3.0])
+    assert profile.position(0.5).shape == (3,)
+    assert profile.position(np.zeros(4)).shape == (4, 3)
+    points = sample(profile, 5)
+    np.testing.assert_array_equal(points.times, [0.0, 0.5, 1.0, 1.5, 2.0])
+    for values in points[1:]:
+        assert values.shape == (5, 3)
+
+
+@pytest.mark.parametrize(
+    ("profile", "n_points", "tolerance"),
+    # A quintic is its own interpolation. Of another motion the quintic Hermite's error is at
+    # most max|theta^(6)| h^6 / 46080 (h the time between points): for the paper's profile with
+    # 21 points (pi / 2) (2 pi)^5 (1 / 20)^6 / 46080 = 5.3e-9 rad.
+    [(quintic(0.2, -1.3, 0.7), 2, 1e-14), (paper_profile(), 21, 5.4e-9)],
+)
+def test_sampled_profiles_are_followed(profile, n_points, tolerance):
+    points = sample(profile, n_points)
+    rows = [
+        (round(t * S), list(p), list(v), list(a), []) for t, p, v, a in zip(*points, strict=True)
+    ]
+    generator = ReferenceGenerator(["a"])
+    generator.start(profile.start, 0)
+    assert generator.offer(validate(["a"], ["a"], 0, rows)).accepted
+    for i in range(400):
+        stamp = round(i * profile.duration / 390 * S)
+        generator.sample(stamp)
+        expected = profile.position(stamp / S)
+        np.testing.assert_allclose(generator.position, expected, rtol=0, atol=tolerance)
+    assert generator.finished
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: paper_profile(0.0), "duration is 0.0 s: it must be finite and above 0"),
+        (lambda: paper_profile(float("nan")), "duration is nan s"),
+        (lambda: quintic(0.0, 1.0, float("inf")), "duration is inf s"),
+        (lambda: quintic(0.0, [1.0, float("nan")], 1.0), r"end\[1\] is nan rad"),
+        (lambda: paper_profile(angle=float("inf")), r"angle\[0\] is inf rad"),
+        (lambda: quintic([0.0, 1.0], [1.0, 2.0, 3.0], 1.0), "start, end, duration: .*shape"),
+        (lambda: quintic([[0.0]], 1.0, 1.0), r"have shape \(1, 1\)"),
+        (lambda: quintic("x", 1.0, 1.0), "start, end, duration"),
+        (lambda: sample(paper_profile(), 1), "n_points is 1: give an integer of at least 2"),
+        (lambda: sample(paper_profile(), 2.5), "n_points is 2.5"),
+    ],
+)
+def test_what_makes_no_profile_is_refused(make, message):
+    with pytest.raises(TrajectoryError, match=message):
+        make()

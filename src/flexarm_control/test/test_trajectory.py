@@ -1,0 +1,753 @@
+"""Trajectories: what is refused, how the points are joined, when the reference changes."""
+
+from array import array
+
+import numpy as np
+import pytest
+from flexarm_control.trajectory import (
+    BRAKING_STEP,
+    MAX_MAGNITUDE,
+    MAX_POINTS,
+    ReferenceGenerator,
+    validate,
+)
+from flexarm_dynamics.errors import TrajectoryError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+S = 10**9  # [ns]
+MS = 10**6  # [ns]
+ARM = ("a", "b")
+
+
+def point(time, positions, velocities=(), accelerations=(), effort=()):
+    """One point; time in seconds."""
+    return (round(time * S), positions, velocities, accelerations, effort)
+
+
+def one(points, stamp=0):
+    """A trajectory for one joint `a`, from (time, position, velocity, acceleration) rows."""
+    rows = [point(row[0], *([value] for value in row[1:])) for row in points]
+    return validate(["a"], ["a"], round(stamp * S), rows)
+
+
+def held(position=0.0, stamp=0, **options):
+    """A generator of one joint that holds a position since a stamp [s]."""
+    generator = ReferenceGenerator(["a"], **options)
+    generator.start([position], round(stamp * S))
+    return generator
+
+
+def at(generator, time):
+    """Sample at a time [s]: (position, velocity, acceleration) of joint 0."""
+    generator.sample(round(time * S))
+    return generator.position[0], generator.velocity[0], generator.acceleration[0]
+
+
+# --------------------------------------------------------------------------- validation
+
+
+def test_columns_come_in_the_order_of_the_arm():
+    trajectory = validate(
+        ["b", "a"],
+        ARM,
+        5,
+        [point(0.5, [1.0, 2.0], [3.0, 4.0], [5.0, 6.0]), point(1.25, [7, 8], [0, 0], [9, 10])],
+    )
+    assert trajectory.joint_names == ARM
+    assert trajectory.stamp_ns == 5
+    np.testing.assert_array_equal(trajectory.times_ns, [500 * MS, 1250 * MS])
+    np.testing.assert_array_equal(trajectory.times, [0.5, 1.25])
+    np.testing.assert_array_equal(trajectory.positions, [[2, 1], [8, 7]])
+    np.testing.assert_array_equal(trajectory.velocities, [[4, 3], [0, 0]])
+    np.testing.assert_array_equal(trajectory.accelerations, [[6, 5], [10, 9]])
+
+
+def test_arrays_of_ros_messages_are_read():
+    trajectory = validate(
+        ARM, ARM, 0, [(S, array("d", [1.0, 2.0]), array("d"), array("d"), array("d"))]
+    )
+    np.testing.assert_array_equal(trajectory.positions, [[1, 2]])
+    assert trajectory.velocities is None
+    assert trajectory.accelerations is None
+
+
+def test_arrays_can_not_be_changed_after_the_check():
+    trajectory = one([(1, 0.5, 0.0, 0.0)])
+    for values in (
+        trajectory.times_ns,
+        trajectory.positions,
+        trajectory.velocities,
+        trajectory.accelerations,
+    ):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 1
+
+
+GOOD = point(1, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("names", "stamp", "points", "message"),
+    [
+        (["a"], 0, [GOOD], r"lacks 'b': give every joint of the arm \(a, b\)"),
+        (["a", "c"], 0, [GOOD], "'c', which is no joint of this arm: give a, b"),
+        (["a", "b", "a"], 0, [GOOD], "'a' 2 times"),
+        (None, 0, [GOOD], "joint_names is None"),
+        ([["a"], "b"], 0, [GOOD], "which is no joint"),
+        ([np.zeros(2), "b"], 0, [GOOD], "which is no joint"),
+        (ARM, 0, [], "empty trajectory: give at least one point"),
+        (ARM, 0, None, "points is None"),
+        (ARM, 0, [GOOD, 3], r"points\[1\] is 3"),
+        (ARM, 0, [GOOD[:4]], r"points\[0\] is .*: give \(time_from_start, positions,"),
+        (ARM, 1.0, [GOOD], "header.stamp is 1.0: give integer nanoseconds"),
+        (ARM, -1, [GOOD], "header.stamp is -1 ns"),
+        (ARM, 2**63, [GOOD], "header.stamp is 9223372036854775808 ns"),
+        (ARM, 2**63 - 1, [GOOD], "the trajectory ends 1 s after"),
+        (ARM, 0, [(1.5, [0, 0], [], [], [])], r"points\[0\].time_from_start is 1.5"),
+        (ARM, 0, [GOOD, (2**64, [0, 0], [], [], [])], r"points\[1\].time_from_start is 184"),
+        (ARM, 0, [point(-0.5, [0, 0])], r"points\[0\].time_from_start is -0.5 s: .*at least 0"),
+        (ARM, 0, [GOOD, GOOD], r"points\[1\].time_from_start is 1 s, not later than points\[0\]"),
+        (ARM, 0, [GOOD, point(0.5, [0, 0])], r"points\[1\].time_from_start is 0.5 s, not later"),
+        (ARM, 0, [point(1, [])], r"points\[0\].positions is empty"),
+        (ARM, 0, [point(1, [], [0, 0])], r"points\[0\].positions is empty"),
+        (
+            ARM,
+            0,
+            [GOOD, point(2, [1])],
+            r"points\[1\].positions has length 1, for 2 joints: give 2",
+        ),
+        (ARM, 0, [GOOD, point(2, [])], r"points\[1\] has no positions, points\[0\] has"),
+        (ARM, 0, [GOOD, point(2, None)], r"points\[1\].positions is None"),
+        (ARM, 0, [GOOD, point(2, range(10**30))], r"points\[1\].positions is range"),
+        (ARM, 0, [GOOD, point(2, "12")], r"points\[1\].positions is '12': give 2 numbers"),
+        (ARM, 0, [GOOD, point(2, [None, 1])], r"points\[1\].positions is \[None, 1\]"),
+        (ARM, 0, [GOOD, point(2, [[1], 1])], r"points\[1\].positions is \[\[1\], 1\]"),
+        (ARM, 0, [GOOD, point(2, [10**400, 1])], r"points\[1\].positions is \[1000"),
+        (ARM, 0, [point(1, [0, 0], [0])], r"velocities has length 1, for 2 joints: give 2 or none"),
+        (ARM, 0, [GOOD, point(2, [0, 0], [0, 0])], r"points\[0\] has no velocities, points\[1\]"),
+        (
+            ARM,
+            0,
+            [point(1, [0, 0], [0, 0], [0, 0]), point(2, [0, 0], [0, 0])],
+            r"points\[1\] has no accelerations, points\[0\] has: give the same fields",
+        ),
+        (ARM, 0, [point(1, [0, 0], [], [0, 0])], r"accelerations but no velocities"),
+        (
+            ["b", "a"],
+            0,
+            [GOOD, point(2, [float("nan"), 0])],
+            r"points\[1\].positions of joint b is nan rad: it must be finite",
+        ),
+        (
+            ARM,
+            0,
+            [point(1, [0, 0], [0, 0], [0, float("-inf")])],
+            r"points\[0\].accelerations of joint b is -inf rad/s\^2",
+        ),
+        (ARM, 0, [point(1, [2 * MAX_MAGNITUDE, 0])], "at most 1e.09 in magnitude"),
+        (ARM, 0, [point(1, [0, 0], (), (), [0, 0])], r"points\[0\].effort is not empty: effort"),
+        (ARM, 0, [point(1, [0, 0], (), (), None)], r"points\[0\].effort is None"),
+        (ARM, 0, [point(1, [0, 0], [0, 1e-3])], "last point's velocity of joint b is 0.001 rad/s"),
+    ],
+)
+def test_what_can_not_be_followed_is_refused_by_name(names, stamp, points, message):
+    with pytest.raises(TrajectoryError, match=message):
+        validate(names, ARM, stamp, points)
+
+
+def test_an_integer_too_long_to_print_is_refused():
+    with pytest.raises(TrajectoryError, match="header.stamp is a int ns, outside"):
+        validate(ARM, ARM, 10**5000, [GOOD])
+
+
+def test_more_points_than_allowed_are_refused():
+    with pytest.raises(TrajectoryError, match="1000001 points are more than the 1000000 allowed"):
+        validate(ARM, ARM, 0, [GOOD] * (MAX_POINTS + 1))
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([point(1, [0, -1.5])], r"points\[0\]: position of joint b is -1.5 rad, .*limit of -1 rad"),
+        ([point(1, [0, 0]), point(9, [2.5, 0])], r"points\[1\]: position of joint a is 2.5 rad"),
+        (
+            [point(1, [0, 0], [0, -4]), point(9, [0, 0], [0, 0])],
+            r"points\[0\]: velocity of joint b is -4 rad/s, beyond its limit of 3 rad/s",
+        ),
+        (
+            [point(1, [0, 0]), point(1.1, [0, 0.5])],
+            r"points\[0\] to points\[1\] joint b would move at 5 rad/s on average.*of 3 rad/s",
+        ),
+    ],
+)
+def test_limits_are_held_by_name(points, message):
+    with pytest.raises(TrajectoryError, match=message):
+        validate(ARM, ARM, 0, points, [-2, -1], [2, 1], [np.inf, 3])
+
+
+def test_limits_met_exactly_are_accepted():
+    points = [point(0.7, [0.7, 0.0]), point(0.8, [0.8, 1.0]), point(1.8, [2.0, -1.0])]
+    validate(ARM, ARM, 0, points, [-2, -1], [2, 1], [1.2, 10.0])
+    validate(["a"], ["a"], 0, [point(0.7, [0.7]), point(0.8, [0.8])], velocity_max=[1.0])
+
+
+@pytest.mark.parametrize(
+    ("limit", "message"),
+    [
+        ([1.0], r"velocity_max has shape \(1,\), the joints have \(2,\)"),
+        ([1.0, float("nan")], "velocity_max of joint b is nan"),
+        (["x", 1.0], "velocity_max is"),
+    ],
+)
+def test_limits_of_another_shape_are_refused(limit, message):
+    with pytest.raises(TrajectoryError, match=message):
+        validate(ARM, ARM, 0, [GOOD], velocity_max=limit)
+
+
+junk = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.just(10**5000),
+    st.floats(),
+    st.text(max_size=3),
+    st.binary(max_size=3),
+    st.complex_numbers(),
+    st.lists(st.integers(), max_size=3),
+    st.dictionaries(st.text(max_size=1), st.floats(), max_size=2),
+)
+numbers = st.one_of(st.floats(), st.floats(-3, 3), st.integers(-3, 3), junk)
+values = st.one_of(
+    st.lists(st.floats(-3, 3), min_size=2, max_size=2),
+    st.lists(numbers, max_size=3),
+    st.just([]),
+    st.just(array("d", [0.0, 0.0])),
+    junk,
+)
+point_times = st.one_of(st.integers(0, 10 * S), st.integers(), junk)
+any_point = st.one_of(
+    st.tuples(point_times, values, values, values, st.one_of(st.just([]), values)), junk
+)
+
+
+@settings(max_examples=300)
+@given(
+    st.one_of(st.permutations(ARM), st.lists(st.one_of(st.sampled_from("abc"), junk)), junk),
+    st.one_of(st.just(0), st.integers(), junk),
+    st.one_of(st.lists(any_point, max_size=4), junk),
+)
+def test_whatever_comes_only_trajectory_errors_are_raised(names, stamp, points):
+    try:
+        trajectory = validate(names, ARM, stamp, points)
+    except TrajectoryError:
+        return
+    assert np.isfinite(trajectory.positions).all()
+
+
+coordinates = st.floats(-MAX_MAGNITUDE, MAX_MAGNITUDE)
+pairs = st.lists(coordinates, min_size=2, max_size=2)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(st.tuples(st.integers(0, 2**62), pairs, pairs, pairs), min_size=1, max_size=4),
+    st.integers(1, 3),
+    st.integers(0, 2**62),
+    st.lists(st.integers(0, 2**63), max_size=5),
+)
+def test_whatever_is_accepted_gives_a_finite_reference(rows, fields, stamp, samples):
+    rows = sorted({row[0]: row for row in rows}.values())
+    points = [(row[0], *row[1 : fields + 1], *[[]] * (3 - fields), []) for row in rows]
+    if fields > 1:
+        points[-1] = (*points[-1][:2], [0.0, 0.0], *points[-1][3:])
+    generator = ReferenceGenerator(ARM, start_tolerance=MAX_MAGNITUDE)
+    generator.start([0.0, 0.0], 0)
+    assert generator.offer(validate(ARM, ARM, stamp, points)).accepted or rows[0][0] == 0
+    for instant in [*sorted(samples), stamp + rows[-1][0] - 1, stamp + rows[-1][0]]:
+        generator.sample(instant)
+        for reference in (generator.position, generator.velocity, generator.acceleration):
+            assert np.isfinite(reference).all()
+
+
+# --------------------------------------------------------------------------- interpolation
+
+
+def test_positions_alone_are_joined_by_straight_lines():
+    generator = held(0.0)
+    generator.offer(one([(1, 2.0), (3, -2.0)]))
+    at(generator, 0)
+    assert at(generator, 0.25) == (0.5, 2.0, 0.0)
+    assert at(generator, 1.0) == (2.0, -2.0, 0.0)
+    assert at(generator, 2.5) == (-1.0, -2.0, 0.0)
+    assert at(generator, 3.0) == (-2.0, 0.0, 0.0)
+
+
+def test_velocities_make_cubics():
+    # From rest at 0 to 1 at rest in 2 s: 3 s^2 - 2 s^3; at s = 1/2: 1/2, 1.5 / 2, 0; at s = 1/4:
+    # 3/16 - 2/64 = 5/32, (6/4 - 6/16) / 2 = 9/16, (6 - 12/4) / 4 = 3/4.
+    generator = held(0.0)
+    generator.offer(one([(2, 1.0, 0.0)]))
+    assert at(generator, 0) == (0.0, 0.0, 1.5)
+    assert at(generator, 0.5) == pytest.approx((5 / 32, 9 / 16, 3 / 4), abs=1e-15)
+    assert at(generator, 1) == pytest.approx((0.5, 0.75, 0.0), abs=1e-15)
+    assert at(generator, 2) == (1.0, 0.0, 0.0)
+
+
+def test_accelerations_make_quintics():
+    # 10 s^3 - 15 s^4 + 6 s^5 over 2 s; at s = 1/2: 1/2, (15/8) / 2, 0; at s = 1/4:
+    # 53/512, (30 / 16 * 9 / 16) / 2, (60 / 4 * 3 / 4 * 1 / 2) / 4.
+    generator = held(0.0)
+    generator.offer(one([(2, 1.0, 0.0, 0.0)]))
+    assert at(generator, 0) == (0.0, 0.0, 0.0)
+    assert at(generator, 0.5) == pytest.approx((53 / 512, 135 / 256, 45 / 32), abs=1e-14)
+    assert at(generator, 1) == pytest.approx((0.5, 15 / 16, 0.0), abs=1e-14)
+
+
+def test_quintics_reproduce_polynomials_of_degree_five():
+    # (t - 4)^3 times a quadratic: at rest at t = 4, where the trajectory has to end.
+    motion = np.polynomial.Polynomial([-4.0, 1.0]) ** 3 * np.polynomial.Polynomial([0.3, -0.2, 0.1])
+    rates = [motion, motion.deriv(), motion.deriv(2)]
+    generator = held(motion(0.0))
+    knots = [0.0, 0.4, 0.41, 1.7, 3.0, 4.0]
+    generator.offer(one([(t, *(rate(t) for rate in rates)) for t in knots]))
+    for t in np.arange(0, 4, 0.01):
+        state = at(generator, t)
+        assert state == pytest.approx([rate(t) for rate in rates], rel=1e-10, abs=1e-10)
+
+
+def test_cubics_reproduce_polynomials_of_degree_three():
+    motion = np.polynomial.Polynomial([-3.0, 1.0]) ** 2 * np.polynomial.Polynomial([0.3, -0.2])
+    rates = [motion, motion.deriv(), motion.deriv(2)]
+    generator = held(motion(0.0))
+    knots = [0.0, 0.4, 0.41, 1.7, 3.0]
+    generator.offer(one([(t, *(rate(t) for rate in rates[:2])) for t in knots]))
+    for t in np.arange(0, 3, 0.01):
+        assert at(generator, t) == pytest.approx([rate(t) for rate in rates], rel=1e-11, abs=1e-11)
+
+
+@pytest.mark.parametrize("fields", [1, 2, 3])
+def test_the_reference_is_as_smooth_at_the_points_as_their_fields(fields):
+    rng = np.random.default_rng(1)
+    rows = rng.normal(size=(6, 3))
+    rows[-1, 1:] = 0.0
+    generator = held(0.1)
+    generator.offer(one([(0.3 * (i + 1), *row[:fields]) for i, row in enumerate(rows)], stamp=0.05))
+    for i, row in enumerate(rows):
+        knot = round((0.05 + 0.3 * (i + 1)) * S)
+        for instant in (knot - 1, knot):
+            generator.sample(instant)
+            state = (generator.position[0], generator.velocity[0], generator.acceleration[0])
+            np.testing.assert_allclose(state[:fields], row[:fields], atol=1e-5)
+
+
+@pytest.mark.parametrize("fields", [1, 2, 3])
+def test_a_new_trajectory_takes_over_smoothly(fields):
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0, 0.0, 0.0)]))
+    at(generator, 0)
+    before = at(generator, 0.4)
+    generator.offer(one([(0.5, -1.0, 0.0, 0.0)[: fields + 1]], stamp=0.4))
+    after = at(generator, 0.4)
+    # linear: position; cubic: velocity too; quintic: acceleration too
+    assert after[:fields] == before[:fields]
+    assert before[1] > 1.0
+    assert at(generator, 0.4 + 1e-9)[:fields] == pytest.approx(before[:fields], abs=1e-5)
+    assert at(generator, 0.9) == (-1.0, 0.0, 0.0)
+
+
+def test_all_joints_are_joined_alike_and_apart():
+    generator = ReferenceGenerator(ARM)
+    generator.start([0.0, 10.0], 0)
+    generator.offer(validate(ARM, ARM, 0, [point(1, [1, 9]), point(2, [1, 5])]))
+    generator.sample(0)
+    generator.sample(S // 2)
+    np.testing.assert_array_equal(generator.position, [0.5, 9.5])
+    np.testing.assert_array_equal(generator.velocity, [1.0, -1.0])
+    generator.sample(3 * S // 2)
+    np.testing.assert_array_equal(generator.position, [1.0, 7.0])
+    np.testing.assert_array_equal(generator.velocity, [0.0, -4.0])
+
+
+# --------------------------------------------------------------------------- when
+
+
+def test_stamp_zero_starts_at_the_first_sample_after_the_offer():
+    generator = held(0.0, stamp=5)
+    at(generator, 6)
+    verdict = generator.offer(one([(1, 1.0)]))
+    assert (verdict.accepted, verdict.trajectory_id, verdict.repeat) == (True, 1, False)
+    assert verdict.reason == "starts at the next sample"
+    assert not generator.active
+    assert at(generator, 9)[0] == 0.0
+    assert generator.active
+    assert not generator.finished
+    assert at(generator, 9.5)[0] == 0.5
+    assert at(generator, 10) == (1.0, 0.0, 0.0)
+    assert not generator.active
+    assert generator.finished
+
+
+def test_a_future_stamp_waits_and_starts_between_samples():
+    generator = held(0.0)
+    verdict = generator.offer(one([(1, 1.0)], stamp=2.0005))
+    assert verdict.reason == "starts at 2.0005 s"
+    assert at(generator, 2.0) == (0.0, 0.0, 0.0)
+    assert not generator.active
+    assert at(generator, 2.001)[0] == pytest.approx(0.0005, abs=1e-12)
+    assert generator.active
+
+
+def test_until_a_future_stamp_the_old_trajectory_is_followed():
+    generator = held(0.0)
+    generator.offer(one([(4, 4.0)]))
+    at(generator, 0)
+    generator.offer(one([(1, 0.0)], stamp=2))
+    assert at(generator, 1.5)[0] == 1.5
+    assert at(generator, 2.25)[0] == 1.5  # half a second of one that goes from 2 to 0 in 1 s
+    assert at(generator, 3.0)[0] == 0.0
+    assert generator.finished
+
+
+def test_a_past_stamp_is_refused():
+    generator = held(0.0)
+    at(generator, 3)
+    verdict = generator.offer(one([(1, 1.0)], stamp=2.75))
+    assert (verdict.accepted, verdict.trajectory_id) == (False, 0)
+    assert verdict.reason == "starts at 2.75 s, 0.25 s in the past; use stamp 0 for now"
+    assert generator.offer(one([(1, 1.0)], stamp=3)).accepted
+    assert at(generator, 3.5)[0] == 0.5
+
+
+def test_nothing_is_accepted_before_there_is_a_state():
+    generator = ReferenceGenerator(["a"])
+    assert generator.offer(one([(1, 1.0)])).reason.startswith("no state yet")
+    with pytest.raises(TrajectoryError, match="no state yet"):
+        generator.sample(0)
+    with pytest.raises(TrajectoryError, match="no state yet"):
+        generator.stop(0, 1.0)
+
+
+def test_a_trajectory_for_other_joints_is_refused():
+    verdict = held(0.0).offer(validate(ARM, ARM, 0, [GOOD]))
+    assert verdict.reason == "the trajectory is for a, b, this is a: validate it for this arm"
+
+
+def test_a_repeat_does_not_restart_the_motion():
+    generator = held(0.0)
+    rows = [(1, 1.0, 0.5, 0.0), (2, 1.5, 0.0, 0.0)]
+    generator.offer(one(rows))
+    at(generator, 0)
+    half = at(generator, 0.5)
+    for _ in range(3):
+        verdict = generator.offer(one(rows))
+        assert (verdict.accepted, verdict.repeat) == (False, True)
+        assert (verdict.trajectory_id, verdict.reason) == (1, "repeat of trajectory 1")
+        assert at(generator, 0.5) == half
+    at(generator, 5)
+    assert generator.offer(one(rows)).repeat  # after its end as well
+    assert generator.accepted_id == 1
+
+
+def test_a_repeat_with_a_stamp_is_a_repeat_and_not_in_the_past():
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0)], stamp=1))
+    at(generator, 3)
+    assert generator.offer(one([(1, 1.0)], stamp=1)).repeat
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        one([(1, np.nextafter(1.0, 2), 0.0)]),
+        one([(1.001, 1.0, 0.0)]),
+        one([(1, 1.0)]),
+        one([(1, 1.0, 0.0, 0.0)]),
+        one([(0.5, 0.5, 0.0), (1, 1.0, 0.0)]),
+        one([(1, 1.0, 0.0)], stamp=7),
+    ],
+)
+def test_what_differs_is_no_repeat(other):
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0, 0.0)]))
+    assert generator.offer(other).accepted
+
+
+def test_a_superseded_trajectory_is_no_repeat():
+    generator = held(0.0)
+    first, second = one([(1, 1.0)]), one([(1, 2.0)])
+    assert [generator.offer(t).trajectory_id for t in (first, second, first)] == [1, 2, 3]
+
+
+def test_what_is_refused_changes_nothing():
+    generator = held(0.0)
+    trajectory = one([(1, 1.0)])
+    generator.offer(trajectory)
+    at(generator, 0)
+    at(generator, 0.5)
+    assert not generator.offer(one([(0, 3.0)])).accepted
+    assert not generator.offer(one([(1, 3.0)], stamp=0.1)).accepted
+    assert at(generator, 0.75)[0] == 0.75
+    assert generator.offer(trajectory).repeat
+
+
+def test_a_new_future_trajectory_replaces_the_pending_one():
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0)], stamp=2))
+    verdict = generator.offer(one([(1, -1.0)], stamp=3))
+    assert verdict.reason == "starts at 3 s; replaces trajectory 1, which had not started"
+    assert at(generator, 2.5)[0] == 0.0
+    assert at(generator, 3.5)[0] == -0.5
+
+
+def test_one_that_starts_now_replaces_the_pending_one():
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0)], stamp=2))
+    assert "replaces trajectory 1" in generator.offer(one([(1, -1.0)])).reason
+    at(generator, 0)
+    assert at(generator, 2.5)[0] == -1.0
+
+
+def test_a_future_one_leaves_alone_what_starts_at_the_next_sample():
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0)]))
+    assert generator.offer(one([(0, 1.0), (1, 3.0)], stamp=2)).accepted
+    at(generator, 0)
+    assert at(generator, 0.5)[0] == 0.5
+    assert at(generator, 2.5)[0] == 2.0
+
+
+def test_of_two_that_are_due_the_newer_is_followed():
+    generator = held(0.0)
+    generator.offer(one([(1, 1.0)]))
+    generator.offer(one([(1, -1.0)], stamp=0.5))
+    assert at(generator, 1.0)[0] == -0.5
+    assert at(generator, 1.5)[0] == -1.0
+
+
+def test_a_first_point_at_zero_must_be_near_the_reference():
+    generator = held(0.5)
+    assert generator.offer(one([(0, 0.509), (1, 1.0)])).accepted
+    generator = held(0.5)
+    verdict = generator.offer(one([(0, 0.511), (1, 1.0)]))
+    assert not verdict.accepted
+    assert "0.011 rad from the reference of joint a" in verdict.reason
+    assert "start_tolerance 0.01 rad: give the first point a time_from_start > 0" in verdict.reason
+    assert held(0.5, start_tolerance=0.02).offer(one([(0, 0.511), (1, 1.0)])).accepted
+
+
+def test_a_first_point_at_zero_of_a_future_start_is_judged_by_the_reference_then():
+    generator = held(0.0)
+    generator.offer(one([(4, 4.0)]))
+    at(generator, 0)
+    assert not generator.offer(one([(0, 0.0), (1, 1.0)], stamp=2)).accepted
+    assert generator.offer(one([(0, 2.0), (1, 1.0)], stamp=2)).accepted
+    assert at(generator, 2) == (2.0, -1.0, 0.0)
+    assert at(generator, 1.999)[0] == 2.0  # back in time, before the start: the state there
+
+
+def test_a_speed_to_the_first_point_beyond_the_limit_is_refused():
+    generator = held(0.0, velocity_max=[2.0])
+    verdict = generator.offer(one([(0.25, 1.0), (2, 1.0)]))
+    assert verdict.reason.startswith("joint a would move at 4 rad/s on average to reach points[0]")
+    assert generator.offer(one([(0.5, 1.0)])).accepted
+
+
+def test_samples_are_the_same_in_any_order():
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(50, 3))
+    rows[-1, 1] = 0.0
+    trajectory = one([(0.1 * i, *row) for i, row in enumerate(rows)], stamp=1)
+    stamps = np.sort(rng.integers(S, 7 * S, 300))
+
+    def reference(order):
+        generator = held(rows[0, 0])
+        generator.offer(trajectory)
+        generator.sample(S)
+        samples = {}
+        for i in order:
+            generator.sample(int(stamps[i]))
+            samples[i] = generator._state.tobytes()
+        return [samples[i] for i in range(len(stamps))]
+
+    forward = reference(range(len(stamps)))
+    assert reference(reversed(range(len(stamps)))) == forward
+    assert reference(rng.permutation(len(stamps))) == forward
+
+
+def test_a_single_point_at_zero_ends_at_once():
+    generator = held(0.0)
+    generator.offer(one([(0, 0.005)]))
+    assert at(generator, 1) == (0.005, 0.0, 0.0)
+    assert generator.finished
+
+
+def test_start_holds_and_forgets():
+    generator = held(0.0)
+    trajectory = one([(1, 1.0)])
+    generator.offer(trajectory)
+    at(generator, 0)
+    at(generator, 0.5)
+    generator.start([0.25], S)
+    assert at(generator, 2) == (0.25, 0.0, 0.0)
+    assert not generator.active
+    assert generator.offer(trajectory).trajectory_id == 2
+
+
+def test_reset_forgets_everything():
+    generator = held(0.0)
+    trajectory = one([(1, 1.0)])
+    generator.offer(trajectory)
+    at(generator, 100)
+    generator.reset()
+    assert generator.accepted_id == 0
+    assert generator.position[0] == 0.0
+    assert generator.offer(trajectory).reason.startswith("no state yet")
+    generator.start([0.5], 0)
+    verdict = generator.offer(trajectory)
+    assert (verdict.accepted, verdict.trajectory_id) == (True, 1)
+
+
+@pytest.mark.parametrize(
+    ("position", "message"),
+    [
+        ([0.0, 0.0], r"shape \(2,\), the joints have \(1,\)"),
+        ([float("nan")], "joint a is nan rad"),
+        (["x"], "give one number per joint"),
+    ],
+)
+def test_a_position_that_can_not_be_held_is_refused(position, message):
+    generator = held(0.75)
+    with pytest.raises(TrajectoryError, match=message):
+        generator.start(position, S)
+    assert at(generator, 1)[0] == 0.75
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, float("nan"), float("inf")])
+def test_a_start_tolerance_out_of_range_is_refused(tolerance):
+    with pytest.raises(TrajectoryError, match="start_tolerance is"):
+        ReferenceGenerator(["a"], start_tolerance=tolerance)
+
+
+# --------------------------------------------------------------------------- stop
+
+
+def test_a_stop_brakes_along_a_cubic_velocity():
+    # From 2 rad/s without acceleration, bound 3 rad/s^2: T = 1.5 * 2 / 3 = 1 s over v T / 2 = 1
+    # rad; in the middle half the velocity, 3/4... of v (s - s^3 + s^4 / 2) = 2 (13 / 32) rad.
+    generator = held(0.0)
+    generator.offer(one([(5, 10.0)]))
+    at(generator, 0)
+    before = at(generator, 1)
+    generator.stop(S, 3.0)
+    assert at(generator, 1) == before
+    assert generator.stopping
+    assert not generator.active
+    assert at(generator, 1.5) == pytest.approx((2 + 13 / 16, 1.0, -3.0), abs=1e-12)
+    assert at(generator, 2) == (pytest.approx(3.0, abs=1e-12), 0.0, 0.0)
+    assert not generator.stopping
+    assert not generator.finished
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    st.floats(0.1, 10.0),
+)
+def test_a_stop_is_smooth_bounded_and_never_turns_back(velocity, acceleration, bound):
+    names = ["a", "b", "c"]
+    generator = ReferenceGenerator(names)
+    generator.start([1.0, 2.0, 3.0], 0)
+    rest = [0.0] * 3
+    points = [
+        point(0, [1.0, 2.0, 3.0], velocity, acceleration),
+        point(1, [1.0, 2.0, 3.0], rest, rest),
+    ]
+    generator.offer(validate(names, names, 0, points))
+    generator.sample(0)
+    v, a = generator.velocity.copy(), generator.acceleration.copy()
+    np.testing.assert_array_equal(v, velocity)
+    generator.stop(0, bound)
+    generator.sample(0)
+    np.testing.assert_array_equal(generator.position, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(generator.velocity, v)
+    np.testing.assert_allclose(generator.acceleration, a, rtol=1e-12)
+    limit = np.maximum(bound, np.abs(a)) + 1e-9
+    # Only what was almost at rest may, over the least duration T, overshoot by a T max s (1 - s)^2.
+    back = np.abs(a) * BRAKING_STEP * 4 / 27 + 1e-9
+    for i in range(1, 200):
+        generator.sample(i * generator._path.duration_ns // 199)
+        assert (generator.velocity * np.sign(v) >= -back).all()
+        assert (np.abs(generator.acceleration) <= limit).all()
+    assert not generator.stopping
+    np.testing.assert_array_equal(generator.velocity, 0.0)
+
+
+def test_joints_at_rest_stay_near_where_they_are_in_a_stop():
+    generator = ReferenceGenerator(ARM)
+    generator.start([0.0, 1.0], 0)
+    points = [point(0, [0, 1], [1, 0], [0, 4]), point(1, [1, 2], [0, 0], [0, 0])]
+    generator.offer(validate(ARM, ARM, 0, points))
+    generator.sample(0)
+    assert generator.acceleration[1] == 4.0
+    generator.stop(0, 1.0)
+    for stamp in range(0, 2 * S, S // 50):
+        generator.sample(stamp)
+        # to rest over one step from 4 rad/s^2: a T^2 / 12
+        assert generator.position[1] == pytest.approx(1 + (4e-4 / 12 if stamp else 0), abs=1e-15)
+        assert generator.velocity[1] == 0.0
+
+
+def test_a_stop_cancels_what_is_followed_and_what_waits():
+    generator = held(0.0)
+    trajectory = one([(1, 1.0)])
+    generator.offer(trajectory)
+    at(generator, 0)
+    at(generator, 0.5)
+    generator.offer(one([(1, 7.0)], stamp=5))
+    generator.stop(S // 2, 1.5)
+    assert at(generator, 9)[0] == pytest.approx(1.0, abs=1e-12)  # 0.5 + v T / 2, T = 1 s
+    verdict = generator.offer(trajectory)
+    assert (verdict.accepted, verdict.trajectory_id) == (True, 3)
+
+
+def test_a_trajectory_takes_over_from_a_stop():
+    generator = held(0.0)
+    generator.offer(one([(5, 10.0)]))
+    at(generator, 0)
+    at(generator, 1)
+    generator.stop(S, 3.0)
+    before = at(generator, 1.5)
+    generator.offer(one([(1, 5.0, 0.0, 0.0)], stamp=1.5))
+    assert at(generator, 1.5) == before
+    assert generator.active
+    assert at(generator, 2.5) == (5.0, 0.0, 0.0)
+
+
+def test_a_stop_of_a_hold_holds():
+    generator = held(0.5)
+    generator.stop(S, 1.0)
+    assert at(generator, 1) == (0.5, 0.0, 0.0)
+    assert at(generator, 2) == (0.5, 0.0, 0.0)
+    assert not generator.stopping
+
+
+@pytest.mark.parametrize(
+    ("deceleration", "message"),
+    [
+        (0.0, "deceleration of joint a is 0.0 rad/s.2: it must be finite and above 0"),
+        (float("nan"), "deceleration of joint a is nan"),
+        (float("inf"), "deceleration of joint a is inf"),
+        ([1.0, 2.0], "give a number, or one per joint"),
+        ("x", "deceleration is 'x'"),
+        (1e-6, "joint a would take 3e.06 s to stop from 2 rad/s, more than 3600 s"),
+    ],
+)
+def test_a_stop_that_can_not_be_made_is_refused_and_changes_nothing(deceleration, message):
+    generator = held(0.0)
+    generator.offer(one([(5, 10.0)]))
+    at(generator, 0)
+    with pytest.raises(TrajectoryError, match=message):
+        generator.stop(0, deceleration)
+    assert at(generator, 1)[0] == 2.0

@@ -1,0 +1,1 @@
+"""Dynamics of arms with flexible links; no ROS anywhere in this package."""

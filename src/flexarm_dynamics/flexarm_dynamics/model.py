@@ -1,0 +1,239 @@
+r"""What every model of an arm offers, and the terms of the equations of motion (2).
+
+.. math::
+    M(q,\delta)\begin{bmatrix}\ddot q\\ \ddot\delta\end{bmatrix}
+    + \begin{bmatrix}f_1\\f_2\end{bmatrix}
+    + \begin{bmatrix}C_1\dot\delta\\C_2\dot\delta\end{bmatrix}
+    + \begin{bmatrix}K_1\delta\\K_2\delta\end{bmatrix}
+    = \begin{bmatrix}u\\0\end{bmatrix} \qquad (2)
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import registry
+from .errors import ModelError, ShapeError
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Terms of (2) at one state, for n joints and m modal coordinates.
+
+    Attributes
+    ----------
+    M : ndarray, shape (n + m, n + m)
+        Mass matrix.
+    f1, f2 : ndarray, shape (n,), (m,)
+        Coriolis, centrifugal, gravitational and friction terms.
+    C1, C2 : ndarray, shape (n, m), (m, m)
+        What multiplies the deflection rates; structural damping is in C2.
+    K1, K2 : ndarray, shape (n, m), (m, m)
+        What multiplies the deflections; K2 holds the elastic and the centrifugal stiffness.
+    """
+
+    M: np.ndarray
+    f1: np.ndarray
+    f2: np.ndarray
+    C1: np.ndarray
+    C2: np.ndarray
+    K1: np.ndarray
+    K2: np.ndarray
+
+    @property
+    def n(self):
+        """Number of joints."""
+        return self.f1.size
+
+    @property
+    def H(self):
+        """Inverse of the mass matrix, (3)."""
+        return np.linalg.inv(self.M)
+
+    def partition(self):
+        """H11, H12, H21, H22 of (3)."""
+        n, H = self.n, self.H
+        return H[:n, :n], H[:n, n:], H[n:, :n], H[n:, n:]
+
+
+class ArmModel(ABC):
+    """A model of an arm: equations of motion, kinematics of the tip, energy.
+
+    The vectors are q (n,) [rad] and delta (m,) [m for bending, rad for twist]; the state of the integrators
+    is (q, delta, qd, delta_d).
+    """
+
+    def __init__(self, arm):
+        self.arm = arm
+        self.joint_names = arm.joint_names
+        self.mode_names = arm.mode_names
+
+    @property
+    def n_joints(self):
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @property
+    def n_modes(self):
+        """Number of modal coordinates m."""
+        return len(self.mode_names)
+
+    @abstractmethod
+    def terms(self, q, qd, delta=None, delta_d=None):
+        """Terms of (2).
+
+        Without deflections, the paper's control model: a) H does not depend on the deflections, b) no
+        products of deflections, so that C1 and K1 depend on the joints alone.
+
+        Returns
+        -------
+        Terms
+        """
+
+    @abstractmethod
+    def kinetic_energy(self, q, qd, delta, delta_d):
+        """Kinetic energy [J]."""
+
+    @abstractmethod
+    def potential_energy(self, q, delta):
+        """Elastic and gravitational energy [J]."""
+
+    @abstractmethod
+    def tip_position(self, q, delta):
+        """Position of the last link's tip in the base frame, shape (3,) [m]."""
+
+    @abstractmethod
+    def tip_velocity(self, q, qd, delta, delta_d):
+        """Velocity of the last link's tip in the base frame, shape (3,) [m/s]."""
+
+    @abstractmethod
+    def tip_deflection(self, delta):
+        """Deflection of the last link's tip in its own base frame, shape (2,): along y and z [m]."""
+
+    @abstractmethod
+    def mode_shapes(self, link, direction):
+        """`beam.ModeShapes` of a link in a direction."""
+
+    @abstractmethod
+    def friction_table(self):
+        """Viscous, Coulomb and smoothing speed of each joint, shape (n, 3)."""
+
+    @abstractmethod
+    def stepper(self, tableau, weights):
+        """Compiled fixed-step explicit Runge-Kutta integrator.
+
+        Parameters
+        ----------
+        tableau, weights : ndarray, shape (p, p), (p,)
+            Butcher coefficients.
+
+        Returns
+        -------
+        callable
+            ``advance(state, torque, step, substeps, friction)``, which overwrites the state; torque (n,) is
+            constant meanwhile, friction (n, 3) is as in `friction_table`.
+        """
+
+    def friction(self, qd):
+        """Friction torque of the joints, shape (n,) [N m]: ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
+        viscous, coulomb, smoothing = self.friction_table().T
+        return viscous * qd + coulomb * np.tanh(qd / smoothing)
+
+    def derivative(self, state, torque):
+        """Time derivative of the state (q, delta, qd, delta_d): the form (6), ready for scipy.
+
+        Parameters
+        ----------
+        state : ndarray, shape (2 (n + m),)
+        torque : ndarray, shape (n,)
+
+        Returns
+        -------
+        ndarray, shape (2 (n + m),)
+        """
+        n, m = self.n_joints, self.n_modes
+        if np.shape(state) != (2 * (n + m),):
+            raise ShapeError(f"state has shape {np.shape(state)}, wanted {(2 * (n + m),)}")
+        q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
+        t = self.terms(q, qd, delta, delta_d)
+        force = np.concatenate(
+            [
+                np.asarray(torque, float) - t.f1 - t.C1 @ delta_d - t.K1 @ delta,
+                -t.f2 - t.C2 @ delta_d - t.K2 @ delta,
+            ]
+        )
+        return np.concatenate([qd, delta_d, np.linalg.solve(t.M, force)])
+
+    def energy(self, state):
+        """Total energy of a state [J]."""
+        n, m = self.n_joints, self.n_modes
+        q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
+        return self.kinetic_energy(q, qd, delta, delta_d) + self.potential_energy(q, delta)
+
+    def frequencies(self, q=None, locked=False):
+        """Undamped natural frequencies at rest, ascending [rad/s].
+
+        Parameters
+        ----------
+        q : ndarray, shape (n,), optional
+            Where; zero if not given.
+        locked : bool
+            Joints locked, or free (rigid-body zeros are left out).
+        """
+        n = self.n_joints
+        t = self.terms(np.zeros(n) if q is None else np.asarray(q, float), np.zeros(n))
+        mass = t.M[n:, n:]
+        if not locked:
+            # Joints free: what is left of the modal inertia once the joints give way.
+            mass = mass - t.M[n:, :n] @ np.linalg.solve(t.M[:n, :n], t.M[:n, n:])
+        squares = np.linalg.eigvals(np.linalg.solve(mass, t.K2)).real
+        return np.sqrt(np.sort(squares))
+
+
+def build(arm):
+    """The model that an arm file names, found through the entry points `flexarm.models`.
+
+    Parameters
+    ----------
+    arm : Arm
+
+    Returns
+    -------
+    ArmModel
+
+    Raises
+    ------
+    UnknownComponentError
+        When no installed package has a model of that name.
+    ModelError
+        When that model can't represent this arm.
+    """
+    return registry.find("flexarm.models", arm.model)(arm)
+
+
+def damping_matrix(M22, K, ratios):
+    r"""Modal damping :math:`D = M_{22}\Psi\,\mathrm{diag}(2\zeta_i\omega_i)\,\Psi^T M_{22}` of the clamped modes.
+
+    Parameters
+    ----------
+    M22, K : ndarray, shape (m, m)
+        Modal mass and stiffness.
+    ratios : sequence of float
+        Damping ratios by ascending frequency; shorter than m: the last one repeats; empty: none.
+
+    Returns
+    -------
+    ndarray, shape (m, m)
+    """
+    from scipy.linalg import eigh
+
+    m = K.shape[0]
+    if not len(ratios):
+        return np.zeros((m, m))
+    zeta = np.array([ratios[min(i, len(ratios) - 1)] for i in range(m)])
+    squares, psi = eigh(K, M22)
+    if squares.min() <= 0.0:
+        raise ModelError(f"stiffness is not positive definite (eigenvalue {squares.min():.3g})")
+    left = M22 @ psi
+    return left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T

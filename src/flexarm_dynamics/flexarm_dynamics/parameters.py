@@ -1,0 +1,184 @@
+"""Declared parameters: one declaration gives type, unit, range, default and description.
+
+From it come the validation, the ROS parameter descriptors and the tables in the documentation.
+Nothing here knows ROS.
+"""
+
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from .errors import ParameterError
+
+KINDS = ("float", "int", "bool", "string", "float_array", "string_array")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One declared parameter.
+
+    Parameters
+    ----------
+    name : str
+        Dotted name, without the prefix of the component (`kp`, not `slow.kp`).
+    kind : str
+        One of `KINDS`.
+    default : object
+        The default. A float array of one element stands for that value in every place.
+    description : str
+        What it does, in a sentence.
+    unit : str
+        The unit, `-` for none.
+    low, high : float, optional
+        Closed range of every element.
+    choices : tuple of str, optional
+        The values that a string may take.
+    length : str or int, optional
+        Length of an array: a number, or a name looked up in the sizes given to `check`
+        (`joints`, `modes`, `z`). An array of one element is spread to that length.
+    read_only : bool
+        Whether the value is fixed once the node has started.
+    """
+
+    name: str
+    kind: str
+    default: object
+    description: str
+    unit: str = "-"
+    low: float | None = None
+    high: float | None = None
+    choices: tuple = ()
+    length: str | int | None = None
+    read_only: bool = False
+
+    def check(self, value, sizes: Mapping[str, int] | None = None, prefix: str = ""):
+        """Return `value` in its canonical type, or say why it can't be used.
+
+        Parameters
+        ----------
+        value : object
+            The value as it came from a file, a message or a caller.
+        sizes : mapping, optional
+            Lengths by name, for arrays whose `length` is a name.
+        prefix : str
+            Put before the name in error messages.
+
+        Returns
+        -------
+        float, int, bool, str or list
+            The value; arrays as lists of their full length.
+
+        Raises
+        ------
+        ParameterError
+            Naming the parameter, the value and the limit.
+        """
+        where = prefix + self.name
+        if self.kind == "bool":
+            if not isinstance(value, bool):
+                raise ParameterError(f"{where}: {value!r} is not a boolean: write true or false")
+            return value
+        if self.kind == "string":
+            if not isinstance(value, str):
+                raise ParameterError(f"{where}: {value!r} is not a string")
+            if self.choices and value not in self.choices:
+                raise ParameterError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
+            return value
+        if self.kind == "string_array":
+            if isinstance(value, str) or not isinstance(value, Sequence):
+                raise ParameterError(f"{where}: {value!r} is not a list of strings")
+            if not all(isinstance(item, str) for item in value):
+                raise ParameterError(f"{where}: {list(value)!r} holds what is not a string")
+            return list(value)
+        if self.kind == "int":
+            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+                raise ParameterError(f"{where}: {value!r} is not an integer")
+            return int(self._in_range(where, value))
+        if self.kind == "float":
+            return self._float(where, value)
+        return self._float_array(where, value, sizes or {})
+
+    def _float(self, where, value):
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise ParameterError(f"{where}: {value!r} is not a number")
+        if isinstance(value, numbers.Integral):
+            raise ParameterError(
+                f"{where}: {value!r} is an integer where a float is asked for: write {float(value)}"
+            )
+        return float(self._in_range(where, value))
+
+    def _float_array(self, where, value, sizes):
+        if isinstance(value, str) or not hasattr(value, "__len__"):
+            raise ParameterError(f"{where}: {value!r} is not a list of numbers")
+        value = list(value)
+        if value and all(
+            isinstance(v, numbers.Integral) and not isinstance(v, bool) for v in value
+        ):
+            wanted = ", ".join(str(float(v)) for v in value)
+            raise ParameterError(
+                f"{where}: {[int(v) for v in value]} is a list of integers where floats are asked"
+                f" for: write [{wanted}]"
+            )
+        out = [self._float(f"{where}[{i}]", v) for i, v in enumerate(value)]
+        if self.length is None:
+            return out
+        wanted = self.length if isinstance(self.length, int) else sizes.get(self.length)
+        if wanted is None:
+            return out
+        if len(out) == 1:
+            return out * wanted
+        if len(out) != wanted:
+            what = f" ({self.length})" if isinstance(self.length, str) else ""
+            raise ParameterError(
+                f"{where}: {len(out)} values where {wanted}{what} are needed; one value stands for all"
+            )
+        return out
+
+    def _in_range(self, where, value):
+        if not math.isfinite(value):
+            raise ParameterError(f"{where}: {value} is not finite")
+        if self.low is not None and value < self.low:
+            raise ParameterError(
+                f"{where}: {value} is below its lower limit {self.low} [{self.unit}]"
+            )
+        if self.high is not None and value > self.high:
+            raise ParameterError(
+                f"{where}: {value} is above its upper limit {self.high} [{self.unit}]"
+            )
+        return value
+
+
+def check_all(declared, values, sizes=None, prefix=""):
+    """Check a mapping of values against declarations, filling in defaults.
+
+    Parameters
+    ----------
+    declared : sequence of Parameter
+        What there may be.
+    values : mapping
+        Name to value; what is missing takes its default.
+    sizes : mapping, optional
+        Lengths by name.
+    prefix : str
+        Put before names in error messages.
+
+    Returns
+    -------
+    dict
+        Every declared name with its checked value.
+
+    Raises
+    ------
+    ParameterError
+        For an unknown name or an unusable value.
+    """
+    known = {p.name: p for p in declared}
+    for name in values:
+        if name not in known:
+            raise ParameterError(
+                f"{prefix}{name}: no such parameter; there are {', '.join(sorted(known)) or 'none'}"
+            )
+    return {
+        name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()
+    }

@@ -1,0 +1,39 @@
+"""Components found by name through Python entry points, so that a user's package adds one."""
+
+import difflib
+from functools import cache
+from importlib.metadata import entry_points
+
+from .errors import UnknownComponentError
+
+
+@cache
+def names(group):
+    """Sorted names that installed packages provide in an entry-point group."""
+    return tuple(sorted({e.name for e in entry_points(group=group)}))
+
+
+@cache
+def find(group, name):
+    """The class registered as `name` in `group`, for example ``flexarm.slow_laws``.
+
+    Raises
+    ------
+    UnknownComponentError
+        Listing what there is; or saying why a registered one can't be imported.
+    """
+    found = [e for e in entry_points(group=group) if e.name == name]
+    if not found:
+        close = difflib.get_close_matches(name, names(group), 1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise UnknownComponentError(
+            f"{group}: {name!r} is provided by no installed package (there are:"
+            f" {', '.join(names(group)) or 'none; is the workspace built and sourced?'}){hint}"
+        )
+    try:
+        return found[0].load()
+    except Exception as error:
+        raise UnknownComponentError(
+            f"{group}: {name!r} ({found[0].value}) can't be imported:"
+            f" {type(error).__name__}: {error}"
+        ) from error

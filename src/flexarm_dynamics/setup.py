@@ -1,0 +1,24 @@
+from setuptools import find_packages, setup
+
+name = "flexarm_dynamics"
+
+setup(
+    name=name,
+    version="0.1.0",
+    description="Arms with flexible links: beams, assumed modes, equations of motion, strain map, slow and fast subsystems. No ROS.",
+    license="Apache-2.0",
+    maintainer="flexarm maintainers",
+    maintainer_email="maintainers@flexarm.invalid",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
+        (f"share/{name}", ["package.xml"]),
+    ],
+    zip_safe=False,
+    entry_points={
+        "flexarm.models": [
+            "one_link = flexarm_dynamics.one_link:OneLink",
+            "paper_appendix = flexarm_dynamics.paper_appendix:PaperAppendix",
+        ],
+    },
+)

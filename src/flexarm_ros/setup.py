@@ -1,0 +1,18 @@
+from setuptools import find_packages, setup
+
+name = "flexarm_ros"
+
+setup(
+    name=name,
+    version="0.1.0",
+    description="What the nodes of flexarm share: lifecycle, parameters, messages to arrays and back, diagnostics.",
+    license="Apache-2.0",
+    maintainer="flexarm maintainers",
+    maintainer_email="maintainers@flexarm.invalid",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
+        (f"share/{name}", ["package.xml"]),
+    ],
+    zip_safe=False,
+)

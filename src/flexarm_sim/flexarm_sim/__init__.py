@@ -1,0 +1,1 @@
+"""Simulation of arms with flexible links; ROS only in `nodes`."""

@@ -1,0 +1,99 @@
+"""The arm that is simulated: its state, its motion under torque, its safe action."""
+
+import numpy as np
+from flexarm_dynamics.errors import ModelError, ShapeError
+
+from . import integrators
+
+#: Damping of the safe action `damp` where the arm file gives none: stops the rigid arm with this rate [1/s].
+DAMP_RATE = 10.0
+#: A brake's smoothing speed is raised until the explicit integrator stays stable: rate * substep.
+BRAKE_RATE_PER_STEP = 1.0
+
+
+class Plant:
+    """A simulated arm.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The plant's own model; may have more modes than the controller's.
+    period : float
+        Interval over which torque is constant [s].
+
+    Attributes
+    ----------
+    state : ndarray, shape (2 (n + m),)
+        (q, delta, qd, delta_d) [rad, m, rad/s, m/s].
+    """
+
+    def __init__(self, model, period):
+        n, m = model.n_joints, model.n_modes
+        self.model, self.period = model, period
+        self.state = np.zeros(2 * (n + m))
+        self.q, self.delta, self.qd, self.delta_d = np.split(self.state, [n, n + m, 2 * n + m])
+        self.substeps = integrators.substeps(model, period)
+        self._advance = model.stepper(integrators.TABLEAU, integrators.WEIGHTS)
+        self._friction = model.friction_table()
+        self._safe = self._friction + self._safe_friction()
+        self._safe[:, 2] = self._brake_smoothing()
+        self._no_torque = np.zeros(n)
+
+    def reset(self, position=None, delta=None):
+        """At rest, straight (or bent by `delta`), at `position` [rad]."""
+        n = self.model.n_joints
+        position = np.zeros(n) if position is None else np.asarray(position, float)
+        if position.shape != (n,):
+            raise ShapeError(f"initial position has shape {position.shape}, wanted {(n,)}")
+        self.state[:] = 0.0
+        self.q[:] = position
+        if delta is not None:
+            self.delta[:] = delta
+
+    def advance(self, torque):
+        """One period under constant torque, shape (n,) [N m]."""
+        self._run(torque, self._friction)
+
+    def advance_safely(self):
+        """One period without drive torque, under each joint's safe action."""
+        self._run(self._no_torque, self._safe)
+
+    def _run(self, torque, friction):
+        self._advance(self.state, torque, self.period / self.substeps, self.substeps, friction)
+        if not np.isfinite(self.state).all():
+            raise ModelError(
+                f"the state of {self.model.arm.name} is no longer finite: torque or speed beyond what its"
+                " model holds for; reset the simulator"
+            )
+
+    def _safe_friction(self):
+        """What the safe action adds to friction: viscous, Coulomb, (unused); shape (n, 3)."""
+        table = np.zeros((self.model.n_joints, 3))
+        inertia = self._inertia()
+        for i, joint in enumerate(self.model.arm.joints):
+            if joint.safe_action == "damp":
+                given = joint.damp_coefficient
+                table[i, 0] = DAMP_RATE * inertia[i] if given is None else given
+            elif joint.safe_action == "brake":
+                table[i, 0] = DAMP_RATE * inertia[i]
+                table[i, 1] = self._brake_torque(joint, inertia[i])
+        return table
+
+    def _brake_torque(self, joint, inertia):
+        if joint.brake_torque is not None:
+            return joint.brake_torque
+        # No datum: what stops the rigid arm from 1 rad/s in 0.1 s.
+        return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
+
+    def _brake_smoothing(self):
+        step = self.period / self.substeps
+        # The joint alone is quicker to stop than the rigid arm by the ratio of h11 to B of (10).
+        H11 = np.diag(self._terms().H)[: self.model.n_joints]
+        return np.maximum(self._friction[:, 2], self._safe[:, 1] * H11 * step / BRAKE_RATE_PER_STEP)
+
+    def _terms(self):
+        n = self.model.n_joints
+        return self.model.terms(np.zeros(n), np.zeros(n))
+
+    def _inertia(self):
+        return np.diag(self._terms().M)[: self.model.n_joints]

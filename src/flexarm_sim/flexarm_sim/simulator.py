@@ -1,0 +1,171 @@
+"""The simulated arm behind its sensors, sample by sample; what the simulator node calls."""
+
+from dataclasses import replace
+
+import numpy as np
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.strain_map import StrainMap
+
+from .plant import Plant
+from .sensors import Sensors
+
+PARAMETERS = (
+    Parameter(
+        "arm",
+        "string",
+        "",
+        "Arm file: a shipped name (R, P3, one_link) or a path. Names and the strain map are this file's.",
+        read_only=True,
+    ),
+    Parameter(
+        "plant_arm",
+        "string",
+        "",
+        "Arm file of the simulated arm itself, when it differs from `arm`; empty: the same.",
+        read_only=True,
+    ),
+    Parameter(
+        "plant_modes",
+        "int",
+        0,
+        "Modes per flexible direction of the simulated arm; 0: as in its file.",
+        low=0,
+        high=20,
+        read_only=True,
+    ),
+    Parameter(
+        "rate",
+        "float",
+        1000.0,
+        "Control rate: samples per second of simulated time.",
+        unit="Hz",
+        low=1.0,
+        high=20000.0,
+        read_only=True,
+    ),
+    Parameter(
+        "initial_position",
+        "float_array",
+        [0.0],
+        "Joint angles after a start or reset.",
+        unit="rad",
+        low=-100.0,
+        high=100.0,
+        length="joints",
+    ),
+    Parameter("noise", "bool", False, "Whether gauges have the noise of the arm file.", read_only=True),
+    Parameter("seed", "int", 0, "Seed of the noise.", low=0, high=2**31 - 1, read_only=True),
+    Parameter(
+        "publish_rates",
+        "bool",
+        False,
+        "Publish the true rates of the observed modes in modal_rate: for tests; no real arm has them.",
+        read_only=True,
+    ),
+    Parameter(
+        "publish_joint_velocity",
+        "bool",
+        True,
+        "Publish joint velocities; false: as a driver that has an encoder alone.",
+        read_only=True,
+    ),
+)
+
+
+class Simulator:
+    """A plant, its sensors, and time counted in samples.
+
+    Parameters
+    ----------
+    settings : mapping
+        Checked values of `PARAMETERS`.
+
+    Attributes
+    ----------
+    sequence : int
+        Number of the present sample.
+    stamp_ns : int
+        Its time [ns]: sequence times the period, from `START_NS`.
+    position, velocity, torque, strain, amplitude, rate : ndarray
+        The present sample: joint position (n,) [rad], velocity (n,) [rad/s], torque applied until now (n,)
+        [N m], strain (gauges,), modal amplitudes derived from the strains and true rates of the observed
+        modes (m,).
+    """
+
+    #: Simulated time starts here, not at 0: a stamp of 0 means "now" in a trajectory.
+    START_NS = 1_000_000_000
+
+    def __init__(self, settings):
+        self.settings = dict(settings)
+        arm = arm_file.load(settings["arm"])
+        self.arm = arm
+        self.nominal = model.build(arm)
+        plant_arm = arm_file.load(settings["plant_arm"]) if settings["plant_arm"] else arm
+        self._same_names(plant_arm)
+        if settings["plant_modes"]:
+            plant_arm = plant_arm.with_modes(settings["plant_modes"])
+        # The order of the gauges is that of the arm file the others know.
+        gauges = {g.name: g for g in plant_arm.gauges}
+        plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
+        self.plant_model = model.build(plant_arm)
+        self.period_ns = round(1e9 / settings["rate"])
+        self.plant = Plant(self.plant_model, 1e-9 * self.period_ns)
+        self.sensors = Sensors(self.plant_model, settings["noise"], settings["seed"])
+        self.strain_map = StrainMap(self.nominal) if arm.gauges else None
+        n, m = len(arm.joints), len(arm.observed_modes)
+        self.position, self.velocity = np.zeros(n), np.zeros(n)
+        self.torque, self.strain = np.zeros(n), np.zeros(len(arm.gauges))
+        self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        self._observed = [self.plant_model.mode_names.index(name) for name in arm.observed_modes]
+        self.reset()
+
+    def _same_names(self, plant_arm):
+        for what in ("joint_names", "gauge_names"):
+            mine, its = getattr(self.arm, what), getattr(plant_arm, what)
+            if set(mine) != set(its) or (what == "joint_names" and mine != its):
+                raise ModelError(
+                    f"plant_arm {plant_arm.name} has {what} {list(its)}, arm {self.arm.name} has"
+                    f" {list(mine)}: they must be the same"
+                )
+        missing = set(self.arm.observed_modes) - set(plant_arm.mode_names)
+        if missing:
+            raise ModelError(
+                f"plant_arm {plant_arm.name} lacks the modes {', '.join(sorted(missing))} that arm"
+                f" {self.arm.name} observes: raise plant_modes"
+            )
+
+    @property
+    def time(self):
+        """Time since the start of the session [s]."""
+        return 1e-9 * (self.stamp_ns - self.START_NS)
+
+    def reset(self, position=None):
+        """Back to rest at the initial position; sequence and time start again."""
+        self.plant.reset(self.settings["initial_position"] if position is None else position)
+        self.sensors.reset()
+        self.sequence, self.stamp_ns = 0, self.START_NS
+        self.torque[:] = 0.0
+        self._measure()
+
+    def advance(self, torque):
+        """One period under `torque` (n,) [N m], or under the safe actions where it is None."""
+        if torque is None:
+            self.plant.advance_safely()
+            self.torque[:] = 0.0
+        else:
+            self.plant.advance(torque)
+            self.torque[:] = torque
+        self.sequence += 1
+        self.stamp_ns += self.period_ns
+        self._measure()
+
+    def _measure(self):
+        plant = self.plant
+        self.sensors.position(plant.q, self.position)
+        self.velocity[:] = plant.qd
+        self.sensors.strain(plant.delta, self.strain)
+        if self.strain_map is not None:
+            self.strain_map.amplitudes(self.strain, self.amplitude)
+        self.rate[:] = plant.delta_d[self._observed]
