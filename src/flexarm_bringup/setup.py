@@ -7,7 +7,7 @@ name = "flexarm_bringup"
 setup(
     name=name,
     version="0.1.0",
-    description="Launch files, arm and controller files, the case study and the command line of flexarm.",
+    description="Launch files, arm and controller files, case study and command line of flexarm.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",

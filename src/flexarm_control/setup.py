@@ -5,7 +5,7 @@ name = "flexarm_control"
 setup(
     name=name,
     version="0.1.0",
-    description="Slow and fast laws, composite control, observers and trajectories for arms with flexible links, and the nodes observer and controller.",
+    description="Slow and fast laws, composite control and observers for arms with flexible links.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",

@@ -5,7 +5,7 @@ name = "flexarm_dynamics"
 setup(
     name=name,
     version="0.1.0",
-    description="Arms with flexible links: beams, assumed modes, equations of motion, strain map, slow and fast subsystems. No ROS.",
+    description="Beams, assumed modes and equations of motion of arms with flexible links.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",

@@ -5,7 +5,7 @@ name = "flexarm_ros"
 setup(
     name=name,
     version="0.1.0",
-    description="What the nodes of flexarm share: lifecycle, parameters, messages to arrays and back, diagnostics.",
+    description="What the nodes of flexarm share: lifecycle, parameters, messages, diagnostics.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",

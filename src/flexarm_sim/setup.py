@@ -5,7 +5,7 @@ name = "flexarm_sim"
 setup(
     name=name,
     version="0.1.0",
-    description="Simulator of arms with flexible links: integrators, plant, sensor models, and the node simulator.",
+    description="Simulator of arms with flexible links: integrators, plant, sensor models.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",

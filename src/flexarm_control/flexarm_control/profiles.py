@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+
 from flexarm_dynamics.errors import TrajectoryError
 
 

@@ -23,9 +23,9 @@ import operator
 import reprlib
 from array import array
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
+
 from flexarm_dynamics.errors import TrajectoryError
 
 MAX_POINTS = 10**6
@@ -196,7 +196,7 @@ def _column_order(joint_names, arm_joint_names):
 
 
 def _columns(points):
-    """Turn the points into one tuple of k entries per field."""
+    """Turn the points into one list of k entries per field."""
     try:
         points = list(points)
     except TypeError:
@@ -208,12 +208,13 @@ def _columns(points):
             f"{len(points)} points are more than the {MAX_POINTS} allowed: send fewer, "
             "farther apart"
         )
-    for index, point in enumerate(points):
-        if not isinstance(point, list | tuple) or len(point) != len(_FIELDS):
-            raise TrajectoryError(
-                f"points[{index}] is {_show(point)}: give ({', '.join(_FIELDS)}) in each point"
-            )
-    return list(zip(*points, strict=True))
+    if not set(map(type, points)) <= {tuple, list} or set(map(len, points)) != {len(_FIELDS)}:
+        for index, point in enumerate(points):
+            if not isinstance(point, tuple | list) or len(point) != len(_FIELDS):
+                raise TrajectoryError(
+                    f"points[{index}] is {_show(point)}: give ({', '.join(_FIELDS)}) in each point"
+                )
+    return [[point[i] for point in points] for i in range(len(_FIELDS))]
 
 
 def _stamp(stamp_ns):
@@ -307,20 +308,24 @@ def _lengths(name, column):
 def _numbers(name, column, n):
     """Return the values of all points, n each, one after the other, as a flat float array."""
 
-    def read(values, count):
-        # array() rather than numpy: it refuses None and strings, which numpy would convert.
-        numbers = array("d", values)
-        if len(numbers) != count:
+    # array() rather than numpy: it refuses None and strings, which numpy would convert; and it
+    # copies the array('d') of a ROS message whole.
+    numbers = array("d")
+
+    def read(column):
+        for values in column:
+            numbers.extend(values)
+        if len(numbers) != n * len(column):  # its len() has lied
             raise ValueError
-        return np.frombuffer(numbers)
 
     try:
-        return read(chain.from_iterable(column), n * len(column))
+        read(column)
     except _NOT_NUMBERS:
-        index, value = _first_failure(column, lambda values: read(iter(values), n))
+        index, value = _first_failure(column, lambda values: array("d", iter(values)))
         raise TrajectoryError(
             f"points[{index}].{name} is {_show(value)}: give {n} numbers"
         ) from None
+    return np.frombuffer(numbers)
 
 
 def _first_failure(column, convert):
@@ -527,11 +532,11 @@ class _Path:
     def evaluate(self, stamp_ns, out):
         """Fill `out` (3, n) with the state at a stamp; return whether it is before the end."""
         elapsed_ns = stamp_ns - self.start_ns
+        if elapsed_ns < 0:
+            elapsed_ns = 0  # before the start nothing is known but the state at the start
         if elapsed_ns >= self.duration_ns:
             np.copyto(out, self._end)
             return False
-        if elapsed_ns < 0:
-            elapsed_ns = 0  # before the start nothing is known but the state at the start
         if not self._low_ns <= elapsed_ns < self._high_ns:
             self._enter_segment(elapsed_ns)
         x = self._x

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+
 from flexarm_control.profiles import paper_profile, quintic, sample
 from flexarm_control.trajectory import ReferenceGenerator, validate
 from flexarm_dynamics.errors import TrajectoryError
-from scipy.integrate import quad
 
 S = 10**9  # [ns]
 PROFILES = [

@@ -1,1 +1,1 @@
-"""What the nodes of flexarm share."""
+"""What the nodes share: parameters, life cycle, quality of service, messages to arrays and back."""

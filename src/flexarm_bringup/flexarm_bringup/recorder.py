@@ -1,0 +1,178 @@
+"""Records the line as serialised messages; reads them back; writes a bag that common viewers open."""
+
+import struct
+
+import numpy as np
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.serialization import deserialize_message
+
+from .metrics import Record
+from .processes import ProcessError, installed
+
+TOPICS = {
+    "arm_state": ArmState,
+    "arm_state_estimate": ArmState,
+    "joint_torque": JointTorque,
+    "controller/state": CompositeState,
+    "observer/state": ObserverState,
+}
+
+#: Deep enough for a reader that falls behind for seconds.
+DEEP = QoSProfile(
+    history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
+)
+
+
+def raw_stamp_ns(raw):
+    """Stamp of a serialised message that begins with a header (CDR, little endian) [ns]."""
+    sec, nanosec = struct.unpack_from("<iI", raw, 4)
+    return sec * 1_000_000_000 + nanosec
+
+
+class Recorder:
+    """Keeps every message of the line, as it came, until it is read.
+
+    `poll` empties the middleware's queues without waking an executor per message: that would take a core
+    from the loop that is recorded.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Which has the subscriptions; its executor must not serve them: `poll` does.
+    """
+
+    def __init__(self, node):
+        self.raw = {topic: [] for topic in TOPICS}
+        self._subscriptions = {
+            topic: node.create_subscription(kind, topic, lambda raw: None, DEEP, raw=True)
+            for topic, kind in TOPICS.items()
+        }
+
+    def poll(self):
+        """Take what has come since the last call."""
+        for topic, subscription in self._subscriptions.items():
+            kept, handle = self.raw[topic], subscription.handle
+            with handle:
+                while (taken := handle.take_message(subscription.msg_type, True)) is not None:
+                    kept.append(taken[0])
+
+    def complete(self):
+        """Whether something has come on every topic."""
+        return all(self.raw.values())
+
+    @property
+    def latest_ns(self):
+        """Stamp of the newest torque [ns]; 0 before the first."""
+        raw = self.raw["joint_torque"]
+        return raw_stamp_ns(raw[-1]) if raw else 0
+
+    def samples(self):
+        """One serialised message per stamp and topic: what was sent again is kept once, the last time.
+
+        Returns
+        -------
+        dict
+            Topic to {stamp_ns: bytes}.
+
+        Raises
+        ------
+        ProcessError
+            When a topic lacks a sample that another one has.
+        """
+        kept = {
+            topic: {raw_stamp_ns(raw): bytes(raw) for raw in messages}
+            for topic, messages in self.raw.items()
+        }
+        # The last sample may still be under way on some topics.
+        end = min(max(stamps) for stamps in kept.values())
+        kept = {
+            topic: {s: raw for s, raw in sorted(stamps.items()) if s <= end}
+            for topic, stamps in kept.items()
+        }
+        stamps = set().union(*kept.values())
+        for topic, messages in kept.items():
+            if len(messages) != len(stamps):
+                raise ProcessError(
+                    f"recording: {len(stamps) - len(messages)} of {len(stamps)} samples of {topic} were lost"
+                )
+        return kept
+
+
+def decode(samples):
+    """Messages of `Recorder.samples`, topic to list, in order of their stamps."""
+    return {
+        topic: [deserialize_message(raw, TOPICS[topic]) for raw in messages.values()]
+        for topic, messages in samples.items()
+    }
+
+
+def to_record(messages, start_ns):
+    """A `Record` from decoded messages; time zero at `start_ns`."""
+
+    def table(topic, field):
+        rows = [getattr(m, field) for m in messages[topic]]
+        width = max(map(len, rows))
+        # Rates are empty until the observer has converged.
+        return np.array([r if len(r) else [np.nan] * width for r in rows])
+
+    stamps = [m.header.stamp for m in messages["arm_state"]]
+    time = np.array([(s.sec * 10**9 + s.nanosec - start_ns) * 1e-9 for s in stamps])
+    control, estimate = "controller/state", "arm_state_estimate"
+    return Record(
+        time=time,
+        reference=table(control, "reference_position"),
+        reference_velocity=table(control, "reference_velocity"),
+        position=table("arm_state", "joint_position"),
+        velocity=table(estimate, "joint_velocity"),
+        amplitude=table(estimate, "modal_amplitude"),
+        rate=table(estimate, "modal_rate"),
+        quasi_steady=table(control, "quasi_steady_amplitude"),
+        slow_torque=table(control, "slow_torque"),
+        fast_torque=table(control, "fast_torque"),
+        torque=table(control, "torque"),
+    )
+
+
+def write_bag(path, samples):
+    """Write `Recorder.samples` as a rosbag2 bag with MCAP storage, log times from the stamps.
+
+    Parameters
+    ----------
+    path : Path
+        Directory of the bag; must not exist.
+    samples : dict
+        Topic to {stamp_ns: bytes}.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    store = typestore()
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {
+            topic: writer.add_connection(
+                f"/{topic}", f"flexarm_msgs/msg/{TOPICS[topic].__name__}", typestore=store
+            )
+            for topic in samples
+        }
+        rows = sorted(
+            ((stamp, i, topic) for i, topic in enumerate(samples) for stamp in samples[topic]),
+        )
+        for stamp, _, topic in rows:
+            writer.write(connections[topic], stamp, samples[topic][stamp])
+
+
+def typestore():
+    """Jazzy's types with flexarm's beside them, for `rosbags`."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name in ("ArmState", "JointTorque", "CompositeState", "ObserverState"):
+        types.update(get_types_from_msg(_definition(name), f"flexarm_msgs/msg/{name}"))
+    store.register(types)
+    return store
+
+
+def _definition(name):
+    """Text of a message definition, from where colcon installed it."""
+    return installed("share", "flexarm_msgs", "msg", f"{name}.msg").read_text()

@@ -1,0 +1,259 @@
+"""Controller node: `arm_state_estimate` and `joint_trajectory` in, `joint_torque` and `controller/state` out."""
+
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from time import perf_counter
+
+from flexarm_control import arm_controller, composite, trajectory
+from flexarm_control.arm_controller import ArmController, Supervisor
+from flexarm_control.composite import FAST, SLOW, CompositeControl
+from flexarm_control.samples import ArmSample
+from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_ros import qos
+from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter, stamp_ns
+from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
+from flexarm_ros.parameters import merge
+from rclpy.parameter import Parameter as RosParameter
+from trajectory_msgs.msg import JointTrajectory
+
+SLOW_TYPE = Parameter(
+    "type",
+    "string",
+    "linear_model_following",
+    "Slow law, by its name in the entry-point group flexarm.slow_laws; none: fast control alone.",
+)
+FAST_TYPE = Parameter(
+    "type",
+    "string",
+    "lqr",
+    "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone.",
+)
+STATE_TIMEOUT = Parameter(
+    "state_timeout",
+    "float",
+    0.5,
+    "Without a state for so long the torque is disabled and the trajectory given up.",
+    unit="s",
+    low=0.01,
+    high=3600.0,
+    read_only=True,
+)
+
+
+def parameter_groups():
+    """Declared parameters of this node, by prefix."""
+
+    def laws(group):
+        return merge(*(registry.find(group, name).PARAMETERS for name in registry.names(group)))
+
+    common = (*arm_controller.PARAMETERS, arm_controller.START_TOLERANCE, STATE_TIMEOUT)
+    return {
+        "": (ARM, *common),
+        "slow.": (SLOW_TYPE, *laws(SLOW)),
+        "fast.": (FAST_TYPE, *laws(FAST)),
+    }
+
+
+class ControllerNode(ArmNode):
+    """Messages to arrays, one call of `ArmController`, arrays to messages."""
+
+    def __init__(self):
+        super().__init__("controller", parameter_groups())
+        # Redesign (Riccati) happens here, off the control path; one at a time, in order.
+        self._designer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
+
+    def build(self):
+        parameters = self.parameters
+        self.arm = arm_file.load(parameters["arm"])
+        self.model = model.build(self.arm)
+        parameters.resolve(composite.sizes(self.model))
+        law = CompositeControl(self.model, self._design(SLOW), self._design(FAST))
+        settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
+        self.core = ArmController(self.model, law, settings, parameters["start_tolerance"])
+        self._good = self._law_parameters()
+        parameters.on_change(self._changed)
+        arm = self.arm
+        self._reader = StateReader(arm)
+        self._sample = ArmSample(len(arm.joints), len(arm.modes))
+        # Drawn afresh at each start: two controllers on one arm are told apart by it.
+        self._torque = TorqueWriter(arm, int.from_bytes(os.urandom(4), "little"))
+        self._state = CompositeStateWriter(self.model)
+        self._limits = self._trajectory_limits()
+        self._samples, self._samples_before, self._saturations = 0, 0, 0
+        self._ticks, self._seen = 0, False
+        self._make_topics()
+
+    def _make_topics(self):
+        options = qos.overridable()
+        self._torque_pub = self.make_publisher(
+            JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
+        )
+        self._state_pub = self.make_publisher(
+            CompositeState, "controller/state", qos.LINE, qos_overriding_options=options
+        )
+        self.make_subscription(
+            ArmState, "arm_state_estimate", self._on_state, qos.LINE, qos_overriding_options=options
+        )
+        self.make_subscription(
+            JointTrajectory,
+            "joint_trajectory",
+            self._on_trajectory,
+            qos.COMMAND,
+            qos_overriding_options=options,
+        )
+        self._tick = self.parameters["state_timeout"] / 5.0
+        self.make_timer(self._tick, self._watch)
+
+    def _trajectory_limits(self):
+        joints = self.arm.joints
+        low, high = zip(*(j.limits.position for j in joints), strict=True)
+        return list(low), list(high), [j.limits.velocity for j in joints]
+
+    # Control path ----------------------------------------------------------------------------
+
+    def _on_state(self, msg):
+        if not self.active:
+            return
+        started = perf_counter()
+        self._ticks, self._seen = 0, True
+        sample, core = self._sample, self.core
+        was = core.state
+        try:
+            self._reader.read(msg, sample)
+            enabled = core.step(sample)
+        except MessageError as error:
+            core.disable(str(error))
+            enabled = False
+        self._torque_pub.publish(self._torque.answer(sample, enabled, core.torque))
+        took = perf_counter() - started
+        self._samples += 1
+        self._saturations += core.saturated
+        if self._state_pub.get_subscription_count():
+            self._state_pub.publish(self._state.fill(sample, core, took))
+        if core.state == Supervisor.INACTIVE and was != Supervisor.INACTIVE:
+            self.get_logger().error(f"torque disabled: {core.reason}")
+
+    def _watch(self):
+        """Steady clock: the states have stopped."""
+        self._ticks += 1
+        if self._ticks < 6 or not self._seen or not self.active:
+            return
+        self._seen = False
+        timeout = self.parameters["state_timeout"]
+        self._disable(f"no arm_state_estimate for {timeout:g} s: is the observer running?")
+
+    def _disable(self, reason):
+        self.core.disable(reason)
+        self.get_logger().error(f"torque disabled: {reason}")
+        self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+
+    # Trajectories ----------------------------------------------------------------------------
+
+    def _on_trajectory(self, msg):
+        if not self.active:
+            return
+        low, high, velocity = self._limits
+        points = [
+            (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
+            for p in msg.points
+        ]
+        try:
+            data = trajectory.validate(
+                msg.joint_names,
+                self.arm.joint_names,
+                stamp_ns(msg.header.stamp),
+                points,
+                position_low=low,
+                position_high=high,
+                velocity_max=velocity,
+            )
+            verdict = self.core.offer(data)
+        except TrajectoryError as error:
+            self.core.refuse(str(error))
+            self.get_logger().warning(f"trajectory refused: {error}")
+            return
+        if verdict.accepted:
+            self.get_logger().info(f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}")
+        elif not verdict.repeat:
+            self.get_logger().warning(f"trajectory refused: {verdict.reason}")
+
+    # Design ----------------------------------------------------------------------------------
+
+    def _law_parameters(self):
+        return {"slow.": self.parameters.group("slow."), "fast.": self.parameters.group("fast.")}
+
+    def _design(self, group, values=None):
+        prefix = "slow." if group == SLOW else "fast."
+        values = self.parameters.group(prefix) if values is None else values
+        law = registry.find(group, values["type"])
+        declared = {p.name for p in law.PARAMETERS}
+        chosen = {k: v for k, v in values.items() if k in declared}
+        return composite.design_law(group, values["type"], self.model, chosen)
+
+    def _changed(self, names):
+        if names & {p.name for p in arm_controller.PARAMETERS}:
+            settings = self.parameters.group("", {p.name for p in arm_controller.PARAMETERS})
+            self.core.configure(settings)
+        groups = [g for g, p in ((SLOW, "slow."), (FAST, "fast.")) if any(n.startswith(p) for n in names)]
+        if groups:
+            self._designer.submit(self._redesign, groups, self._law_parameters())
+
+    def _redesign(self, groups, values):
+        """In the design thread: a new law swaps whole, or the parameters go back to what they were."""
+        try:
+            law = self.core.law
+            slow = self._design(SLOW, values["slow."]) if SLOW in groups else law.slow
+            fast = self._design(FAST, values["fast."]) if FAST in groups else law.fast
+            self.core.law = CompositeControl(self.model, slow, fast)
+            self._good = values
+        except FlexarmError as error:
+            self.get_logger().error(f"design refused, the old law goes on: {error}")
+            old = [
+                RosParameter(prefix + name, value=value)
+                for prefix, group in self._good.items()
+                for name, value in group.items()
+                if values[prefix][name] != value
+            ]
+            self.executor.create_task(self.set_parameters_atomically, old)
+
+    # Life cycle ------------------------------------------------------------------------------
+
+    def stop(self):
+        self.core.disable("the controller was stopped")
+        self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+
+    def destroy_node(self):
+        self._designer.shutdown(wait=False, cancel_futures=True)
+        super().destroy_node()
+
+    def diagnose(self):
+        rate, self._samples_before = self._samples - self._samples_before, self._samples
+        core = self.core
+        values = {
+            "state": core.state.name,
+            "slow law": self.parameters["slow.type"],
+            "fast law": self.parameters["fast.type"],
+            "samples per second": rate,
+            "saturated samples": self._saturations,
+            "trajectory": core.trajectory_id,
+        }
+        if not self.active:
+            return OK, "not active", values
+        if core.state == Supervisor.INACTIVE:
+            return ERROR, core.reason or "no arm_state_estimate yet: start the observer", values
+        if core.reason:
+            return WARN, core.reason, values
+        return OK, "", values
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_control controller``."""
+    sys.exit(run(ControllerNode, args))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
+
+import sys
+
+from flexarm_control import arm_observer, composite
+from flexarm_control.samples import ArmSample
+from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_msgs.msg import ArmState, ObserverState
+from flexarm_ros import qos
+from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
+from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
+from flexarm_ros.parameters import merge
+
+TYPE = Parameter(
+    "type",
+    "string",
+    "filtered_derivative",
+    "Observer, by its name in the entry-point group flexarm.observers.",
+    read_only=True,
+)
+
+
+def parameter_groups():
+    """Declared parameters of this node, by prefix."""
+    laws = [
+        registry.find(arm_observer.OBSERVERS, name).PARAMETERS
+        for name in registry.names(arm_observer.OBSERVERS)
+    ]
+    return {"": (ARM,), "observer.": (TYPE, *arm_observer.PARAMETERS, *merge(*laws))}
+
+
+class ObserverNode(ArmNode):
+    """Messages to arrays, one call of `ArmObserver`, arrays to messages."""
+
+    def __init__(self):
+        super().__init__("observer", parameter_groups())
+
+    def build(self):
+        parameters = self.parameters
+        self.arm = arm_file.load(parameters["arm"])
+        self.model = model.build(self.arm)
+        parameters.resolve(composite.sizes(self.model))
+        bandwidth = parameters["observer.joint_velocity_bandwidth"]
+        self.core = arm_observer.ArmObserver(self.model, self._design(), bandwidth)
+        parameters.on_change(self._changed)
+        arm = self.arm
+        self._reader = StateReader(arm)
+        self._sample = ArmSample(len(arm.joints), len(arm.modes), len(arm.gauges))
+        self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
+        self._samples, self._refused, self._samples_before = 0, 0, 0
+        options = qos.overridable()
+        self._estimate_pub = self.make_publisher(
+            ArmState, "arm_state_estimate", qos.LINE, qos_overriding_options=options
+        )
+        self._state_pub = self.make_publisher(
+            ObserverState, "observer/state", qos.LINE, qos_overriding_options=options
+        )
+        self.make_subscription(
+            ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+        )
+
+    def _design(self):
+        name = self.parameters["observer.type"]
+        law = registry.find(arm_observer.OBSERVERS, name)
+        declared = {p.name for p in law.PARAMETERS}
+        values = self.parameters.group("observer.", declared)
+        return arm_observer.design_observer(name, self.model, values)
+
+    def _changed(self, names):
+        """Swap in a new observer; it starts afresh, and the controller waits until it has converged."""
+        self.core.bandwidth = self.parameters["observer.joint_velocity_bandwidth"]
+        if names - {"observer.joint_velocity_bandwidth"}:
+            self.core.observer = self._design()
+
+    def _on_state(self, msg):
+        if not self.active:
+            return
+        sample, writer, core = self._sample, self._writer, self.core
+        try:
+            self._reader.read(msg, sample)
+            known = core.step(sample)
+        except MessageError as error:
+            self._refused += 1
+            self.report(f"arm_state {msg.sequence}: {error}")
+            self._forward_unknown(msg)
+            return
+        self._samples += 1
+        writer.head(sample.stamp_ns, sample.session, sample.sequence)
+        writer.write("joint_position", sample.position)
+        writer.write("joint_velocity", core.velocity)
+        writer.write("joint_torque", sample.torque)
+        writer.write("strain", sample.strain)
+        writer.write("modal_amplitude", core.observer.amplitude)
+        writer.write("modal_rate", core.observer.rate if known else None)
+        self._estimate_pub.publish(writer.message)
+        if self._state_pub.get_subscription_count():
+            name = self.parameters["observer.type"]
+            self._state_pub.publish(
+                self._state_writer.fill(sample, name, core.observer, sample.strain)
+            )
+
+    def _forward_unknown(self, msg):
+        """Pass a bad sample on without modal states, so that the controller disables at once."""
+        out = ArmState(
+            header=msg.header,
+            session=msg.session,
+            sequence=msg.sequence,
+            joint_names=msg.joint_names,
+            joint_position=msg.joint_position,
+            joint_velocity=msg.joint_velocity,
+            joint_torque=msg.joint_torque,
+        )
+        self._estimate_pub.publish(out)
+
+    def diagnose(self):
+        rate, self._samples_before = self._samples - self._samples_before, self._samples
+        values = {
+            "observer": self.parameters["observer.type"],
+            "samples per second": rate,
+            "samples refused": self._refused,
+            "converged": self.core.observer.converged,
+        }
+        if not self.active:
+            return OK, "not active", values
+        if rate == 0:
+            return ERROR, "no usable arm_state: start the simulator or driver", values
+        if not self.core.observer.converged:
+            return WARN, "not converged yet", values
+        return OK, "", values
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_control observer``."""
+    sys.exit(run(ObserverNode, args))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,291 @@
+"""Messages to arrays and back, without copies that are not needed.
+
+Numbers are cast here: a Python int or numpy scalar assigned to a float64 field is published as garbage.
+"""
+
+from array import array
+
+import numpy as np
+from flexarm_dynamics.errors import MessageError
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+
+SECOND = 1_000_000_000
+
+
+def stamp_ns(stamp):
+    """Nanoseconds of a builtin_interfaces/Time or Duration."""
+    return stamp.sec * SECOND + stamp.nanosec
+
+
+def set_stamp(stamp, ns):
+    """Write nanoseconds into a builtin_interfaces/Time."""
+    stamp.sec, stamp.nanosec = divmod(ns, SECOND)
+
+
+class _Columns:
+    """Names and values of one group of arrays, in the arm's order whatever the sender's."""
+
+    def __init__(self, field, names):
+        self.field, self.names = field, list(names)
+        self._order = None
+        self._seen = self.names
+
+    def order(self, names):
+        """None where `names` are in the arm's order, else an index array."""
+        if names == self._seen:
+            return self._order
+        if sorted(names) != sorted(self.names):
+            missing = [n for n in self.names if n not in names]
+            unknown = [n for n in names if n not in self.names]
+            wrong = [f"missing {', '.join(missing)}"] if missing else []
+            wrong += [f"unknown {', '.join(unknown)}"] if unknown else []
+            raise MessageError(
+                f"{self.field} {list(names)}: {'; '.join(wrong) or 'a name twice'} (this arm has"
+                f" {self.names})"
+            )
+        self._seen = list(names)
+        self._order = (
+            None if names == self.names else np.array([names.index(n) for n in self.names])
+        )
+        return self._order
+
+    def read(self, field, values, order, out):
+        """Copy one array into `out`; an empty one gives False."""
+        size = len(values)
+        if size == 0:
+            return False
+        if size != len(self.names):
+            raise MessageError(
+                f"{field} has {size} values for {len(self.names)} names in {self.field}"
+            )
+        values = np.asarray(values)
+        out[:] = values if order is None else values[order]
+        return True
+
+
+class StateReader:
+    """Reads `ArmState` messages into an `ArmSample`.
+
+    Parameters
+    ----------
+    arm : Arm
+        Whose names and order count.
+    """
+
+    def __init__(self, arm):
+        self._joints = _Columns("joint_names", arm.joint_names)
+        self._gauges = _Columns("gauge_names", arm.gauge_names)
+        self._modes = _Columns("mode_names", arm.observed_modes)
+        self._strain = np.zeros(len(arm.gauges))
+        self._amplitude = np.zeros(len(arm.observed_modes))
+        self._rate = np.zeros(len(arm.observed_modes))
+
+    def read(self, msg, sample):
+        """Fill `sample`; stamp, session and sequence even when the rest is refused.
+
+        Raises
+        ------
+        MessageError
+            For names or lengths that are not this arm's.
+        """
+        sample.stamp_ns = stamp_ns(msg.header.stamp)
+        sample.session, sample.sequence = msg.session, msg.sequence
+        joints = self._joints
+        order = joints.order(msg.joint_names)
+        if not joints.read("joint_position", msg.joint_position, order, sample.position):
+            raise MessageError("joint_position is empty")
+        sample.velocity_known = joints.read(
+            "joint_velocity", msg.joint_velocity, order, sample.velocity
+        )
+        if not joints.read("joint_torque", msg.joint_torque, order, sample.torque):
+            sample.torque[:] = np.nan
+        sample.strain = self._optional(
+            self._gauges, msg.gauge_names, "strain", msg.strain, self._strain
+        )
+        sample.amplitude = self._optional(
+            self._modes, msg.mode_names, "modal_amplitude", msg.modal_amplitude, self._amplitude
+        )
+        sample.rate = self._optional(
+            self._modes, msg.mode_names, "modal_rate", msg.modal_rate, self._rate
+        )
+
+    @staticmethod
+    def _optional(columns, names, field, values, out):
+        if len(values) == 0:
+            return None
+        columns.read(field, values, columns.order(names), out)
+        return out
+
+
+def _floats(msg, field, size):
+    """Size an array field and return a view of it to write into.
+
+    The view is of the message's own array, which the setter makes: assigning to the field again would
+    leave the view behind.
+    """
+    setattr(msg, field, array("d", bytes(8 * size)))
+    return np.frombuffer(getattr(msg, field)) if size else np.zeros(0)
+
+
+class StateWriter:
+    """An `ArmState` message whose arrays are written in place.
+
+    Parameters
+    ----------
+    arm : Arm
+    frame_id : str
+        Base frame of the arm.
+    """
+
+    def __init__(self, arm, frame_id="base_link"):
+        self.message = msg = ArmState()
+        msg.header.frame_id = frame_id
+        msg.joint_names = list(arm.joint_names)
+        msg.gauge_names = list(arm.gauge_names)
+        msg.mode_names = list(arm.observed_modes)
+        self._views = {}
+
+    def head(self, stamp, session, sequence):
+        """Write stamp [ns], session and sequence."""
+        msg = self.message
+        set_stamp(msg.header.stamp, stamp)
+        msg.session, msg.sequence = session, sequence
+
+    def write(self, field, values):
+        """Write an array field; None leaves it empty: not known."""
+        size = 0 if values is None else len(values)
+        view = self._views.get(field)
+        if view is None or view.size != size:
+            view = self._views[field] = _floats(self.message, field, size)
+        if size:
+            view[:] = values
+
+
+class TorqueWriter:
+    """A `JointTorque` message whose torque is written in place."""
+
+    def __init__(self, arm, controller_id):
+        self.message = msg = JointTorque()
+        msg.joint_names = list(arm.joint_names)
+        msg.controller_id = controller_id
+        self.torque = _floats(msg, "torque", len(arm.joints))
+
+    def answer(self, sample, enabled, torque):
+        """Fill in the answer to a sample; a disabled one carries zeros."""
+        msg = self.message
+        set_stamp(msg.header.stamp, sample.stamp_ns)
+        msg.session, msg.sequence = sample.session, sample.sequence
+        msg.mode = JointTorque.ENABLED if enabled else JointTorque.DISABLED
+        self.torque[:] = torque if enabled else 0.0
+        return msg
+
+
+class TorqueReader:
+    """Reads `JointTorque` messages.
+
+    Parameters
+    ----------
+    arm : Arm
+    """
+
+    #: A torque beyond this is no torque [N m].
+    HUGE = 1e9
+
+    def __init__(self, arm):
+        self._joints = _Columns("joint_names", arm.joint_names)
+        self._torque = np.zeros(len(arm.joints))
+
+    def read(self, msg):
+        """The torques (n,) [N m], or None where the message says DISABLED.
+
+        Raises
+        ------
+        MessageError
+            For wrong names, lengths, a mode that is neither, or values that are not finite.
+        """
+        if msg.mode == JointTorque.DISABLED:
+            return None
+        if msg.mode != JointTorque.ENABLED:
+            raise MessageError(f"mode is {msg.mode}: neither DISABLED (0) nor ENABLED (1)")
+        if not self._joints.read(
+            "torque", msg.torque, self._joints.order(msg.joint_names), self._torque
+        ):
+            raise MessageError("torque is empty")
+        if not np.abs(self._torque).max() < self.HUGE:
+            i = int(np.argmin(np.abs(self._torque) < self.HUGE))
+            raise MessageError(f"torque of {self._joints.names[i]} is {self._torque[i]}")
+        return self._torque
+
+
+class CompositeStateWriter:
+    """A `CompositeState` message for an `ArmController`."""
+
+    def __init__(self, model):
+        self.message = msg = CompositeState()
+        msg.joint_names, msg.mode_names = list(model.joint_names), list(model.mode_names)
+        n, m = model.n_joints, model.n_modes
+        self._arrays = {
+            name: _floats(msg, name, size)
+            for name, size in (
+                ("reference_position", n),
+                ("reference_velocity", n),
+                ("reference_acceleration", n),
+                ("position_error", n),
+                ("velocity_error", n),
+                ("slow_torque", n),
+                ("fast_torque", n),
+                ("torque", n),
+                ("quasi_steady_amplitude", m),
+                ("fast_deviation", 2 * m),
+            )
+        }
+
+    def fill(self, sample, controller, compute_time):
+        """Copy what the controller holds; `compute_time` in seconds."""
+        msg, a = self.message, self._arrays
+        set_stamp(msg.header.stamp, sample.stamp_ns)
+        msg.session, msg.sequence = sample.session, sample.sequence
+        msg.supervisor_state = int(controller.state)
+        reference, law = controller.reference, controller.law
+        a["reference_position"][:] = reference.position
+        a["reference_velocity"][:] = reference.velocity
+        a["reference_acceleration"][:] = reference.acceleration
+        a["position_error"][:] = controller.position_error
+        a["velocity_error"][:] = controller.velocity_error
+        a["slow_torque"][:] = law.slow_torque
+        a["fast_torque"][:] = law.fast_torque
+        a["torque"][:] = controller.torque
+        a["quasi_steady_amplitude"][:] = law.quasi_steady
+        a["fast_deviation"][:] = law.deviation
+        msg.saturated = controller.saturated
+        msg.rejected_reason = controller.reason
+        msg.accepted_trajectory_id = controller.trajectory_id
+        msg.compute_time = float(compute_time)
+        return msg
+
+
+class ObserverStateWriter:
+    """An `ObserverState` message."""
+
+    def __init__(self, arm):
+        self.message = msg = ObserverState()
+        msg.mode_names, msg.gauge_names = list(arm.observed_modes), list(arm.gauge_names)
+
+    def fill(self, sample, name, observer, strain):
+        """Copy what the observer holds."""
+        msg = self.message
+        set_stamp(msg.header.stamp, sample.stamp_ns)
+        msg.session, msg.sequence = sample.session, sample.sequence
+        msg.observer = name
+        msg.innovation = array("d", observer.innovation)
+        msg.covariance_diagonal = array("d", observer.covariance_diagonal)
+        if strain is None:
+            health = [ObserverState.GAUGE_MISSING] * len(msg.gauge_names)
+        else:
+            health = [
+                ObserverState.GAUGE_GOOD if ok else ObserverState.GAUGE_MISSING
+                for ok in np.isfinite(strain)
+            ]
+        msg.gauge_health = array("B", health)
+        msg.converged = observer.converged
+        return msg

@@ -1,0 +1,220 @@
+"""The frame of every node: lifecycle with autostart, diagnostics, clean exit on signals."""
+
+import gc
+import signal
+import sys
+import traceback
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from flexarm_dynamics.errors import FlexarmError, ParameterError
+from flexarm_dynamics.parameters import Parameter
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.signals import SignalHandlerOptions
+
+from .parameters import NodeParameters
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+ARM = Parameter(
+    "arm",
+    "string",
+    "",
+    "Arm file: a shipped name (R, P3, one_link) or a path.",
+    read_only=True,
+)
+AUTOSTART = Parameter(
+    "autostart",
+    "bool",
+    True,
+    "Configure and activate at the start; false: wait for a lifecycle manager.",
+    read_only=True,
+)
+
+
+class ArmNode(LifecycleNode):
+    """A lifecycle node that configures whole or not at all.
+
+    Subclasses implement `build` (parameters to objects, publishers, subscriptions), `start`, `stop` and
+    `diagnose`; what they create with the ``create_*`` methods is destroyed on clean-up.
+
+    Parameters
+    ----------
+    name : str
+    groups : mapping
+        Prefix to declared parameters, see `NodeParameters`.
+    """
+
+    def __init__(self, name, groups):
+        super().__init__(name)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        groups = {**groups, "": (AUTOSTART, *groups.get("", ()))}
+        self.parameters = NodeParameters(self, groups)
+        self.active = False
+        self._made = []
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.failure = ""
+
+    # What subclasses fill in -----------------------------------------------------------------
+
+    def build(self):
+        """Build everything from the parameters; raise a FlexarmError to refuse."""
+
+    def start(self):
+        """The node was activated."""
+
+    def stop(self):
+        """The node is being deactivated or is ending: leave the arm safe."""
+
+    def diagnose(self):
+        """Return (level, message, {key: value}) for `/diagnostics`."""
+        return OK, "", {}
+
+    # Made and unmade with the configuration ----------------------------------------------------
+
+    def make_publisher(self, *args, **kwargs):
+        """A publisher that lives until clean-up."""
+        return self._keep(self.destroy_publisher, self.create_publisher(*args, **kwargs))
+
+    def make_subscription(self, *args, **kwargs):
+        """A subscription that lives until clean-up."""
+        return self._keep(self.destroy_subscription, self.create_subscription(*args, **kwargs))
+
+    def make_service(self, *args, **kwargs):
+        """A service that lives until clean-up."""
+        return self._keep(self.destroy_service, self.create_service(*args, **kwargs))
+
+    def make_timer(self, period, callback):
+        """A timer on the steady clock that lives until clean-up."""
+        return self._keep(
+            self.destroy_timer, self.create_timer(period, callback, clock=self._steady)
+        )
+
+    def _keep(self, destroy, thing):
+        self._made.append((destroy, thing))
+        return thing
+
+    def _unmake(self):
+        for destroy, thing in reversed(self._made):
+            destroy(thing)
+        self._made.clear()
+
+    # Life cycle ------------------------------------------------------------------------------
+
+    def on_configure(self, state):
+        try:
+            self.build()
+        except FlexarmError as error:
+            self.failure = str(error)
+            self.get_logger().error(f"not configured: {error}")
+            self._unmake()
+            return TransitionCallbackReturn.FAILURE
+        self.make_timer(1.0, self._publish_diagnostics)
+        return super().on_configure(state)
+
+    def on_activate(self, state):
+        self.active = True
+        self.start()
+        # The objects made so far stay for good: the collector need not look at them on the control path.
+        gc.collect()
+        gc.freeze()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state):
+        self.stop()
+        self.active = False
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state):
+        self._unmake()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state):
+        if self.active:
+            self.stop()
+            self.active = False
+        self._unmake()
+        return super().on_shutdown(state)
+
+    def autostart(self):
+        """Configure and activate; False when that failed."""
+        if not self.parameters["autostart"]:
+            return True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                return False
+        return True
+
+    # Diagnostics -----------------------------------------------------------------------------
+
+    def _publish_diagnostics(self):
+        level, message, values = self.diagnose()
+        status = DiagnosticStatus(
+            level=level,
+            name=self.get_fully_qualified_name().lstrip("/"),
+            hardware_id=self.arm.name if getattr(self, "arm", None) else "",
+            message=message or "ok",
+            values=[KeyValue(key=str(k), value=str(v)) for k, v in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def report(self, text):
+        """Log a refusal: at once when it is a new one, else every ten seconds."""
+        now = self._steady.now().nanoseconds
+        last, when = getattr(self, "_reported", ("", 0))
+        if text != last or now - when > 10_000_000_000:
+            self._reported = (text, now)
+            self.get_logger().warning(text)
+
+
+def run(node_class, args=None):
+    """Run a node until SIGINT or SIGTERM; the process's exit code.
+
+    Parameters
+    ----------
+    node_class : callable
+        Makes the node.
+    args : list of str, optional
+        Command line.
+
+    Returns
+    -------
+    int
+        0 after a signal, 1 when the node could not start.
+    """
+    stopped = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.append(True))
+    node = None
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = node_class()
+        if not node.autostart():
+            return 1
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while not stopped and rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+        return 0
+    except (ParameterError, ParameterException) as error:
+        print(f"{node_class.__name__}: {error}", file=sys.stderr)
+        return 1
+    except FlexarmError as error:
+        print(f"{node_class.__name__}: {error}", file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except Exception:
+        traceback.print_exc()
+        return 1
+    finally:
+        if node is not None:
+            if node.active:
+                node.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()

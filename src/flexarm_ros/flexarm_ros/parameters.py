@@ -1,0 +1,160 @@
+"""Declared parameters as ROS parameters: descriptors, validation, and what changed."""
+
+import difflib
+
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import Parameter
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterValueException
+
+
+def descriptor(parameter):
+    """The ROS descriptor of a declared parameter: text for people, a range for sliders."""
+    text = parameter.description + (f" [{parameter.unit}]" if parameter.unit != "-" else "")
+    limits = []
+    if parameter.low is not None or parameter.high is not None:
+        limits.append(f"from {parameter.low} to {parameter.high}")
+    if parameter.choices:
+        limits.append("one of " + ", ".join(parameter.choices))
+    if parameter.length is not None:
+        limits.append(f"length {parameter.length}, or one value for all")
+    out = ParameterDescriptor(
+        description=text,
+        additional_constraints="; ".join(limits),
+        read_only=parameter.read_only,
+        # Typed by our own check, whose refusal says what to write instead.
+        dynamic_typing=True,
+    )
+    if parameter.low is not None and parameter.high is not None:
+        if parameter.kind == "float":
+            span = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
+            out.floating_point_range = [span]
+        elif parameter.kind == "int":
+            out.integer_range = [IntegerRange(from_value=parameter.low, to_value=parameter.high)]
+    return out
+
+
+class NodeParameters:
+    """All parameters of one node.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    groups : mapping
+        Prefix (``""``, ``"slow."``) to the declared parameters under it.
+
+    Raises
+    ------
+    ParameterError
+        When a value given at the start can't be used.
+    """
+
+    def __init__(self, node, groups):
+        self._node = node
+        self._declared = {
+            prefix + p.name: (prefix, p) for prefix, group in groups.items() for p in group
+        }
+        self._sizes = {}
+        self._listener = None
+        for name, (_, parameter) in self._declared.items():
+            try:
+                node.declare_parameter(name, parameter.default, descriptor(parameter))
+            except InvalidParameterValueException as error:
+                raise ParameterError(f"{name}: {error}") from None
+        self._warn_unknown()
+        self._values = {}
+        self._values = self._checked({})
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._on_applied)
+
+    def _warn_unknown(self):
+        """A misspelt name in a parameter file is ignored by ROS; a person should hear of it.
+
+        One file may serve all nodes, so that only names like one of this node's are worth a word.
+        """
+        known = set(self._declared) | set(self._node._parameters)
+        for name in self._node._parameter_overrides:
+            close = difflib.get_close_matches(name, self._declared, 1, cutoff=0.75)
+            if name not in known and close:
+                self._node.get_logger().warning(
+                    f"parameter {name} is not one of this node's; did you mean {close[0]}?"
+                )
+
+    def resolve(self, sizes):
+        """Check again with the lengths that are known once the arm is.
+
+        Raises
+        ------
+        ParameterError
+        """
+        self._sizes = dict(sizes)
+        self._values = self._checked({})
+
+    def on_change(self, listener):
+        """Call ``listener(set of changed names)`` after a set has been taken."""
+        self._listener = listener
+
+    def __getitem__(self, name):
+        return self._values[name]
+
+    def group(self, prefix, names=None):
+        """Values under a prefix, without it; only `names` where given."""
+        return {
+            p.name: self._values[full]
+            for full, (of, p) in self._declared.items()
+            if of == prefix and (names is None or p.name in names)
+        }
+
+    def _checked(self, changes):
+        values = {}
+        for name, (prefix, parameter) in self._declared.items():
+            value = changes.get(name, self._node.get_parameter(name).value)
+            if hasattr(value, "tolist"):  # arrays come as array.array
+                value = value.tolist()
+            values[name] = parameter.check(value, self._sizes, prefix)
+        return values
+
+    def _on_set(self, parameters):
+        # Validates only: nothing is applied here, so that a refused set leaves no trace.
+        try:
+            self._checked({p.name: p.value for p in parameters if p.name in self._declared})
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_applied(self, parameters):
+        changed = {p.name for p in parameters if p.name in self._declared}
+        if not changed:
+            return
+        self._values = self._checked({p.name: p.value for p in parameters if p.name in changed})
+        if self._listener is not None:
+            self._listener(changed)
+
+
+def merge(*groups):
+    """Declarations of several components under one prefix; a name means one thing.
+
+    Raises
+    ------
+    ParameterError
+        When two components declare a name differently.
+    """
+    merged: dict[str, Parameter] = {}
+    for group in groups:
+        for parameter in group:
+            other = merged.setdefault(parameter.name, parameter)
+            if (other.kind, other.length, other.unit) != (
+                parameter.kind,
+                parameter.length,
+                parameter.unit,
+            ):
+                raise ParameterError(
+                    f"{parameter.name} is declared twice, as {other.kind} [{other.unit}] and as"
+                    f" {parameter.kind} [{parameter.unit}]: rename it in one of the laws"
+                )
+    return tuple(merged.values())

@@ -1,0 +1,275 @@
+"""Simulator node: `joint_torque` in, `arm_state` and `joint_states` out; in lockstep or in real time."""
+
+import os
+import sys
+from array import array
+
+from flexarm_dynamics import arm_file
+from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_msgs.msg import ArmState, JointTorque
+from flexarm_ros import qos
+from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
+from flexarm_ros.node import AUTOSTART, ERROR, OK, WARN, ArmNode, run
+from flexarm_sim import simulator
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+PARAMETERS = (
+    Parameter(
+        "lockstep",
+        "bool",
+        False,
+        "One period per torque that answers the last state, as fast as the machine goes; false: real time.",
+        read_only=True,
+    ),
+    Parameter(
+        "start_paused",
+        "bool",
+        True,
+        "In lockstep, wait for `~/pause` with data false before the first period.",
+        read_only=True,
+    ),
+    Parameter(
+        "resend_period",
+        "float",
+        0.1,
+        "In lockstep or paused, the state is sent again after so long without an answer (wall time).",
+        unit="s",
+        low=0.01,
+        high=10.0,
+        read_only=True,
+    ),
+    Parameter(
+        "real_time_factor",
+        "float",
+        1.0,
+        "In real time: seconds simulated per second of wall time.",
+        low=0.001,
+        high=100.0,
+        read_only=True,
+    ),
+    Parameter(
+        "torque_timeout",
+        "float",
+        0.05,
+        "In real time: a torque that answers a state older than this is too late; the safe action follows.",
+        unit="s",
+        low=0.001,
+        high=10.0,
+        read_only=True,
+    ),
+    Parameter(
+        "joint_states_rate",
+        "float",
+        50.0,
+        "Rate of joint_states, in simulated time; at most the control rate.",
+        unit="Hz",
+        low=0.1,
+        high=20000.0,
+        read_only=True,
+    ),
+)
+
+
+class SimulatorNode(ArmNode):
+    """Messages to arrays, one call of `Simulator`, arrays to messages."""
+
+    def __init__(self):
+        super().__init__("simulator", {"": (*simulator.PARAMETERS, *PARAMETERS)})
+
+    def build(self):
+        parameters = self.parameters
+        self.arm = arm_file.load(parameters["arm"])
+        parameters.resolve({"joints": len(self.arm.joints)})
+        names = {p.name for p in simulator.PARAMETERS}
+        self.sim = simulator.Simulator(parameters.group("", names))
+        parameters.on_change(self._changed)
+        self._lockstep = parameters["lockstep"]
+        self._rates, self._velocity = (
+            parameters["publish_rates"],
+            parameters["publish_joint_velocity"],
+        )
+        # A restart is a new session; so is a reset.
+        self._session = int.from_bytes(os.urandom(4), "little")
+        self._paused = self._lockstep and parameters["start_paused"]
+        self._answered = None  # sequence of the state whose answer is kept while paused
+        self._answer = None
+        self._writer, self._reader = StateWriter(self.arm), TorqueReader(self.arm)
+        self._joint_state = JointState(name=list(self.arm.joint_names))
+        self._fill()
+        self._late, self._refused, self._waited, self._before = 0, 0, 0, 0
+        self._controllers, self._fault, self._second = set(), "", None
+        self._make_topics()
+
+    def _make_topics(self):
+        options = qos.overridable()
+        self._state_pub = self.make_publisher(
+            ArmState, "arm_state", qos.LINE, qos_overriding_options=options
+        )
+        self._joint_pub = self.make_publisher(
+            JointState, "joint_states", 10, qos_overriding_options=options
+        )
+        self.make_subscription(
+            JointTorque, "joint_torque", self._on_torque, qos.LINE, qos_overriding_options=options
+        )
+        self.make_service(Trigger, "~/reset", self._on_reset)
+        self.make_service(SetBool, "~/pause", self._on_pause)
+        parameters = self.parameters
+        every = parameters["rate"] / parameters["joint_states_rate"]
+        self._joint_states_every = max(1, round(every))
+        self._timeout_samples = max(1, round(parameters["torque_timeout"] * parameters["rate"]))
+        if not self._lockstep:
+            period = 1e-9 * self.sim.period_ns / parameters["real_time_factor"]
+            self.make_timer(period, self._on_period)
+        self.make_timer(parameters["resend_period"], self._resend)
+
+    def _changed(self, names):
+        if "initial_position" in names:
+            self.sim.settings["initial_position"] = self.parameters["initial_position"]
+
+    def start(self):
+        self._resend()
+
+    # Torque in, state out --------------------------------------------------------------------
+
+    def _on_torque(self, msg):
+        if not self.active or msg.session != self._session:
+            return
+        try:
+            torque = self._reader.read(msg)
+        except MessageError as error:
+            self._refused += 1
+            self.report(f"joint_torque {msg.sequence}: {error}: the safe action is applied")
+            torque = None
+        self._watch_controllers(msg.controller_id)
+        if self._lockstep:
+            if msg.sequence != self.sim.sequence:
+                return  # an answer to a state that was sent again
+            if self._paused:
+                return  # the state is sent again after the pause, and answered from the cache
+            self._advance(torque)
+            self._publish()
+        elif self._answered is None or msg.sequence >= self._answered:
+            self._answered = msg.sequence
+            self._answer = None if torque is None else torque.copy()
+
+    def _on_period(self):
+        """Real time: the newest torque, if it is fresh, else the safe action."""
+        if not self.active or self._paused:
+            return
+        sim = self.sim
+        fresh = (
+            self._answered is not None and sim.sequence - self._answered <= self._timeout_samples
+        )
+        if not fresh and self._answered is not None:
+            self._late += 1
+        self._advance(self._answer if fresh else None)
+        self._publish()
+
+    def _advance(self, torque):
+        self._waited = 0
+        if self._fault:
+            return
+        try:
+            self.sim.advance(torque)
+        except ModelError as error:
+            self._fault = str(error)
+            self.get_logger().error(f"stopped: {error}")
+            self._paused = True
+            return
+        self._fill()
+
+    def _fill(self):
+        """The present sample into the message."""
+        sim, writer = self.sim, self._writer
+        writer.head(sim.stamp_ns, self._session, sim.sequence)
+        writer.write("joint_position", sim.position)
+        writer.write("joint_velocity", sim.velocity if self._velocity else None)
+        writer.write("joint_torque", sim.torque)
+        writer.write("strain", sim.strain)
+        writer.write("modal_amplitude", None if sim.strain_map is None else sim.amplitude)
+        writer.write("modal_rate", sim.rate if self._rates else None)
+
+    def _publish(self):
+        self._state_pub.publish(self._writer.message)
+        sim = self.sim
+        if sim.sequence % self._joint_states_every == 0 and self._joint_pub.get_subscription_count():
+            msg = self._joint_state
+            set_stamp(msg.header.stamp, sim.stamp_ns)
+            msg.position = array("d", sim.position)
+            msg.velocity = array("d", sim.velocity)
+            msg.effort = array("d", sim.torque)
+            self._joint_pub.publish(msg)
+
+    def _resend(self):
+        """Steady clock: send an unanswered state again, and say so when nobody answers."""
+        if not self.active or not (self._lockstep or self._paused):
+            return
+        self._waited += 1
+        self._state_pub.publish(self._writer.message)
+        seconds = self._waited * self.parameters["resend_period"]
+        if not self._paused and seconds >= 5.0:
+            self.report(
+                f"no joint_torque answers state {self.sim.sequence} for 5 s: are observer and controller"
+                " running, on this domain, with this arm?"
+            )
+
+    def _watch_controllers(self, controller_id):
+        self._controllers.add(controller_id)
+        if len(self._controllers) > 1 and self._second != controller_id:
+            self._second = controller_id
+            ids = ", ".join(str(i) for i in sorted(self._controllers))
+            self.report(f"joint_torque comes from several controllers ({ids}): stop all but one")
+
+    # Services --------------------------------------------------------------------------------
+
+    def _on_reset(self, request, response):
+        self.sim.reset()
+        self._session = (self._session + 1) % 2**32
+        self._answered, self._answer, self._fault = None, None, ""
+        self._controllers, self._second = set(), None
+        self._paused = self._lockstep and self.parameters["start_paused"]
+        self._fill()
+        self._resend()
+        response.success, response.message = True, f"session {self._session}"
+        return response
+
+    def _on_pause(self, request, response):
+        if self._fault and not request.data:
+            response.success, response.message = False, f"call ~/reset first: {self._fault}"
+            return response
+        self._paused = request.data
+        response.success, response.message = True, "paused" if request.data else "running"
+        if not request.data:
+            self._resend()
+        return response
+
+    def diagnose(self):
+        done, self._before = self.sim.sequence - self._before, self.sim.sequence
+        values = {
+            "mode": "lockstep" if self._lockstep else "real time",
+            "simulated time [s]": f"{self.sim.time:.3f}",
+            "samples per second": done,
+            "periods without a fresh torque": self._late,
+            "torques refused": self._refused,
+            "controllers seen": len(self._controllers),
+        }
+        if self._fault:
+            return ERROR, self._fault, values
+        if len(self._controllers) > 1:
+            return ERROR, "several controllers publish joint_torque: stop all but one", values
+        if self._paused:
+            return OK, "paused: call ~/pause with data false", values
+        if done == 0 or (not self._lockstep and self._answer is None):
+            return WARN, "no fresh torque: the safe action is applied", values
+        return OK, "", values
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_sim simulator``."""
+    sys.exit(run(SimulatorNode, args))
+
+
+if __name__ == "__main__":
+    main()
