@@ -1,6 +1,7 @@
 """The loop without ROS: the very objects that the nodes call, sample by sample; and the continuous loop."""
 
 import numpy as np
+
 from flexarm_control.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.arm_controller import ArmController
 from flexarm_control.arm_observer import ArmObserver, design_observer

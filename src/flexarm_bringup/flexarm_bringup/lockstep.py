@@ -5,21 +5,22 @@ from dataclasses import dataclass
 
 import rclpy
 from builtin_interfaces.msg import Duration
-from flexarm_msgs.msg import CompositeState
-from flexarm_ros import qos
-from flexarm_ros.messages import set_stamp
-from flexarm_sim.simulator import Simulator
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from flexarm_msgs.msg import CompositeState
+from flexarm_ros import qos
+from flexarm_ros.messages import set_stamp
+from flexarm_sim.simulator import Simulator
+
+from .case_study import LEAD_NS
 from .processes import ProcessError
 from .recorder import Recorder
 
-#: The trajectory starts this long after the simulator's first sample [ns]: the observer converges before.
-LEAD_NS = 100_000_000
+#: Instant at which the case study's trajectory starts.
 START_NS = Simulator.START_NS + LEAD_NS
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+
 from flexarm_dynamics.units import FOOT, POUND_FORCE_FOOT
 
 

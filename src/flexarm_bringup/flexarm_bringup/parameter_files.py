@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import yaml
+
 from flexarm_dynamics.errors import ParameterError
 
 PREFIXES = {"controller": ("slow", "fast"), "observer": ("observer",), "simulator": ()}

@@ -3,9 +3,10 @@
 import struct
 
 import numpy as np
-from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
+
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 
 from .metrics import Record
 from .processes import ProcessError, installed

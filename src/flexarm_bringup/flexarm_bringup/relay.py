@@ -9,6 +9,9 @@ import sys
 import time
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
 from flexarm_dynamics import arm_file, model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 from flexarm_ros import qos
@@ -20,8 +23,6 @@ from flexarm_ros.messages import (
     set_stamp,
 )
 from flexarm_sim.simulator import Simulator
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 
 from .processes import Processes, own_domain
 

@@ -3,6 +3,7 @@
 from enum import IntEnum
 
 import numpy as np
+
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import Parameter
 

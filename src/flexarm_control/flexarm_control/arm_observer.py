@@ -1,6 +1,7 @@
 """Observer of an arm: strains to amplitudes, order of samples, and the chosen observer."""
 
 import numpy as np
+
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import Parameter, check_all

@@ -5,6 +5,7 @@ z_f = z - z_bar(x, u_slow). On the manifold z_f = 0 and u_fast = 0.
 """
 
 import numpy as np
+
 from flexarm_dynamics import registry
 from flexarm_dynamics.parameters import check_all
 from flexarm_dynamics.singular_perturbation import quasi_steady_state

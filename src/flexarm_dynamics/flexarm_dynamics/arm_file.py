@@ -412,7 +412,7 @@ def parse(text, where="arm"):
         Naming the field by its path, the value, and what is wanted.
     """
     try:
-        data = yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader
+        data = yaml.load(text, Loader=_Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
@@ -427,7 +427,8 @@ def parse(text, where="arm"):
         raise ArmFileError("links", "empty: an arm has at least one link")
     if len(joints) != len(links):
         raise ArmFileError(
-            "joints", f"{len(joints)} joints for {len(links)} links: a serial arm has one joint each"
+            "joints",
+            f"{len(joints)} joints for {len(links)} links: a serial arm has one joint each",
         )
     _unique(joints, "joints")
     _unique(links, "links")

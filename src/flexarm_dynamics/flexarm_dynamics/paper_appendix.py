@@ -54,7 +54,9 @@ class PaperAppendix(OneLinkEquations):
             M22[0, 1] += options["m23_fit"]
             M22[1, 0] += options["m23_fit"]
         elif options["m23_fit"]:
-            raise ModelError(f"{self.arm.name}: paper_appendix.m23_fit needs two modes, not {count}")
+            raise ModelError(
+                f"{self.arm.name}: paper_appendix.m23_fit needs two modes, not {count}"
+            )
         # k_ei, diagonal in print.
         K = link.stiffness["y"] / L**3 * np.diag(np.diag(shapes.gram(2)))
         w = link.mass_per_length * L**2 * shapes.integral(lambda xi: xi)

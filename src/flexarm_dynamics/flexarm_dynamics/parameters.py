@@ -179,6 +179,4 @@ def check_all(declared, values, sizes=None, prefix=""):
             raise ParameterError(
                 f"{prefix}{name}: no such parameter; there are {', '.join(sorted(known)) or 'none'}"
             )
-    return {
-        name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()
-    }
+    return {name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()}

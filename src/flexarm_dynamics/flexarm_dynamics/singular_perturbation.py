@@ -62,7 +62,9 @@ def state_space(terms):
 
 
 def quasi_steady_state(terms, torque):
-    r"""Deflection part of (9): :math:`\bar\delta = (H_{21}K_1 + H_{22}K_2)^{-1}(-H_{21}f_1 - H_{22}f_2 + H_{21}\bar u)`.
+    r"""Deflection part of (9), the quasi-steady state.
+
+    .. math:: \bar\delta = (H_{21}K_1 + H_{22}K_2)^{-1}(-H_{21}f_1 - H_{22}f_2 + H_{21}\bar u)
 
     Parameters
     ----------

@@ -6,6 +6,7 @@ Numbers are cast here: a Python int or numpy scalar assigned to a float64 field 
 from array import array
 
 import numpy as np
+
 from flexarm_dynamics.errors import MessageError
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 

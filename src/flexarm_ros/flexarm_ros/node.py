@@ -7,15 +7,17 @@ import traceback
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from flexarm_dynamics.errors import FlexarmError, ParameterError
-from flexarm_dynamics.parameters import Parameter
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
+from flexarm_dynamics.errors import FlexarmError, ParameterError
+from flexarm_dynamics.parameters import Parameter
+
 from .parameters import NodeParameters
+from .spin import Line, spin
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -54,6 +56,8 @@ class ArmNode(LifecycleNode):
         groups = {**groups, "": (AUTOSTART, *groups.get("", ()))}
         self.parameters = NodeParameters(self, groups)
         self.active = False
+        self.line = None  # the control path, while active
+        self._line = None
         self._made = []
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.failure = ""
@@ -93,6 +97,10 @@ class ArmNode(LifecycleNode):
             self.destroy_timer, self.create_timer(period, callback, clock=self._steady)
         )
 
+    def make_line(self, subscription, period=None, on_period=None):
+        """Name the subscription that is the control path, see `spin.Line`."""
+        self._line = Line(subscription, period, on_period)
+
     def _keep(self, destroy, thing):
         self._made.append((destroy, thing))
         return thing
@@ -116,7 +124,7 @@ class ArmNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state):
-        self.active = True
+        self.active, self.line = True, self._line
         self.start()
         # The objects made so far stay for good: the collector need not look at them on the control path.
         gc.collect()
@@ -124,20 +132,23 @@ class ArmNode(LifecycleNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state):
-        self.stop()
-        self.active = False
+        self._halt()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state):
         self._unmake()
+        self._line = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state):
         if self.active:
-            self.stop()
-            self.active = False
+            self._halt()
         self._unmake()
         return super().on_shutdown(state)
+
+    def _halt(self):
+        self.stop()
+        self.active, self.line = False, None
 
     def autostart(self):
         """Configure and activate; False when that failed."""
@@ -196,10 +207,7 @@ def run(node_class, args=None):
         node = node_class()
         if not node.autostart():
             return 1
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while not stopped and rclpy.ok():
-            executor.spin_once(timeout_sec=0.1)
+        spin(node, stopped)
         return 0
     except (ParameterError, ParameterException) as error:
         print(f"{node_class.__name__}: {error}", file=sys.stderr)

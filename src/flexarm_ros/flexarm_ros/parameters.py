@@ -2,8 +2,6 @@
 
 import difflib
 
-from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -11,6 +9,9 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterValueException
+
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import Parameter
 
 
 def descriptor(parameter):
@@ -32,7 +33,9 @@ def descriptor(parameter):
     )
     if parameter.low is not None and parameter.high is not None:
         if parameter.kind == "float":
-            span = FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
+            span = FloatingPointRange(
+                from_value=float(parameter.low), to_value=float(parameter.high)
+            )
             out.floating_point_range = [span]
         elif parameter.kind == "int":
             out.integer_range = [IntegerRange(from_value=parameter.low, to_value=parameter.high)]

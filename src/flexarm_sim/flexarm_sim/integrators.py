@@ -6,8 +6,9 @@ Prince, scipy's tableau), in substeps short enough for the highest mode: with om
 """
 
 import numpy as np
-from flexarm_dynamics.errors import ModelError
 from scipy.integrate import DOP853, solve_ivp
+
+from flexarm_dynamics.errors import ModelError
 
 _STAGES = DOP853.n_stages
 TABLEAU = np.ascontiguousarray(DOP853.A[:_STAGES, :_STAGES])

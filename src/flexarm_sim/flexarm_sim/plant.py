@@ -1,6 +1,7 @@
 """The arm that is simulated: its state, its motion under torque, its safe action."""
 
 import numpy as np
+
 from flexarm_dynamics.errors import ModelError, ShapeError
 
 from . import integrators

@@ -1,6 +1,7 @@
 """What the simulator measures: encoder and strain gauges."""
 
 import numpy as np
+
 from flexarm_dynamics.strain_map import gauge_rows
 
 
@@ -19,7 +20,9 @@ class Sensors:
 
     def __init__(self, model, noise=False, seed=0):
         arm = model.arm
-        self.rows = gauge_rows(model, arm.gauges) * np.array([[g.gain] for g in arm.gauges] or [[1.0]])
+        self.rows = gauge_rows(model, arm.gauges) * np.array(
+            [[g.gain] for g in arm.gauges] or [[1.0]]
+        )
         self.bias = np.array([g.bias for g in arm.gauges])
         self.sigma = np.array([g.noise if noise else 0.0 for g in arm.gauges])
         counts = np.array([j.encoder_counts for j in arm.joints], float)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.parameters import Parameter
@@ -55,7 +56,9 @@ PARAMETERS = (
         high=100.0,
         length="joints",
     ),
-    Parameter("noise", "bool", False, "Whether gauges have the noise of the arm file.", read_only=True),
+    Parameter(
+        "noise", "bool", False, "Whether gauges have the noise of the arm file.", read_only=True
+    ),
     Parameter("seed", "int", 0, "Seed of the noise.", low=0, high=2**31 - 1, read_only=True),
     Parameter(
         "publish_rates",

@@ -15,6 +15,7 @@ Every eigenvalue of the closed boundary layer has a real part below -alpha.
 
 import control
 import numpy as np
+
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem, is_stabilisable

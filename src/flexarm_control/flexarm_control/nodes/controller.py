@@ -5,6 +5,9 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
 
+from rclpy.parameter import Parameter as RosParameter
+from trajectory_msgs.msg import JointTrajectory
+
 from flexarm_control import arm_controller, composite, trajectory
 from flexarm_control.arm_controller import ArmController, Supervisor
 from flexarm_control.composite import FAST, SLOW, CompositeControl
@@ -17,8 +20,6 @@ from flexarm_ros import qos
 from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter, stamp_ns
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
-from rclpy.parameter import Parameter as RosParameter
-from trajectory_msgs.msg import JointTrajectory
 
 SLOW_TYPE = Parameter(
     "type",
@@ -95,8 +96,14 @@ class ControllerNode(ArmNode):
         self._state_pub = self.make_publisher(
             CompositeState, "controller/state", qos.LINE, qos_overriding_options=options
         )
-        self.make_subscription(
-            ArmState, "arm_state_estimate", self._on_state, qos.LINE, qos_overriding_options=options
+        self.make_line(
+            self.make_subscription(
+                ArmState,
+                "arm_state_estimate",
+                self._on_state,
+                qos.LINE,
+                qos_overriding_options=options,
+            )
         )
         self.make_subscription(
             JointTrajectory,
@@ -198,7 +205,9 @@ class ControllerNode(ArmNode):
         if names & {p.name for p in arm_controller.PARAMETERS}:
             settings = self.parameters.group("", {p.name for p in arm_controller.PARAMETERS})
             self.core.configure(settings)
-        groups = [g for g, p in ((SLOW, "slow."), (FAST, "fast.")) if any(n.startswith(p) for n in names)]
+        groups = [
+            g for g, p in ((SLOW, "slow."), (FAST, "fast.")) if any(n.startswith(p) for n in names)
+        ]
         if groups:
             self._designer.submit(self._redesign, groups, self._law_parameters())
 

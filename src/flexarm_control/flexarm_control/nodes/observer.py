@@ -57,8 +57,10 @@ class ObserverNode(ArmNode):
         self._state_pub = self.make_publisher(
             ObserverState, "observer/state", qos.LINE, qos_overriding_options=options
         )
-        self.make_subscription(
-            ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+        self.make_line(
+            self.make_subscription(
+                ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+            )
         )
 
     def _design(self):

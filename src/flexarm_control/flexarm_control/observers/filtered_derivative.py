@@ -13,6 +13,7 @@ It needs no model. It delays a rate of frequency w by about 1/omega_c + h/2, and
 """
 
 import numpy as np
+
 from flexarm_dynamics.parameters import Parameter
 
 from .base import Observer

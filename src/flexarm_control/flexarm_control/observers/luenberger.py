@@ -22,10 +22,11 @@ The joint torque is the one that was applied, from the sample; less friction; gr
 """
 
 import numpy as np
+from scipy.linalg import expm
+
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.singular_perturbation import state_space
-from scipy.linalg import expm
 
 from .base import Observer
 

