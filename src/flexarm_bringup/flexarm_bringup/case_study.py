@@ -140,6 +140,8 @@ def paper_trajectory(joint_names, points=101):
 
 #: The trajectory starts this long after the simulator's first sample [ns]: the observer converges before.
 LEAD_NS = 100_000_000
+#: Simulator in lockstep, paused for the trajectory half way to its start.
+LOCKSTEP = {"lockstep": True, "pause_at": 0.05}
 
 
 def continuous(run):
@@ -173,7 +175,7 @@ def run_nodes(run, directory, progress=lambda fraction: None):
 
     file = parameter_files.find(run.file)
     with own_domain() as domain, Processes(domain, directory / "log") as processes:
-        processes.start_node("simulator", {"lockstep": True, **run.simulator}, file)
+        processes.start_node("simulator", {**LOCKSTEP, **run.simulator}, file)
         processes.start_node("observer", run.observer, file)
         processes.start_node("controller", run.controller, file)
         with lockstep.LockstepRun(processes) as line:

@@ -18,7 +18,7 @@ from flexarm_sim.simulator import Simulator
 
 from .case_study import LEAD_NS
 from .processes import ProcessError
-from .recorder import Recorder
+from .recorder import Recorder, raw_stamp_ns
 
 #: Instant at which the case study's trajectory starts.
 START_NS = Simulator.START_NS + LEAD_NS
@@ -117,6 +117,16 @@ class LockstepRun:
         raw = self.recorder.raw["controller/state"]
         return deserialize_message(raw[-1], CompositeState) if raw else CompositeState()
 
+    def paused_at(self):
+        """Stamp of the sample that is being sent again [ns]; 0 while the loop runs."""
+        raw = self.recorder.raw["controller/state"][-2:]
+        stamps = {raw_stamp_ns(r) for r in raw}
+        return stamps.pop() if len(raw) == 2 and len(stamps) == 1 else 0
+
+    def ready(self):
+        """Whether the controller sends torque."""
+        return self.controller_state().supervisor_state != CompositeState.INACTIVE
+
     def accepted(self):
         """Number of the last accepted trajectory."""
         return self.controller_state().accepted_trajectory_id
@@ -149,7 +159,9 @@ class LockstepRun:
         timing : Timing
         """
         self.wait_for("the nodes (simulator, observer, controller)", self.recorder.complete)
+        self.wait_for("a converged observer, paused", lambda: self.ready() and self.paused_at())
         self.offer(message)
+        begin = self.paused_at()
         end = START_NS + round(duration * 1e9)
         started = time.perf_counter()
         self.pause(False)
@@ -170,11 +182,12 @@ class LockstepRun:
                 if now > deadline:
                     raise ProcessError(f"the loop stands still at {newest * 1e-9:.3f} s")
         wall = time.perf_counter() - started
-        recorder.poll()
-        samples = recorder.samples()
-        stamps = samples["arm_state"]
-        simulated = 1e-9 * (max(stamps) - min(stamps))
-        return samples, Timing(wall, simulated, len(stamps))
+        reached = recorder.latest_ns
+        complete = lambda: all(raw_stamp_ns(m[-1]) >= end for m in recorder.raw.values())  # noqa: E731
+        self.wait_for("the last sample on every topic", complete)
+        samples = recorder.samples(begin, end)
+        period = (end - begin) / (len(samples["arm_state"]) - 1)
+        return samples, Timing(wall, 1e-9 * (reached - begin), round((reached - begin) / period))
 
     def close(self):
         """Leave the graph."""

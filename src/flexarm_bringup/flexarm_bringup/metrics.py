@@ -1,6 +1,6 @@
 """What is reported of a run: tracking, vibration, torque; from recorded samples, without ROS."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -34,6 +34,10 @@ class Record:
     slow_torque: np.ndarray
     fast_torque: np.ndarray
     torque: np.ndarray
+
+    def thinned(self, every):
+        """The same with one row in `every`."""
+        return Record(*(getattr(self, f.name)[::every] for f in fields(self)))
 
     def tip_deflection(self, model):
         """Deflection of the tip, y = phi_e delta, shape (k,) [m]."""

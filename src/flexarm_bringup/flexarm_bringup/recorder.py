@@ -68,43 +68,43 @@ class Recorder:
         raw = self.raw["joint_torque"]
         return raw_stamp_ns(raw[-1]) if raw else 0
 
-    def samples(self):
+    def samples(self, begin_ns, end_ns):
         """One serialised message per stamp and topic: what was sent again is kept once, the last time.
+
+        Parameters
+        ----------
+        begin_ns, end_ns : int
+            First and last stamp.
 
         Returns
         -------
         dict
-            Topic to {stamp_ns: bytes}.
+            Topic to {stamp_ns: bytes}, in order.
 
         Raises
         ------
         ProcessError
             When a topic lacks a sample that another one has.
         """
-        kept = {
-            topic: {raw_stamp_ns(raw): bytes(raw) for raw in messages}
-            for topic, messages in self.raw.items()
-        }
-        # The last sample may still be under way on some topics.
-        end = min(max(stamps) for stamps in kept.values())
-        kept = {
-            topic: {s: raw for s, raw in sorted(stamps.items()) if s <= end}
-            for topic, stamps in kept.items()
-        }
+        kept = {}
+        for topic, messages in self.raw.items():
+            by_stamp = {raw_stamp_ns(raw): bytes(raw) for raw in messages}
+            kept[topic] = {s: r for s, r in sorted(by_stamp.items()) if begin_ns <= s <= end_ns}
         stamps = set().union(*kept.values())
         for topic, messages in kept.items():
             if len(messages) != len(stamps):
                 raise ProcessError(
-                    f"recording: {len(stamps) - len(messages)} of {len(stamps)} samples of {topic} were lost"
+                    f"recording: {len(stamps) - len(messages)} of {len(stamps)} samples of {topic} were"
+                    " lost: is the machine out of memory or shared memory (df /dev/shm)?"
                 )
         return kept
 
 
-def decode(samples):
+def decode(samples, topics=("arm_state", "arm_state_estimate", "controller/state")):
     """Messages of `Recorder.samples`, topic to list, in order of their stamps."""
     return {
-        topic: [deserialize_message(raw, TOPICS[topic]) for raw in messages.values()]
-        for topic, messages in samples.items()
+        topic: [deserialize_message(raw, TOPICS[topic]) for raw in samples[topic].values()]
+        for topic in topics
     }
 
 

@@ -172,7 +172,11 @@ class ArmController:
         q, qd = sample.position, sample.velocity
         np.subtract(reference.position, q, out=self.position_error)
         np.subtract(reference.velocity, qd, out=self.velocity_error)
-        u = self.law.step(q, qd, sample.amplitude, sample.rate, reference)
+        try:
+            u = self.law.step(q, qd, sample.amplitude, sample.rate, reference)
+        except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
+            self.disable(f"the control law failed: {type(error).__name__}: {error}")
+            return False
         if not np.isfinite(u).all():
             i = int(np.argmin(np.isfinite(u)))
             self.disable(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
@@ -211,6 +215,7 @@ class ArmController:
             raise MessageError(
                 f"state {sample.sequence} is not newer than {self._order.sequence}: the stream went back"
             )
+        self._order.take(sample)
         if verdict == SampleOrder.RESTART or self.state == Supervisor.INACTIVE:
             self.reference.start(sample.position, sample.stamp_ns)
             self.state = Supervisor.READY
@@ -224,6 +229,7 @@ class ArmController:
         previous = self.torque.copy() if self._rate_limited else None
         np.clip(u, -self._limit, self._limit, out=self.torque)
         if self._rate_limited:
-            step = self._rate_limit * dt
+            step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
+            np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
             np.clip(self.torque, previous - step, previous + step, out=self.torque)
         self.saturated = bool((self.torque != u).any())

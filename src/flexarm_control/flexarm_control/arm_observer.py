@@ -108,9 +108,25 @@ class ArmObserver:
         dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
         if sample.amplitude is None:
             sample.amplitude = self.strain_map.amplitudes(sample.strain, out=self._mapped)
-        self._joint_velocity(sample, dt)
-        self.observer.update(sample, dt)
+        if not sample.velocity_known:
+            sample.velocity[:] = self._joint_velocity(sample, dt)
+        self._update(sample, dt)
+        # Only now: a sample that the observer refused has left nothing behind, its time step included.
+        self._order.take(sample)
+        self.velocity[:] = sample.velocity
+        self._position[:] = sample.position
         return self.observer.converged
+
+    def _update(self, sample, dt):
+        try:
+            self.observer.update(sample, dt)
+        except MessageError:
+            raise
+        except Exception as error:  # an observer may be anybody's: it costs this sample, not the node
+            name = type(self.observer).__name__
+            raise MessageError(
+                f"observer {name} failed: {type(error).__name__}: {error}"
+            ) from error
 
     def _check(self, sample):
         arm = self.model.arm
@@ -131,16 +147,11 @@ class ArmObserver:
             check_finite(sample.rate, arm.mode_names, "modal_rate")
 
     def _joint_velocity(self, sample, dt):
-        if sample.velocity_known:
-            self.velocity[:] = sample.velocity
-        elif dt == 0.0:
-            self.velocity[:] = 0.0
-        else:
-            slope = (sample.position - self._position) / dt
-            self.velocity[:] = slope + (self.velocity - slope) * np.exp(-self.bandwidth * dt)
-        self._position[:] = sample.position
-        if not sample.velocity_known:
-            sample.velocity[:] = self.velocity
+        """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""
+        if dt == 0.0:
+            return np.zeros_like(self.velocity)
+        slope = (sample.position - self._position) / dt
+        return slope + (self.velocity - slope) * np.exp(-self.bandwidth * dt)
 
 
 #: Values beyond this are no measurement of an arm (rad, m, strain, and their rates).

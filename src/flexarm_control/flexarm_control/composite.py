@@ -7,6 +7,7 @@ z_f = z - z_bar(x, u_slow). On the manifold z_f = 0 and u_fast = 0.
 import numpy as np
 
 from flexarm_dynamics import registry
+from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.parameters import check_all
 from flexarm_dynamics.singular_perturbation import quasi_steady_state
 
@@ -112,7 +113,23 @@ def design(model, slow, fast):
     """
 
     def law(group, given):
-        given = dict(given)
-        return design_law(group, given.pop("type"), model, given)
+        name, values = typed(given, "slow" if group == SLOW else "fast")
+        return design_law(group, name, model, values)
 
     return CompositeControl(model, law(SLOW, slow), law(FAST, fast))
+
+
+def typed(given, prefix):
+    """Split a mapping into its `type` and the parameters.
+
+    Raises
+    ------
+    ParameterError
+        Without a type.
+    """
+    values = dict(given)
+    name = values.pop("type", None)
+    if not isinstance(name, str):
+        what = "missing" if name is None else f"{name!r} is not a name"
+        raise ParameterError(f"{prefix}.type: {what}; write the name of a law, none for no control")
+    return name, values

@@ -59,15 +59,16 @@ class SampleOrder:
         self.session, self.sequence, self.stamp_ns = None, -1, 0
 
     def judge(self, sample):
-        """Class of `sample`; NEW and RESTART are remembered as the last one."""
+        """Class of `sample` beside the last one taken."""
         if sample.session != self.session:
-            verdict = self.RESTART
-        elif sample.sequence == self.sequence:
+            return self.RESTART
+        if sample.sequence == self.sequence:
             return self.REPEAT
-        elif sample.sequence < self.sequence or sample.stamp_ns <= self.stamp_ns:
+        if sample.sequence < self.sequence or sample.stamp_ns <= self.stamp_ns:
             return self.STALE
-        else:
-            verdict = self.NEW
+        return self.NEW
+
+    def take(self, sample):
+        """Remember `sample` as the last one."""
         self.session, self.sequence = sample.session, sample.sequence
         self.stamp_ns = sample.stamp_ns
-        return verdict

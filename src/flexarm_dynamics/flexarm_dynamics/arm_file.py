@@ -32,20 +32,50 @@ from .units import SI_UNIT, to_si
 MOST_MODES = 20
 
 
-class _Loader(yaml.SafeLoader):
-    """Safe loader that refuses a key given twice and reads ``1e-3`` as the number it is."""
+#: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
+LARGEST = 1e30
 
-    def construct_mapping(self, node, deep=False):
+
+def _read_yaml(text, where):
+    """The file as dicts, lists and scalars; refuses a key that is given twice."""
+    try:
+        loader = yaml.SafeLoader(text)
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _check_keys(root, "", set())
+        return loader.construct_document(root)
+    except ArmFileError:
+        raise
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or error
+        raise ArmFileError(where + line, f"not YAML: {reason}") from None
+    except Exception as error:
+        # What PyYAML lets through on a scalar that is not what its tag says, or on endless nesting.
+        raise ArmFileError(where, f"not YAML: {type(error).__name__}: {error}") from None
+
+
+def _check_keys(node, path, visited):
+    if id(node) in visited:  # an alias
+        return
+    visited.add(id(node))
+    if isinstance(node, yaml.SequenceNode):
+        for i, child in enumerate(node.value):
+            _check_keys(child, f"{path}[{i}]", visited)
+    elif isinstance(node, yaml.MappingNode):
         seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                line = key_node.start_mark.line + 1
-                raise ArmFileError(f"line {line}", f"the key {key!r} is not a name")
-            if key in seen:
-                raise ArmFileError(key, f"given twice (line {key_node.start_mark.line + 1})")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
+        for key, child in node.value:
+            line = f"line {key.start_mark.line + 1}"
+            if key.tag != "tag:yaml.org,2002:str":
+                what = repr(key.value) if isinstance(key, yaml.ScalarNode) else "a collection"
+                raise ArmFileError(path or line, f"the key {what} ({line}) is not a name")
+            at = f"{path}.{key.value}" if path else key.value
+            if key.value in seen:
+                raise ArmFileError(at, f"given twice ({line})")
+            seen.add(key.value)
+            _check_keys(child, at, visited)
 
 
 class _Section:
@@ -88,6 +118,8 @@ class _Section:
             )
         if low is not None and value < low:
             raise ArmFileError(self.at(key), f"{value} must not be below {low}")
+        if positive and value < 1.0 / LARGEST:
+            raise ArmFileError(self.at(key), f"{value} is too small")
         return value * to_si(self.system, dimension)
 
     def vector(self, key, length, dimension="none", default=None):
@@ -104,19 +136,25 @@ class _Section:
     def integer(self, key, default=None, low=None, high=None):
         value = self.raw(key, default, required=default is None)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise ArmFileError(self.at(key), f"{value!r} is not an integer")
+            raise ArmFileError(self.at(key), f"{_kind(value)} is not an integer")
         if (low is not None and value < low) or (high is not None and value > high):
-            raise ArmFileError(self.at(key), f"{value} must be from {low} to {high}")
+            raise ArmFileError(self.at(key), f"{_kind(value)} must be from {low} to {high}")
         return value
 
     def text(self, key, default=None, choices=None):
         value = self.raw(key, default, required=default is None)
         if not isinstance(value, str):
-            raise ArmFileError(self.at(key), f"{value!r} is not text")
+            raise ArmFileError(self.at(key), f"{_kind(value)} is not text")
         if choices and value not in choices:
             close = difflib.get_close_matches(value, choices, 1)
             hint = f"; {close[0]!r}?" if close else ""
             raise ArmFileError(self.at(key), f"{value!r} is not one of {', '.join(choices)}{hint}")
+        return value
+
+    def name(self):
+        value = self.text("name")
+        if not value.strip():
+            raise ArmFileError(self.at("name"), "empty")
         return value
 
     def section(self, key):
@@ -143,6 +181,8 @@ def _kind(value):
         return "nothing"
     if isinstance(value, dict):
         return "a mapping"
+    if isinstance(value, int) and value.bit_length() > 64:
+        return "an integer of more than 64 bits"
     return "a list" if isinstance(value, list) else repr(value)
 
 
@@ -155,8 +195,10 @@ def _number(value, path):
             raise ArmFileError(path, f"{value!r} is not a number") from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ArmFileError(path, f"{_kind(value)} is not a number")
-    if not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         raise ArmFileError(path, f"{value} is not finite")
+    if abs(value) > LARGEST:
+        raise ArmFileError(path, f"{_kind(value)} is too large")
     return float(value)
 
 
@@ -190,7 +232,7 @@ def _limits(joint):
 
 def _joint(s):
     axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
-    norm = math.sqrt(sum(a * a for a in axis))
+    norm = math.hypot(*axis)
     if norm == 0.0:
         raise ArmFileError(s.at("axis"), "its length is zero")
     origin = {"xyz": (0.0,) * 3, "rpy": (0.0,) * 3}
@@ -207,7 +249,7 @@ def _joint(s):
         if s.has(key)
     }
     joint = Joint(
-        name=s.text("name"),
+        name=s.name(),
         axis=tuple(a / norm for a in axis),
         origin_xyz=origin["xyz"],
         origin_rpy=origin["rpy"],
@@ -284,7 +326,7 @@ def _section_properties(s):
 
 
 def _link(s):
-    name = s.text("name")
+    name = s.name()
     length = s.number("length", "length", positive=True)
     if s.has("section"):
         for key in ("EI_y", "EI_z", "GJ", "mass_per_length"):
@@ -330,7 +372,7 @@ def _payload(s):
 
 
 def _gauge(s, links):
-    name = s.text("name")
+    name = s.name()
     link = s.text("link", choices=tuple(links))
     position = s.number("position", "length")
     if not 0.0 <= position <= links[link].length:
@@ -373,9 +415,10 @@ def _observed(s, modes, gauges):
         raise ArmFileError("observed_modes", f"a list of mode names is wanted, not {_kind(names)}")
     known = {m.name: m for m in modes}
     for i, name in enumerate(names):
-        if name not in known:
+        if not isinstance(name, str) or name not in known:
             raise ArmFileError(
-                f"observed_modes[{i}]", f"{name!r} is not a mode of this arm: {', '.join(known)}"
+                f"observed_modes[{i}]",
+                f"{_kind(name)} is not a mode of this arm: {', '.join(known)}",
             )
         if name in names[:i]:
             raise ArmFileError(f"observed_modes[{i}]", f"{name!r} given twice")
@@ -411,15 +454,7 @@ def parse(text, where="arm"):
     ArmFileError
         Naming the field by its path, the value, and what is wanted.
     """
-    try:
-        data = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" line {mark.line + 1}" if mark else ""
-        raise ArmFileError(where + line, f"not YAML: {getattr(error, 'problem', error)}") from None
-    except (RecursionError, ValueError) as error:
-        raise ArmFileError(where, f"not YAML: {type(error).__name__}") from None
-    top = _Section(data, "", "si")
+    top = _Section(_read_yaml(text, where), "", "si")
     top.system = top.text("units", "si", ("si", "imperial"))
     joints = tuple(_joint(s) for s in top.sections("joints", required=True))
     links = tuple(_link(s) for s in top.sections("links", required=True))
@@ -437,7 +472,7 @@ def parse(text, where="arm"):
     _unique(gauges, "gauges")
     model, options = _model(top)
     arm = Arm(
-        name=top.text("name"),
+        name=top.name(),
         joints=joints,
         links=links,
         payload=_payload(top.section("payload")) if top.has("payload") else Payload(),
@@ -490,9 +525,12 @@ def find(name):
     ArmFileError
         When there is no such file; lists the shipped names.
     """
-    path = Path(name).expanduser()
-    if path.is_file():
-        return path
+    try:
+        path = Path(name).expanduser()
+        if path.is_file():
+            return path
+    except (OSError, RuntimeError) as error:  # a name too long; no such user's home
+        raise ArmFileError("arm", f"{str(name)[:80]!r} is no path: {error}") from None
     for directory in arms_directories():
         candidate = directory / f"{name}.yaml"
         if candidate.is_file():

@@ -25,6 +25,9 @@ from .errors import ModelError
 #: Modal integrals are computed to this, relative to the largest entry (Gauss-Legendre, tested).
 INTEGRAL_TOLERANCE = 1e-12
 
+#: Heaviest tip load, in masses and inertias of the beam: the lowest wave number stays where it has digits.
+HEAVIEST_LOAD = 1e10
+
 
 @lru_cache(maxsize=32)
 def _gauss_legendre(n):
@@ -236,11 +239,18 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     Raises
     ------
     ModelError
-        When the frequency equation has fewer roots than asked for in the range searched.
+        When the load is heavier than `HEAVIEST_LOAD`, or when the frequency equation has fewer roots than
+        asked for in the range searched.
     """
     mass = tip_mass / (mass_per_length * length)
     moment = tip_mass * tip_offset / (mass_per_length * length**2)
     inertia = (tip_inertia + tip_mass * tip_offset**2) / (mass_per_length * length**3)
+
+    if max(mass, inertia) > HEAVIEST_LOAD:
+        raise ModelError(
+            f"loaded beam: its load is {mass:.3g} times its mass and {inertia:.3g} times m L^2; at most"
+            f" {HEAVIEST_LOAD:g}, or call the link rigid"
+        )
 
     def determinant(beta):
         m = _loaded_matrix(beta, mass, inertia, moment)
@@ -249,7 +259,11 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
         return m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
 
     roots = []
-    grid = np.arange(1e-3, (modes + 1.5) * np.pi, np.pi / 64.0)
+    # Heavy loads bring two roots near zero, at least a factor of 1.9 apart.
+    step = np.pi / 64.0
+    grid = np.append(
+        np.geomspace(1e-3, step, 16, endpoint=False), np.arange(step, (modes + 1.5) * np.pi, step)
+    )
     values = [determinant(b) for b in grid]
     for k in range(grid.size - 1):
         if values[k] * values[k + 1] < 0.0 and len(roots) < modes:

@@ -29,7 +29,6 @@ import numpy as np
 
 from . import beam
 from .errors import ModelError
-from .kernels import one_link as kernel
 from .model import ArmModel, Terms, damping_matrix
 
 
@@ -168,6 +167,9 @@ class OneLinkEquations(ArmModel):
         return np.array([[f.viscous, f.coulomb, f.smoothing]])
 
     def stepper(self, tableau, weights):
+        # Only who integrates pays for importing numba.
+        from .kernels import one_link as kernel
+
         c = self.coefficients
         scalars = np.array([c.rigid, c.moment, self._gravity[0], self._gravity[1], 0.0, 0.0, 1.0])
         inverse = np.linalg.inv(c.M22)

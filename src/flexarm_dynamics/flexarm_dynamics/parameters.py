@@ -102,6 +102,8 @@ class Parameter:
     def _float(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise ParameterError(f"{where}: {value!r} is not a number")
+        if not _is_finite(value):
+            raise ParameterError(f"{where}: {value} is not finite")
         if isinstance(value, numbers.Integral):
             raise ParameterError(
                 f"{where}: {value!r} is an integer where a float is asked for: write {float(value)}"
@@ -113,7 +115,8 @@ class Parameter:
             raise ParameterError(f"{where}: {value!r} is not a list of numbers")
         value = list(value)
         if value and all(
-            isinstance(v, numbers.Integral) and not isinstance(v, bool) for v in value
+            isinstance(v, numbers.Integral) and not isinstance(v, bool) and _is_finite(v)
+            for v in value
         ):
             wanted = ", ".join(str(float(v)) for v in value)
             raise ParameterError(
@@ -136,7 +139,7 @@ class Parameter:
         return out
 
     def _in_range(self, where, value):
-        if not math.isfinite(value):
+        if not _is_finite(value):
             raise ParameterError(f"{where}: {value} is not finite")
         if self.low is not None and value < self.low:
             raise ParameterError(
@@ -147,6 +150,14 @@ class Parameter:
                 f"{where}: {value} is above its upper limit {self.high} [{self.unit}]"
             )
         return value
+
+
+def _is_finite(value):
+    """Whether a float holds it; an integer or a fraction may be too large for one."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def check_all(declared, values, sizes=None, prefix=""):

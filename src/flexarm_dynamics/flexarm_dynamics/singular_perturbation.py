@@ -247,15 +247,23 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_fast):
 
 
 def frequencies_and_damping(eigenvalues):
-    """Natural frequency [rad/s] and damping ratio of each conjugate pair or pair of real poles, ascending."""
+    """Natural frequency [rad/s] and damping ratio of each conjugate pair or pair of real poles, ascending.
+
+    Real poles are paired by ascending magnitude; one that is left alone counts as a pair of equal ones.
+    Unstable pairs have a negative damping ratio.
+    """
     eigenvalues = np.asarray(eigenvalues)
     pairs = eigenvalues[eigenvalues.imag > 0.0]
     omega = np.abs(pairs)
     zeta = -pairs.real / omega
-    real = np.sort(np.abs(eigenvalues[eigenvalues.imag == 0.0]))
-    for fast, slow in zip(real[1::2], real[::2], strict=False):
-        product = np.sqrt(fast * slow)
+    real = eigenvalues[eigenvalues.imag == 0.0].real
+    real = real[np.argsort(np.abs(real))]
+    if real.size % 2:
+        real = np.append(real, real[-1])
+    for slow, fast in real.reshape(-1, 2):
+        product = np.sqrt(abs(fast * slow))
         omega = np.append(omega, product)
-        zeta = np.append(zeta, 0.5 * (fast + slow) / product if product > 0.0 else 1.0)
+        at_zero = 1.0 if fast + slow <= 0.0 else -1.0
+        zeta = np.append(zeta, -0.5 * (fast + slow) / product if product > 0.0 else at_zero)
     order = np.argsort(omega)
     return omega[order], zeta[order]

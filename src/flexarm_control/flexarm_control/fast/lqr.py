@@ -13,8 +13,8 @@ are taken at one joint configuration, the trajectory's end, so that no Riccati e
 Every eigenvalue of the closed boundary layer has a real part below -alpha.
 """
 
-import control
 import numpy as np
+from scipy.linalg import eig
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.parameters import Parameter
@@ -69,6 +69,9 @@ class Lqr(FastLaw):
     )
 
     def __init__(self, model, parameters):
+        # Takes most of a second to import: only who designs this law waits for it.
+        import control
+
         super().__init__(model, parameters)
         q = np.array(self.parameters["configuration"])
         alpha = self.parameters["alpha"]
@@ -76,9 +79,9 @@ class Lqr(FastLaw):
         ok, worst = is_stabilisable(self.A2, self.B2, alpha)
         if not ok:
             raise DesignError(
-                f"fast.alpha: at joint configuration {q.tolist()} the torques can't reach every mode"
-                f" slower than {alpha} 1/s (smallest singular value {worst:.2g}); lower fast.alpha or"
-                " leave that mode out of the controller's arm file"
+                f"fast.alpha: at joint configuration {q.tolist()} the torques can't reach"
+                f" {self._least_reached()}, which must decay faster than {alpha} 1/s (smallest singular"
+                f" value {worst:.2g}); lower fast.alpha or leave that mode out of the controller's arm file"
             )
         shifted = self.A2 + alpha * np.eye(self.A2.shape[0])
         Q, R = np.diag(self.parameters["q"]), np.diag(self.parameters["r"])
@@ -96,6 +99,12 @@ class Lqr(FastLaw):
                 f"fast: the closed boundary layer's slowest pole is at {worst:.4g} 1/s, not left of"
                 f" -alpha = {-alpha}; raise fast.q or lower fast.alpha"
             )
+
+    def _least_reached(self):
+        """Name of the modal coordinate that dominates the eigenvector B2 reaches least."""
+        _, left, right = eig(self.A2, left=True)
+        i = np.argmin(np.linalg.norm(left.conj().T @ self.B2, axis=1))
+        return self.model.mode_names[int(np.argmax(np.abs(right[: self.model.n_modes, i])))]
 
     def torque(self, z_f):
         return self._K_f @ z_f

@@ -6,19 +6,19 @@ Over a sample of length h under constant torque u the fast subsystem moves exact
     \begin{bmatrix}\delta\\ \dot\delta\end{bmatrix}_k
     = \begin{bmatrix}\Phi_{11}&\Phi_{12}\\ \Phi_{21}&\Phi_{22}\end{bmatrix}
       \begin{bmatrix}\delta\\ \dot\delta\end{bmatrix}_{k-1}
-    + \begin{bmatrix}\Gamma_1\\ \Gamma_2\end{bmatrix} u_{k-1} + \begin{bmatrix}\gamma_1\\ \gamma_2\end{bmatrix} .
+    + \begin{bmatrix}\Gamma_1\\ \Gamma_2\end{bmatrix} u .
 
 The amplitudes are measured, the rates are predicted and corrected by the prediction error of the amplitudes,
 
 .. math::
-    \hat{\dot\delta}_k = \Phi_{21}\delta_{k-1} + \Phi_{22}\hat{\dot\delta}_{k-1} + \Gamma_2 u + \gamma_2
-    + L\,[\delta_k - \Phi_{11}\delta_{k-1} - \Phi_{12}\hat{\dot\delta}_{k-1} - \Gamma_1 u - \gamma_1],
+    \hat{\dot\delta}_k = \Phi_{21}\delta_{k-1} + \Phi_{22}\hat{\dot\delta}_{k-1} + \Gamma_2 u
+    + L\,[\delta_k - \Phi_{11}\delta_{k-1} - \Phi_{12}\hat{\dot\delta}_{k-1} - \Gamma_1 u],
 
 with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`, which leaves the error
 :math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes, whatever the time step.
 
-The joint torque is the one that was applied, from the sample; less friction; gravity (g2 of
-(6)) enters as constant over the sample.
+The joint torque is the one that was applied, from the sample. What (6) has in g2, friction and gravity, goes
+with it: u stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ from scipy.linalg import expm
 
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import Parameter
-from flexarm_dynamics.singular_perturbation import state_space
+from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from .base import Observer
 
@@ -47,7 +47,7 @@ class Luenberger(Observer):
     )
 
     SETTLING = 5.0
-    #: Designs are kept for this many different time steps (jitter in a real-time loop is rounded to 10 us).
+    #: Designs are kept for this many different time steps and configurations; a new one takes about 0.1 ms.
     KEPT = 64
 
     def __init__(self, model, parameters):
@@ -61,22 +61,22 @@ class Luenberger(Observer):
         super().reset()
         self._elapsed = -1.0
 
-    def design(self, dt, q, qd):
+    def design(self, dt, q):
         """Transition of (11) over dt and the gain L; at rest, in configuration q.
 
         Returns
         -------
         Phi : ndarray, shape (2m, 2m)
-        Gamma : ndarray, shape (2m, n + 1)
-            Columns for the torques and for g2 of (6).
+        Gamma : ndarray, shape (2m, n + m)
+            Columns for u - f1 and for f2 of (2).
         L : ndarray, shape (m, m)
         """
         m, n = self.model.n_modes, self.model.n_joints
-        s = state_space(self.model.terms(q, qd))
-        big = np.zeros((2 * m + n + 1, 2 * m + n + 1))
-        big[: 2 * m, : 2 * m] = s.A2
-        big[: 2 * m, 2 * m : 2 * m + n] = s.B2
-        big[: 2 * m, -1] = s.g2
+        terms = self.model.terms(q, np.zeros(n))
+        _, _, H21, H22 = terms.partition()
+        big = np.zeros((3 * m + n, 3 * m + n))
+        big[: 2 * m, : 2 * m] = fast_subsystem(terms)[0]
+        big[m : 2 * m, 2 * m :] = np.hstack([H21, -H22])
         flow = expm(big * dt)
         Phi, Gamma = flow[: 2 * m, : 2 * m], flow[: 2 * m, 2 * m :]
         decay = np.exp(-self.pole * dt)
@@ -84,13 +84,14 @@ class Luenberger(Observer):
         return Phi, Gamma, L
 
     def _design_for(self, dt, sample):
-        # One design per (time step, configuration to 0.1 rad): arms with constant matrices make one.
-        key = (round(dt * 1e5), *np.round(sample.position, 1).tolist())
+        # One design per time step and configuration to 0.1 rad: which one does not depend on the past.
+        q = np.round(sample.position, 1)
+        key = (dt, *q.tolist())
         found = self._designs.get(key)
         if found is None:
             if len(self._designs) >= self.KEPT:
                 self._designs.clear()
-            found = self.design(dt, sample.position, np.zeros_like(sample.velocity))
+            found = self.design(dt, q)
             self._designs[key] = found
         return found
 
@@ -108,9 +109,9 @@ class Luenberger(Observer):
             )
         m = self.amplitude.size
         Phi, Gamma, L = self._design_for(dt, sample)
+        terms = self.model.terms(sample.position, sample.velocity)
         predicted = Phi @ np.concatenate([self.amplitude, self.rate])
-        predicted += Gamma[:, :-1] @ (sample.torque - self.model.friction(sample.velocity))
-        predicted += Gamma[:, -1]
+        predicted += Gamma @ np.concatenate([sample.torque - terms.f1, terms.f2])
         np.subtract(sample.amplitude, predicted[:m], out=self.innovation)
         self.rate[:] = predicted[m:] + L @ self.innovation
         self.amplitude[:] = sample.amplitude

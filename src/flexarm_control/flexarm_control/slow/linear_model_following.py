@@ -42,7 +42,8 @@ class LinearModelFollowing(SlowLaw):
 
     def B_inverse(self, terms):
         """The matrix in front of the bracket of (17), shape (n, n) [kg m^2]."""
-        if self._cached[0] is not terms.M:  # M of (2) is one object as long as it is constant
+        # M of (2) is one object as long as it is constant; K1, gravity's, makes B depend on q besides.
+        if self._cached[0] is not terms.M or terms.K1.any():
             n = terms.n
             B = terms.H[:n, :n] if self.printed else slow_subsystem(terms)[1]
             self._cached = (terms.M, np.linalg.inv(B))

@@ -25,10 +25,14 @@ PARAMETERS = (
         read_only=True,
     ),
     Parameter(
-        "start_paused",
-        "bool",
-        True,
-        "In lockstep, wait for `~/pause` with data false before the first period.",
+        "pause_at",
+        "float",
+        0.0,
+        "In lockstep, pause at this simulated time, once, until `~/pause` is called with data false;"
+        " negative: never.",
+        unit="s",
+        low=-1.0,
+        high=1e6,
         read_only=True,
     ),
     Parameter(
@@ -93,7 +97,7 @@ class SimulatorNode(ArmNode):
         )
         # A restart is a new session; so is a reset.
         self._session = int.from_bytes(os.urandom(4), "little")
-        self._paused = self._lockstep and parameters["start_paused"]
+        self._pause_first()
         self._answered = None  # sequence of the state whose answer is kept while paused
         self._answer = None
         self._writer, self._reader = StateWriter(self.arm), TorqueReader(self.arm)
@@ -127,6 +131,13 @@ class SimulatorNode(ArmNode):
             self.make_line(torques, period, self._on_period)
         self.make_timer(parameters["resend_period"], self._resend)
 
+    def _pause_first(self):
+        """Where the first pause comes, counted in samples: the same in every run."""
+        at = self.parameters["pause_at"]
+        pauses = self._lockstep and at >= 0.0
+        self._pause_sequence = round(at * 1e9 / self.sim.period_ns) if pauses else None
+        self._paused = self._pause_sequence == 0
+
     def _changed(self, names):
         if "initial_position" in names:
             self.sim.settings["initial_position"] = self.parameters["initial_position"]
@@ -152,6 +163,7 @@ class SimulatorNode(ArmNode):
             if self._paused:
                 return  # the state is sent again after the pause, and answered from the cache
             self._advance(torque)
+            self._paused = self._paused or self.sim.sequence == self._pause_sequence
             self._publish()
         elif self._answered is None or msg.sequence >= self._answered:
             self._answered = msg.sequence
@@ -235,7 +247,7 @@ class SimulatorNode(ArmNode):
         self._session = (self._session + 1) % 2**32
         self._answered, self._answer, self._fault = None, None, ""
         self._controllers, self._second = set(), None
-        self._paused = self._lockstep and self.parameters["start_paused"]
+        self._pause_first()
         self._fill()
         self._resend()
         response.success, response.message = True, f"session {self._session}"

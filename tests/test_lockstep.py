@@ -1,0 +1,96 @@
+"""Lockstep: the same inputs give the same samples, to the last bit, whatever else the machine does."""
+
+import contextlib
+import os
+import subprocess
+import sys
+
+import pytest
+from rclpy.serialization import deserialize_message
+
+from flexarm_bringup import case_study, lockstep, parameter_files, recorder, relay
+from flexarm_bringup.processes import Processes, own_domain
+from flexarm_control import profiles
+from flexarm_dynamics import arm_file
+
+RUN = case_study.Run("R", "m11", "composite", "observer")
+
+
+def record(directory, duration, run=RUN):
+    """Samples and timing of a lockstep run of three new processes."""
+    file = parameter_files.find(run.file)
+    with own_domain() as domain, Processes(domain, directory) as processes:
+        processes.start_node("simulator", {**case_study.LOCKSTEP, **run.simulator}, file)
+        processes.start_node("observer", run.observer, file)
+        processes.start_node("controller", run.controller, file)
+        with lockstep.LockstepRun(processes) as line:
+            joints = arm_file.load(run.arm).joint_names
+            message = lockstep.trajectory_message(
+                joints, profiles.paper_profile(), 101, lockstep.START_NS
+            )
+            return line.run(message, duration)
+
+
+#: What tells one run from another, or is a wall-clock time.
+IDENTITY = {"session", "controller_id", "compute_time"}
+
+
+def without_identity(samples):
+    """Every field of every sample, floats as bytes; serialised messages differ in their padding."""
+    return {
+        topic: [
+            fields(deserialize_message(raw, recorder.TOPICS[topic])) for raw in messages.values()
+        ]
+        for topic, messages in samples.items()
+    }
+
+
+def fields(message):
+    """Name to value, arrays and floats as bytes: -0.0 is not 0.0, NaN equals the same NaN."""
+    out = {}
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        if name in IDENTITY:
+            continue
+        if hasattr(value, "get_fields_and_field_types"):
+            value = fields(value)
+        elif hasattr(value, "tobytes"):
+            value = value.tobytes()
+        out[name] = value
+    return out
+
+
+@contextlib.contextmanager
+def loaded_cpu():
+    """One processor kept busy."""
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        with contextlib.suppress(AttributeError, OSError):
+            os.sched_setaffinity(busy.pid, {min(os.sched_getaffinity(0))})
+        yield
+    finally:
+        busy.kill()
+        busy.wait()
+
+
+def test_ten_runs_give_the_same_samples_bit_for_bit_with_one_cpu_loaded(tmp_path):
+    with loaded_cpu():
+        first = without_identity(record(tmp_path / "0", 0.5)[0])
+        assert all(len(messages) == 551 for messages in first.values())
+        for i in range(1, 10):
+            again = without_identity(record(tmp_path / str(i), 0.5)[0])
+            for topic, messages in first.items():
+                assert again[topic] == messages, f"run {i}, {topic}"
+
+
+def test_lockstep_costs_at_most_1_6_of_a_bare_relay(tmp_path):
+    # Interleaved, medians; a noisy machine gets three chances, a slow product none.
+    ratios = []
+    for _ in range(3):
+        bare = [relay.measure("R", tmp_path / "relay", 2000, lockstep.LockstepRun)]
+        loop = record(tmp_path / "loop", 2.0)[1].seconds_per_sample
+        bare.append(relay.measure("R", tmp_path / "relay", 2000, lockstep.LockstepRun))
+        ratios.append(loop / (sum(bare) / 2.0))
+        if ratios[-1] <= 1.6:
+            return
+    pytest.fail(f"lockstep wall time is {ratios} of a bare relay's")
