@@ -345,7 +345,7 @@ def _figures(directory, records):
         arm = name.split("_")[0]
         made += figures.draw(
             directory / "figures" / name,
-            name,
+            "arm {}, gain {}".format(*name.split("_")),
             records[f"{name}_slow"],
             records[f"{name}_composite"],
             model.build(arm_file.load(arm)),

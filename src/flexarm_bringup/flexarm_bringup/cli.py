@@ -19,6 +19,24 @@ def _publish(options):
     publish(options)
 
 
+def _run(options):
+    import os
+
+    from .processes import executable
+
+    path = executable(options.package, options.executable)
+    os.execv(path, [path, *options.arguments])
+
+
+def _parameters(options):
+    from .parameter_tables import tables, write
+
+    if options.write:
+        write(options.write)
+    else:
+        print(tables())
+
+
 def parser():
     """The argument parser of all sub-commands."""
     top = argparse.ArgumentParser(
@@ -50,6 +68,26 @@ def parser():
     )
     add_arguments(publish)
     publish.set_defaults(function=_publish)
+
+    run = commands.add_parser(
+        "run",
+        help="start one node, as `ros2 run` does, without a ROS installation",
+        description="Starts an installed executable of the workspace; what follows it is passed on.",
+        epilog="example: flexarm run flexarm_sim simulator --ros-args -p arm:=R",
+    )
+    run.add_argument("package")
+    run.add_argument("executable")
+    run.add_argument("arguments", nargs=argparse.REMAINDER)
+    run.set_defaults(function=_run)
+
+    parameters = commands.add_parser(
+        "parameters",
+        help="tables of all parameters, from their declarations",
+        description="Prints every node's parameters as Markdown, or writes them between a file's markers.",
+        epilog="example: flexarm parameters --write README.md",
+    )
+    parameters.add_argument("--write", metavar="FILE", help="rewrite the tables of this file")
+    parameters.set_defaults(function=_parameters)
     return top
 
 

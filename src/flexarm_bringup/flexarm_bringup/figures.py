@@ -206,6 +206,7 @@ def _torques(slow, composite, title):
     _finish(right, "composite control", "", composite)
     for axes in (left, right):
         axes.set_xlim(0.0, 4.0)
+        axes.set_xticks(range(5))
     figure.suptitle(f"Fig. 11  Control torques  ({title})", fontsize=11)
     return figure
 

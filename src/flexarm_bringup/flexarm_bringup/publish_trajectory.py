@@ -17,8 +17,7 @@ def add_arguments(parser):
     parser.add_argument(
         "--from",
         dest="start",
-        default="0.0",
-        help="joint angles where the motion starts, comma separated [rad] (default 0)",
+        help="joint angles where the motion starts, comma separated [rad] (default: where the reference is)",
     )
     parser.add_argument(
         "--to",
@@ -46,9 +45,10 @@ def _angles(text, count, what):
     return values
 
 
-def profile_of(options, count):
-    """The motion that the options describe, for `count` joints."""
-    start = _angles(options.start, count, "from")
+def profile_of(options, reference):
+    """The motion that the options describe, from `reference` unless they say from where."""
+    count = len(reference)
+    start = _angles(options.start, count, "from") if options.start else list(reference)
     end = _angles(options.to, count, "to")
     if options.profile == "quintic":
         return profiles.quintic(start, end, options.duration)
@@ -56,37 +56,85 @@ def profile_of(options, count):
     return profiles.paper_profile(options.duration, travel, start)
 
 
+class _Conversation:
+    """A node that publishes trajectories and hears what the controller makes of them."""
+
+    def __init__(self, options, ros_args):
+        import rclpy
+        from trajectory_msgs.msg import JointTrajectory
+
+        from flexarm_msgs.msg import CompositeState
+        from flexarm_ros import qos
+
+        self.timeout = options.timeout
+        self.context = rclpy.Context()
+        rclpy.init(args=ros_args, context=self.context)
+        self.node = rclpy.create_node("publish_trajectory", context=self.context)
+        self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.publisher = self.node.create_publisher(JointTrajectory, options.topic, qos.COMMAND)
+        self.state = None
+        self.node.create_subscription(CompositeState, "controller/state", self._hear, qos.LINE)
+
+    def _hear(self, msg):
+        self.state = msg
+
+    def wait_for(self, condition, otherwise):
+        """Serve callbacks until `condition` holds; raise a FlexarmError with `otherwise` when it does not."""
+        end = time.monotonic() + self.timeout
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > end:
+                raise FlexarmError(otherwise)
+
+    def close(self):
+        import rclpy
+
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
 def publish(options, ros_args=None):
-    """Publish once, with stamp 0 (now), to a controller that is there."""
-    import rclpy
-    from rclpy.node import Node
-    from trajectory_msgs.msg import JointTrajectory
+    """Publish once, with stamp 0 (now), to a controller that is there; say what became of it.
 
-    from flexarm_ros import qos
-
+    Raises
+    ------
+    FlexarmError
+        When there is no controller, or it refuses the trajectory.
+    """
     from .lockstep import trajectory_message
 
     names = arm_file.load(options.arm).joint_names
-    message = trajectory_message(names, profile_of(options, len(names)), options.points)
-    rclpy.init(args=ros_args)
+    profile_of(options, [0.0] * len(names))  # says what is wrong with the options before it waits
+    line = _Conversation(options, ros_args)
     try:
-        node = Node("publish_trajectory")
-        publisher = node.create_publisher(JointTrajectory, options.topic, qos.COMMAND)
-        end = time.monotonic() + options.timeout
-        while publisher.get_subscription_count() == 0:
-            rclpy.spin_once(node, timeout_sec=0.05)
-            if time.monotonic() > end:
-                raise FlexarmError(
-                    f"nobody listens on {publisher.topic_name} for {options.timeout:g} s: start the"
-                    " controller, on this ROS_DOMAIN_ID"
-                )
-        publisher.publish(message)
-        if not publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=options.timeout)):
-            raise FlexarmError("the controller did not acknowledge the trajectory")
-        print(f"published {options.profile}: {len(message.points)} points, {options.duration:g} s")
-        node.destroy_node()
+        line.wait_for(
+            lambda: line.state is not None and line.publisher.get_subscription_count(),
+            f"no controller answers on {line.publisher.topic_name} and controller/state for"
+            f" {options.timeout:g} s: start simulator, observer and controller, on this ROS_DOMAIN_ID",
+        )
+        before = line.state
+        message = trajectory_message(
+            names, profile_of(options, before.reference_position), options.points
+        )
+        line.publisher.publish(message)
+
+        def answered():
+            now = line.state
+            return (now.accepted_trajectory_id, now.rejected_reason) != (
+                before.accepted_trajectory_id,
+                before.rejected_reason,
+            )
+
+        line.wait_for(answered, "the controller took no notice: a repeat of what it follows?")
+        if line.state.accepted_trajectory_id == before.accepted_trajectory_id:
+            raise FlexarmError(f"refused: {line.state.rejected_reason}")
+        print(
+            f"{options.profile}: accepted as trajectory {line.state.accepted_trajectory_id},"
+            f" {len(message.points)} points, {options.duration:g} s"
+        )
     finally:
-        rclpy.try_shutdown()
+        line.close()
 
 
 def main(args=None):

@@ -8,7 +8,7 @@ What print leaves out of its own Lagrangian, and this class with it:
 =============================================  ==========================================================
 omitted                                        effect on arm R
 =============================================  ==========================================================
-the beam's own :math:`m\sum\delta_i^2` in m11  composite's peak joint error 3.447 -> 3.475 deg
+the beam's own :math:`m\sum\delta_i^2` in m11  composite's peak joint error 3.457 -> 3.449 deg
 and :math:`m\dot\theta^2\delta_i` in K2
 :math:`J_p` in m11, :math:`J_p\phi_e'`         m12 .071435 -> .071493 lbf s^2; zeta_2 .4052 -> .3995;
 in m12 and m13                                 first gain -127.04 -> -127.56 lbf

@@ -1,0 +1,67 @@
+"""Tables of all parameters in Markdown, from the declarations that the nodes validate with."""
+
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+
+BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
+
+
+def groups():
+    """Node name to its declared parameters by prefix."""
+    from flexarm_control.nodes import controller, observer
+    from flexarm_ros.node import AUTOSTART
+    from flexarm_sim import simulator
+    from flexarm_sim.nodes import simulator as simulator_node
+
+    common = {"": (AUTOSTART,)}
+    return {
+        "simulator": {"": (*common[""], *simulator.PARAMETERS, *simulator_node.PARAMETERS)},
+        "observer": _with(observer.parameter_groups(), common),
+        "controller": _with(controller.parameter_groups(), common),
+    }
+
+
+def _with(given, common):
+    return {**given, "": (*common[""], *given[""])}
+
+
+def tables():
+    """One table per node."""
+    lines = []
+    for node, by_prefix in groups().items():
+        lines += [f"**`{node}`**", "", "| parameter | default | unit | range | what it does |"]
+        lines += ["|---|---|---|---|---|"]
+        for prefix, declared in by_prefix.items():
+            lines += [_row(prefix, p) for p in declared]
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def _row(prefix, p):
+    default = f"`{p.default!r}`".replace("'", '"').replace("True", "true").replace("False", "false")
+    if p.choices:
+        span = ", ".join(f"`{c}`" for c in p.choices)
+    elif p.low is not None or p.high is not None:
+        span = f"{p.low:g} … {p.high:g}"
+    else:
+        span = ""
+    text = p.description + ("" if not p.read_only else " *Read-only.*")
+    return f"| `{prefix}{p.name}` | {default} | {p.unit} | {span} | {text} |"
+
+
+def write(file):
+    """Put the tables between the markers of a Markdown file.
+
+    Raises
+    ------
+    FlexarmError
+        When the file has no markers.
+    """
+    path = Path(file)
+    text = path.read_text(encoding="utf-8")
+    if BEGIN not in text or END not in text:
+        raise FlexarmError(f"{file}: no lines {BEGIN} and {END} to write between")
+    head, rest = text.split(BEGIN, 1)
+    _, tail = rest.split(END, 1)
+    path.write_text(f"{head}{BEGIN}\n{tables()}\n{END}{tail}", encoding="utf-8")

@@ -1,0 +1,202 @@
+"""Every command of the README: what it starts exists, what it publishes moves the arm."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from builtin_interfaces.msg import Duration
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import get_parameter_value
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from flexarm_bringup import cli, parameter_tables
+from flexarm_bringup.lockstep import LockstepRun
+from flexarm_bringup.processes import Processes, executable, installed, own_domain
+from flexarm_msgs.msg import CompositeState
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
+COMMANDS = [line for kind, text in BLOCKS if kind == "sh" for line in text.splitlines() if line]
+
+
+def words_of(command):
+    return shlex.split(command)
+
+
+def starting(*prefix):
+    """Commands of the README that begin with these words."""
+    return [c for c in COMMANDS if words_of(c)[: len(prefix)] == list(prefix)]
+
+
+def check_files(words):
+    for i, word in enumerate(words):
+        if word == "--params-file":
+            assert (ROOT / words[i + 1]).is_file(), words[i + 1]
+        if word.startswith("arm:=") and "/" in word:
+            assert (ROOT / word[5:]).is_file(), word
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_a_command_names_exists(command):
+    words = words_of(command)
+    if words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    elif words[0] == ".":
+        assert (ROOT / words[1]).is_file()
+    elif words[0] == "./flexarm":
+        assert os.access(ROOT / "flexarm", os.X_OK)
+        options = cli.parser().parse_args(words[1:])
+        if options.command == "run":
+            executable(options.package, options.executable)
+            check_files(options.arguments)
+    elif words[:2] == ["ros2", "topic"]:
+        assert words[2] == "pub"
+    elif words[:3] == ["ros2", "param", "set"]:
+        assert len(words) == 6
+    else:
+        pytest.fail(f"no test knows this command: {command}")
+
+
+def test_executables_and_launch_files_named_in_the_text_are_installed():
+    for package, name in re.findall(r"ros2 run (\w+) (\w+)", README):
+        executable(package, name)
+    for package, name in re.findall(r"ros2 launch (\w+) ([\w.]+)", README):
+        path = installed("share", package, "launch", name)
+        compile(path.read_text(), str(path), "exec")
+
+
+def test_paths_named_in_the_text_exist():
+    for path in re.findall(r"\]\((docs/[^)#]+)\)", README):
+        assert (ROOT / path).is_file(), path
+    for path in re.findall(r"`((?:src|config|tools|docs)/[\w/.]+)`", README):
+        assert (ROOT / path).exists(), path
+
+
+def test_parameter_tables_are_those_of_the_declarations():
+    between = README.split(parameter_tables.BEGIN)[1].split(parameter_tables.END)[0]
+    assert between.strip() == parameter_tables.tables(), (
+        "run: ./flexarm parameters --write README.md"
+    )
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """The three nodes, started by the README's own commands, in real time."""
+    with own_domain() as domain, Processes(domain, tmp_path_factory.mktemp("log")) as processes:
+        for command in starting("./flexarm", "run"):
+            _, _, package, name, *rest = words_of(command)
+            if "--params-file" in rest:
+                rest = [str(ROOT / w) if w.startswith("config/") else w for w in rest]
+                processes.start(name, [executable(package, name), *rest])
+        assert set(processes.running) == {"simulator", "observer", "controller"}
+        with LockstepRun(processes) as line:
+            line.wait_for("the nodes", lambda: line.recorder.complete() and line.ready())
+            yield line
+
+
+def reference(line):
+    line.recorder.poll()
+    raw = line.recorder.raw["controller/state"][-1]
+    return deserialize_message(raw, CompositeState)
+
+
+def message_from_yaml(text):
+    data = yaml.safe_load(text)
+    points = [
+        JointTrajectoryPoint(**{**p, "time_from_start": Duration(**p["time_from_start"])})
+        for p in data["points"]
+    ]
+    return JointTrajectory(joint_names=data["joint_names"], points=points)
+
+
+@pytest.mark.parametrize("command", starting("ros2", "topic", "pub"))
+def test_topic_pub_example_moves_the_arm_with_stamp_0(arm, command):
+    topic, kind, text = [w for w in words_of(command)[3:] if not w.startswith("--")]
+    assert kind == "trajectory_msgs/msg/JointTrajectory"
+    # What `ros2 topic pub` offers by default.
+    qos = QoSProfile(
+        depth=10,
+        reliability=QoSReliabilityPolicy.RELIABLE,
+        durability=QoSDurabilityPolicy.VOLATILE,
+    )
+    publisher = arm.node.create_publisher(JointTrajectory, topic, qos)
+    arm.wait_for("the controller", lambda: publisher.get_subscription_count() > 0)
+    message = message_from_yaml(text)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (0, 0)
+    goal = message.points[-1].positions[0]
+    before = arm.accepted()
+    publisher.publish(message)
+    arm.wait_for("acceptance", lambda: arm.accepted() > before)
+    arm.wait_for("the end", lambda: abs(reference(arm).reference_position[0] - goal) < 1e-9)
+
+    def there():
+        state = reference(arm)
+        return abs(state.position_error[0]) < 0.01 and abs(state.velocity_error[0]) < 0.01
+
+    arm.wait_for("the joint to get there", there)
+    publisher.publish(message)
+    arm.wait_for("a repeat to be seen", lambda: reference(arm).rejected_reason == "")
+    assert arm.accepted() == before + 1
+
+
+@pytest.mark.parametrize("command", starting("ros2", "param", "set"))
+def test_param_set_example_is_taken(arm, command):
+    node, name, value = words_of(command)[3:]
+    client = arm.node.create_client(SetParameters, f"{node}/set_parameters")
+    arm.wait_for(f"{node}/set_parameters", client.service_is_ready)
+    parameter = ParameterMessage(name=name, value=get_parameter_value(value))
+    future = client.call_async(SetParameters.Request(parameters=[parameter]))
+    arm.wait_for("the answer", future.done)
+    (result,) = future.result().results
+    assert result.successful, result.reason
+    assert reference(arm).supervisor_state != CompositeState.INACTIVE
+
+
+def test_publish_command_reaches_the_controller(arm):
+    (command,) = starting("./flexarm", "publish")
+    before = arm.accepted()
+    done = subprocess.run(
+        [sys.executable, "-m", "flexarm_bringup.cli", *words_of(command)[1:]],
+        env={**os.environ, "ROS_DOMAIN_ID": str(arm.processes.domain)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    arm.wait_for("acceptance", lambda: arm.accepted() > before)
+
+
+def test_own_law_example_is_found_by_name_and_runs(tmp_path):
+    (law,) = [text for kind, text in BLOCKS if kind == "python"]
+    point = re.search(r'\["(pd = [\w.:]+)"\]', README).group(1)
+    module = point.split("= ")[1].split(":")[0]
+    (tmp_path / f"{module}.py").write_text(law)
+    info = tmp_path / f"{module}-0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Name: {module}\nVersion: 0\n")
+    (info / "entry_points.txt").write_text(f"[flexarm.slow_laws]\n{point}\n")
+    script = (
+        "from flexarm_bringup import closed_loop, case_study\n"
+        "loop = closed_loop.ClosedLoop('R', {'type': 'pd', 'kp': [40.0], 'kv': [12.0]},"
+        " {'type': 'none'}, {'type': 'filtered_derivative'})\n"
+        "record = loop.run(case_study.paper_trajectory(['joint1']), 4.0)\n"
+        "print(record.position[-1, 0])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(1.5708, abs=0.05)
