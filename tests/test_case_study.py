@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexarm_bringup import case_study, recorder
-from flexarm_bringup.lockstep import START_NS
+from flexarm_bringup.closed_loop import TRAJECTORY_START_NS
 
 #: The nonlinear rows of the reference table (lbf ft, ft, deg), see tests/data/README.md.
 COLUMNS = (
@@ -124,7 +124,7 @@ def test_bag_reads_back_and_equals_the_loop_without_ros(demo, run):
             samples.setdefault(topic, {})[stamp] = raw
     assert set(samples) == set(recorder.TOPICS)
     assert {len(s) for s in samples.values()} == {8051}
-    nodes = recorder.to_record(recorder.decode(samples), START_NS)
+    nodes = recorder.to_record(recorder.decode(samples), TRAJECTORY_START_NS)
     alone = case_study.run_without_ros(run)
     common = alone.time >= nodes.time[0] - 1e-9
     for name in ("time", "reference", "position", "velocity", "amplitude", "rate", "torque"):

@@ -8,7 +8,7 @@ import sys
 import pytest
 from rclpy.serialization import deserialize_message
 
-from flexarm_bringup import case_study, lockstep, parameter_files, recorder, relay
+from flexarm_bringup import case_study, closed_loop, lockstep, parameter_files, recorder, relay
 from flexarm_bringup.processes import Processes, own_domain
 from flexarm_control import profiles
 from flexarm_dynamics import arm_file
@@ -26,7 +26,7 @@ def record(directory, duration, run=RUN):
         with lockstep.LockstepRun(processes) as line:
             joints = arm_file.load(run.arm).joint_names
             message = lockstep.trajectory_message(
-                joints, profiles.paper_profile(), 101, lockstep.START_NS
+                joints, profiles.paper_profile(), 101, closed_loop.TRAJECTORY_START_NS
             )
             return line.run(message, duration)
 

@@ -126,20 +126,16 @@ def run_without_ros(run):
 
 def paper_trajectory(joint_names, points=101):
     """The paper's motion as the controller reads it from a topic, starting at the common instant."""
-    from flexarm_sim.simulator import Simulator
-
     s = profiles.sample(profiles.paper_profile(), points)
     rows = zip(s.times, s.positions, s.velocities, s.accelerations, strict=True)
     return trajectory.validate(
         joint_names,
         joint_names,
-        Simulator.START_NS + LEAD_NS,
+        closed_loop.TRAJECTORY_START_NS,
         [(round(t * 1e9), p, v, a, ()) for t, p, v, a in rows],
     )
 
 
-#: The trajectory starts this long after the simulator's first sample [ns]: the observer converges before.
-LEAD_NS = 100_000_000
 #: Simulator in lockstep, paused for the trajectory half way to its start.
 LOCKSTEP = {"lockstep": True, "pause_at": 0.05}
 
@@ -180,7 +176,7 @@ def run_nodes(run, directory, progress=lambda fraction: None):
         processes.start_node("controller", run.controller, file)
         with lockstep.LockstepRun(processes) as line:
             joints = arm_file.load(run.arm).joint_names
-            start = lockstep.START_NS
+            start = closed_loop.TRAJECTORY_START_NS
             message = lockstep.trajectory_message(joints, profiles.paper_profile(), 101, start)
             samples, timing = line.run(message, DURATION, progress)
         codes = processes.stop()

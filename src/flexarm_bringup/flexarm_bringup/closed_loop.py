@@ -15,6 +15,9 @@ from flexarm_sim.simulator import Simulator
 
 from .metrics import Record
 
+#: Where a recorded trajectory starts on the simulator's clock [ns]: the observer has converged by then.
+TRAJECTORY_START_NS = Simulator.START_NS + 100_000_000
+
 
 class ClosedLoop:
     """Simulator, observer and controller in one process, in lockstep.

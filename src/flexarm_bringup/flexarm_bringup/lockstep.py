@@ -14,14 +14,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from flexarm_msgs.msg import CompositeState
 from flexarm_ros import qos
 from flexarm_ros.messages import set_stamp
-from flexarm_sim.simulator import Simulator
 
-from .case_study import LEAD_NS
+from .closed_loop import TRAJECTORY_START_NS
 from .processes import ProcessError
 from .recorder import Recorder, raw_stamp_ns
-
-#: Instant at which the case study's trajectory starts.
-START_NS = Simulator.START_NS + LEAD_NS
 
 
 def trajectory_message(joint_names, profile, points=101, stamp_ns=0):
@@ -150,7 +146,7 @@ class LockstepRun:
             raise ProcessError(f"simulator/pause: {future.result().message}")
 
     def run(self, message, duration, progress=lambda fraction: None):
-        """Offer a trajectory at `START_NS`, run `duration` seconds beyond its start, and record.
+        """Offer a trajectory at `TRAJECTORY_START_NS`, run `duration` seconds beyond its start, and record.
 
         Returns
         -------
@@ -162,7 +158,7 @@ class LockstepRun:
         self.wait_for("a converged observer, paused", lambda: self.ready() and self.paused_at())
         self.offer(message)
         begin = self.paused_at()
-        end = START_NS + round(duration * 1e9)
+        end = TRAJECTORY_START_NS + round(duration * 1e9)
         started = time.perf_counter()
         self.pause(False)
         recorder = self.recorder
@@ -176,7 +172,7 @@ class LockstepRun:
                 last_check = now
                 self.processes.check()
                 stamp = recorder.latest_ns
-                progress(max(0.0, (stamp - START_NS) / (end - START_NS)))
+                progress(max(0.0, (stamp - TRAJECTORY_START_NS) / (end - TRAJECTORY_START_NS)))
                 if stamp > newest:
                     newest, deadline = stamp, now + self.patience
                 if now > deadline:

@@ -66,7 +66,6 @@ class ArmController:
     model : ArmModel
         The arm as the controller knows it.
     law : CompositeControl
-        May be replaced whole between two samples.
     settings : mapping
         Checked values of `PARAMETERS`.
     start_tolerance : float
@@ -79,13 +78,15 @@ class ArmController:
     enabled : bool
         Whether the torque may be applied, or each joint's safe action is to be taken.
     state : Supervisor
+    law, answered_by : CompositeControl
+        For the next sample, and the one that made `torque`: `law` may be replaced whole at any time.
     saturated : bool
         A limit was met at this sample.
     """
 
     def __init__(self, model, law, settings, start_tolerance=0.01):
         n = model.n_joints
-        self.model, self.law = model, law
+        self.model, self.law, self.answered_by = model, law, law
         self.reference = ReferenceGenerator(model.joint_names, start_tolerance)
         self.torque = np.zeros(n)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
@@ -173,7 +174,8 @@ class ArmController:
         np.subtract(reference.position, q, out=self.position_error)
         np.subtract(reference.velocity, qd, out=self.velocity_error)
         try:
-            u = self.law.step(q, qd, sample.amplitude, sample.rate, reference)
+            law = self.answered_by = self.law
+            u = law.step(q, qd, sample.amplitude, sample.rate, reference)
         except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
             self.disable(f"the control law failed: {type(error).__name__}: {error}")
             return False

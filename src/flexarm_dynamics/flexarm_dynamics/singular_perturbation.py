@@ -7,6 +7,7 @@ Names follow the paper: x = (q, qd), z = (delta, delta_d), a bar for the slow su
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import matrix_balance
 
 from .errors import DesignError
 
@@ -125,14 +126,17 @@ def is_stabilisable(A, B, margin=0.0):
     """
     worst = np.inf
     size = A.shape[0]
-    # Rows of very different size would hide a small but effective input.
-    scale = max(np.linalg.norm(A), 1e-300)
+    norm = np.linalg.norm(A)
+    # Balanced, and each eigenvalue on its own scale: else stiff modes hide what the input does to soft ones.
+    balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+    B = B / units[:, None]
     gain = np.linalg.norm(B) or 1.0
     for s in np.linalg.eigvals(A):
-        if s.real >= -margin - 1e-9 * scale:
-            pencil = np.hstack([(A - s * np.eye(size)) / scale, B / gain])
+        if s.real >= -margin - 1e-9 * norm:
+            scale = max(abs(s), 1e-12 * norm, 1e-300)
+            pencil = np.hstack([(balanced - s * np.eye(size)) / scale, B / gain])
             worst = min(worst, np.linalg.svd(pencil, compute_uv=False)[-1])
-    return bool(worst > 1e-12), float(worst)
+    return bool(worst > 1e-9), float(worst)
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,11 @@ class Lqr(FastLaw):
                 f" r = {np.diag(R).tolist()}, alpha = {alpha}: {error}"
             ) from None
         self._K_f = -np.asarray(gain)
-        worst = np.linalg.eigvals(self.A2 + self.B2 @ self._K_f).real.max()
-        if not worst < -alpha + 1e-6 * (1.0 + alpha):
+        poles = np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)
+        worst = poles.real.max()
+        if (
+            not worst < -alpha - 1e-9 * np.abs(poles).max()
+        ):  # rounding may put an undamped pole there
             raise DesignError(
                 f"fast: the closed boundary layer's slowest pole is at {worst:.4g} 1/s, not left of"
                 f" -alpha = {-alpha}; raise fast.q or lower fast.alpha"

@@ -5,6 +5,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter
 
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter as RosParameter
 from trajectory_msgs.msg import JointTrajectory
 
@@ -43,6 +44,9 @@ STATE_TIMEOUT = Parameter(
     high=3600.0,
     read_only=True,
 )
+
+#: How long the last torque, DISABLED, is waited for to arrive.
+LAST_WORD = Duration(seconds=0.2)
 
 
 def parameter_groups():
@@ -234,6 +238,8 @@ class ControllerNode(ArmNode):
     def stop(self):
         self.core.disable("the controller was stopped")
         self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+        # A node that ends takes with it what has not been read yet.
+        self._torque_pub.wait_for_all_acked(LAST_WORD)
 
     def destroy_node(self):
         self._designer.shutdown(wait=False, cancel_futures=True)

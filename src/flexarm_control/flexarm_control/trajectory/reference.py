@@ -1,0 +1,361 @@
+"""The reference that the joints follow: holds, trajectories, stops."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.errors import TrajectoryError
+
+from .path import Path, hermite
+from .request import JointTrajectoryData
+from .values import (
+    BRAKING_STEP,
+    MAX_BRAKING,
+    NOT_NUMBERS,
+    SECOND,
+    SPEED_ROUNDING,
+    joint_limit,
+    per_joint,
+    seconds,
+    show,
+)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of an offered trajectory.
+
+    Attributes
+    ----------
+    accepted : bool
+        Whether it will be followed.
+    reason : str
+        Why it is refused, or when it starts and what it replaces.
+    trajectory_id : int
+        Its number, counted from 1; of a repeat, the number of what it repeats; 0 if refused.
+    repeat : bool
+        Whether it is the last accepted one again: no error, and no new start.
+    """
+
+    accepted: bool
+    reason: str
+    trajectory_id: int
+    repeat: bool = False
+
+
+class ReferenceGenerator:
+    """The joints' reference: holds, follows trajectories, stops.
+
+    The newest accepted trajectory wins: from its start on it replaces what is followed, and at
+    once what was accepted before and has not begun, except that a trajectory which only waits
+    for the next sample is still begun when the newer one starts later.
+
+    Parameters
+    ----------
+    joint_names : sequence of str
+        The arm's n joints.
+    start_tolerance : float
+        How far a first point at `time_from_start` 0 may be from the reference [rad].
+    velocity_max : (n,) array_like, optional
+        Limit of the mean speed between the reference at the start and the first point [rad/s].
+
+    Attributes
+    ----------
+    position, velocity, acceleration : (n,) arrays
+        The reference at the last sampled stamp [rad], [rad/s], [rad/s^2]; overwritten in place.
+    active : bool
+        A trajectory is being followed: from its start until its end.
+    finished : bool
+        The trajectory last followed has reached its end, which is held.
+    stopping : bool
+        A stop is braking.
+    accepted_id : int
+        The number of the last accepted trajectory; 0: none since the reset.
+    """
+
+    def __init__(self, joint_names, start_tolerance=0.01, velocity_max=None):
+        self.joint_names = tuple(joint_names)
+        if not 0.0 <= start_tolerance < np.inf:
+            raise TrajectoryError(
+                f"start_tolerance is {start_tolerance} rad: it must be finite and at least 0"
+            )
+        self._start_tolerance = float(start_tolerance)
+        self._velocity_max = (
+            None
+            if velocity_max is None
+            else joint_limit("velocity_max", velocity_max, self.joint_names)
+        )
+        n = len(self.joint_names)
+        self._state = np.zeros((3, n))
+        self._scratch = np.zeros((3, n))
+        self.position, self.velocity, self.acceleration = self._state
+        self.reset()
+
+    def reset(self):
+        """Forget everything: the state, the trajectories, their numbers, what is a repeat."""
+        self._state[:] = 0.0
+        self._last_ns = None
+        self.accepted_id = 0
+        self._drop_all()
+
+    def _drop_all(self):
+        self._path = None
+        self._starting = None  # begins at the next sample
+        self._pending = None  # begins at its own start_ns
+        self._last_accepted = None
+        self.active = self.finished = self.stopping = False
+
+    def start(self, position, stamp_ns):
+        """Hold a measured position from a stamp on; trajectories before it are forgotten.
+
+        Parameters
+        ----------
+        position : (n,) array_like
+            The measured joint positions [rad].
+        stamp_ns : int
+            The stamp of the measurement [ns].
+
+        Raises
+        ------
+        TrajectoryError
+            If the position has another shape or is not finite.
+        """
+        position = per_joint("the position to hold", position, self.joint_names)
+        if not np.isfinite(position).all():
+            joint = int(np.argmin(np.isfinite(position)))
+            raise TrajectoryError(
+                f"the position of joint {self.joint_names[joint]} is {position[joint]} rad: "
+                "a finite measurement is needed to hold it"
+            )
+        self._drop_all()
+        self._state[:] = 0.0
+        self._state[0] = position
+        self._last_ns = stamp_ns
+
+    def offer(self, trajectory: JointTrajectoryData) -> Verdict:
+        """Take a validated trajectory, or say why not.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+            From `validate`, for the same joints.
+
+        Returns
+        -------
+        Verdict
+            The decision. What is refused changes nothing.
+        """
+        if self._last_ns is None:
+            return Verdict(False, "no state yet: offer it once the arm's state is known", 0)
+        if trajectory.joint_names != self.joint_names:
+            return Verdict(
+                False,
+                f"the trajectory is for {', '.join(trajectory.joint_names)}, this is "
+                f"{', '.join(self.joint_names)}: validate it for this arm",
+                0,
+            )
+        if self._last_accepted is not None and trajectory.repeats(self._last_accepted):
+            return Verdict(
+                False, f"repeat of trajectory {self.accepted_id}", self.accepted_id, repeat=True
+            )
+        if 0 < trajectory.stamp_ns < self._last_ns:
+            late_ns = self._last_ns - trajectory.stamp_ns
+            return Verdict(
+                False,
+                f"starts at {seconds(trajectory.stamp_ns)}, {seconds(late_ns)} in the past; "
+                "use stamp 0 for now",
+                0,
+            )
+        jump = self._refuse_jump(trajectory)
+        return Verdict(False, jump, 0) if jump else self._accept(trajectory)
+
+    def _refuse_jump(self, trajectory):
+        """Return why the first point can't be reached from the reference at the start, or ''."""
+        if trajectory.stamp_ns == 0:
+            self._reference_at(self._path, self._last_ns)
+        else:
+            path = self._path
+            if self._starting is not None:  # as if the next sample were at the last one's stamp
+                self._reference_at(path, self._last_ns)
+                path = self._starting
+                path.begin(self._last_ns, self._scratch)
+            self._reference_at(path, trajectory.stamp_ns)
+        distance = np.abs(trajectory.positions[0] - self._scratch[0])
+        first = int(trajectory.times_ns[0]) / SECOND
+        if first == 0.0:
+            joint = int(np.argmax(distance))
+            if distance[joint] <= self._start_tolerance:
+                return ""
+            return (
+                f"points[0] at time_from_start 0 is {distance[joint]:.6g} rad from the reference "
+                f"of joint {self.joint_names[joint]} at the start, more than start_tolerance "
+                f"{self._start_tolerance:g} rad: give the first point a time_from_start > 0"
+            )
+        if self._velocity_max is None:
+            return ""
+        fast = np.flatnonzero(distance > first * self._velocity_max * (1.0 + SPEED_ROUNDING))
+        if not fast.size:
+            return ""
+        joint = int(fast[0])
+        return (
+            f"joint {self.joint_names[joint]} would move at {distance[joint] / first:.6g} rad/s on "
+            f"average to reach points[0], beyond its limit of {self._velocity_max[joint]:g} "
+            "rad/s: give the first point a later time_from_start"
+        )
+
+    def _accept(self, trajectory):
+        derivatives = [
+            values
+            for values in (trajectory.positions, trajectory.velocities, trajectory.accelerations)
+            if values is not None
+        ]
+        path = Path(trajectory.times_ns, derivatives, self.accepted_id + 1)
+        replaced = self._pending
+        self._pending = None
+        if trajectory.stamp_ns == 0:
+            replaced = self._starting or replaced
+            self._starting = path
+            reason = "starts at the next sample"
+        else:
+            path.start_ns = trajectory.stamp_ns
+            self._pending = path
+            reason = f"starts at {seconds(trajectory.stamp_ns)}"
+        if replaced is not None:
+            reason += f"; replaces trajectory {replaced.trajectory_id}, which had not started"
+        self.accepted_id = path.trajectory_id
+        self._last_accepted = trajectory
+        return Verdict(True, reason, path.trajectory_id)
+
+    def sample(self, stamp_ns):
+        """Fill `position`, `velocity`, `acceleration` and the flags for a stamp [ns].
+
+        The same stamps after the same calls give the same bits. An earlier stamp than the last
+        is allowed; before the start of what is followed, the state at that start is given.
+
+        Raises
+        ------
+        TrajectoryError
+            If there is no state yet.
+        """
+        if self._last_ns is None:
+            raise TrajectoryError("no state yet: call start with the measured position first")
+        pending = self._pending
+        if pending is not None and stamp_ns >= pending.start_ns:
+            # One that still waits for its first sample would begin after this: it never does.
+            self._starting = self._pending = None
+            self._follow(pending, pending.start_ns)
+        elif self._starting is not None:
+            starting, self._starting = self._starting, None
+            self._follow(starting, stamp_ns)
+        self._last_ns = stamp_ns
+        path = self._path
+        if path is None:
+            return
+        moving = path.evaluate(stamp_ns, self._state)
+        of_trajectory = path.trajectory_id > 0
+        self.active = moving and of_trajectory
+        self.finished = not moving and of_trajectory
+        self.stopping = moving and not of_trajectory
+
+    def _follow(self, path, start_ns):
+        """Leave what is followed for a path, from the reference at that moment."""
+        self._reference_at(self._path, start_ns)
+        path.begin(start_ns, self._scratch)
+        self._path = path
+
+    def _reference_at(self, path, stamp_ns):
+        """Fill the scratch state with the reference that a path gives at a stamp."""
+        if path is None:
+            np.copyto(self._scratch, self._state)  # at rest: the hold since start()
+        else:
+            path.evaluate(stamp_ns, self._scratch)
+
+    def stop(self, stamp_ns, deceleration):
+        """Bring the reference to rest from what it is at a stamp, then hold.
+
+        Each joint's velocity follows the cubic from its present velocity v and acceleration a to
+        rest, the position its integral, over the shortest time T in which no acceleration
+        exceeds D = max(deceleration, |a|): with w = v / T and v >= 0 that is
+        (3 w + a)^2 = 3 D (2 w + a), from a = 0 T = 1.5 |v| / D. T is rounded up to the next
+        `BRAKING_STEP`: a joint that is nearly at rest while it accelerates may move on by up to
+        |a| T^2 / 12.
+
+        All trajectories are cancelled; offered again, they are new.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The stamp at which braking begins [ns].
+        deceleration : float or (n,) array_like
+            Bound of the deceleration, greater than 0 [rad/s^2].
+
+        Raises
+        ------
+        TrajectoryError
+            If there is no state yet, or a deceleration is not finite and above 0.
+        """
+        if self._last_ns is None:
+            raise TrajectoryError("no state yet: there is no reference to stop")
+        bound = _decelerations(deceleration, self.joint_names)
+        self._reference_at(self._path, stamp_ns)
+        path = _braking_path(self._scratch, bound, self.joint_names)
+        path.begin(stamp_ns, self._scratch)
+        self._drop_all()
+        self._path = path
+        self._last_ns = max(self._last_ns, stamp_ns)
+
+
+def _decelerations(deceleration, joint_names):
+    """Return the decelerations as an (n,) array, all finite and above 0 [rad/s^2]."""
+    try:
+        values = np.broadcast_to(np.asarray(deceleration, dtype=float), (len(joint_names),))
+    except NOT_NUMBERS:
+        raise TrajectoryError(
+            f"deceleration is {show(deceleration)}: give a number, or one per joint"
+        ) from None
+    good = (values > 0.0) & (values < np.inf)
+    if not good.all():
+        joint = int(np.argmin(good))
+        raise TrajectoryError(
+            f"deceleration of joint {joint_names[joint]} is {values[joint]} rad/s^2: it must be "
+            "finite and above 0"
+        )
+    return values
+
+
+def _braking_path(state, deceleration, joint_names):
+    """Return the path that brakes every joint as `ReferenceGenerator.stop` says.
+
+    Its points are the moments at which a joint comes to rest. Between them the polynomials are
+    quartics, which the quintic interpolation reproduces.
+    """
+    position, velocity, acceleration = state
+    a = np.where(velocity < 0.0, -acceleration, acceleration)  # along the motion
+    bound = np.maximum(deceleration, np.abs(a))
+    w = (bound - a + np.sqrt(bound * (bound + a))) / 3.0
+    # Rounded up, all segments have at least one step: in nanoseconds the differences of nearby
+    # positions would leave no digits for the accelerations.
+    steps = np.maximum(np.ceil(np.abs(velocity) / w / BRAKING_STEP), 1.0)
+    longest = int(np.argmax(steps))
+    if not steps[longest] * BRAKING_STEP <= MAX_BRAKING:
+        raise TrajectoryError(
+            f"joint {joint_names[longest]} would take {steps[longest] * BRAKING_STEP:.6g} s to "
+            f"stop from {velocity[longest]:.6g} rad/s, more than {MAX_BRAKING:g} s: give a higher "
+            "deceleration"
+        )
+    durations_ns = np.rint(steps * (BRAKING_STEP * SECOND)).astype(np.int64)
+    times_ns = np.unique(durations_ns)
+    length = durations_ns / SECOND
+    x = np.minimum(times_ns[:, None] / SECOND, length)
+    # Of the velocity, b_0 + b_1 x + b_2 x^2 + b_3 x^3: the cubic Hermite, one order down.
+    rest = np.zeros_like(velocity)
+    b0, b1, b2, b3 = hermite(length, (velocity, acceleration), (rest, rest))
+    moving = x < length
+    return Path(
+        times_ns,
+        (
+            position + x * (b0 + x * (b1 / 2.0 + x * (b2 / 3.0 + x * b3 / 4.0))),
+            np.where(moving, b0 + x * (b1 + x * (b2 + x * b3)), 0.0),
+            np.where(moving, b1 + x * (2.0 * b2 + x * 3.0 * b3), 0.0),
+        ),
+    )
