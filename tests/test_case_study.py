@@ -123,7 +123,7 @@ def test_bag_reads_back_and_equals_the_loop_without_ros(demo, run):
                 assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
             samples.setdefault(topic, {})[stamp] = raw
     assert set(samples) == set(recorder.TOPICS)
-    assert {len(s) for s in samples.values()} == {8051}
+    assert {len(s) for s in samples.values()} == {8101}
     nodes = recorder.to_record(recorder.decode(samples), TRAJECTORY_START_NS)
     alone = case_study.run_without_ros(run)
     common = alone.time >= nodes.time[0] - 1e-9

@@ -136,10 +136,6 @@ def paper_trajectory(joint_names, points=101):
     )
 
 
-#: Simulator in lockstep, paused for the trajectory half way to its start.
-LOCKSTEP = {"lockstep": True, "pause_at": 0.05}
-
-
 def continuous(run):
     """The run's metrics in the continuous loop: full state, no sampling, no sensors."""
     arm_model = model.build(arm_file.load(run.arm))
@@ -171,7 +167,7 @@ def run_nodes(run, directory, progress=lambda fraction: None):
 
     file = parameter_files.find(run.file)
     with own_domain() as domain, Processes(domain, directory / "log") as processes:
-        processes.start_node("simulator", {**LOCKSTEP, **run.simulator}, file)
+        processes.start_node("simulator", {"lockstep": True, **run.simulator}, file)
         processes.start_node("observer", run.observer, file)
         processes.start_node("controller", run.controller, file)
         with lockstep.LockstepRun(processes) as line:

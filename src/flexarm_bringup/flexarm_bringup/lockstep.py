@@ -155,7 +155,7 @@ class LockstepRun:
         timing : Timing
         """
         self.wait_for("the nodes (simulator, observer, controller)", self.recorder.complete)
-        self.wait_for("a converged observer, paused", lambda: self.ready() and self.paused_at())
+        self.wait_for("the simulator's pause", self.paused_at)
         self.offer(message)
         begin = self.paused_at()
         end = TRAJECTORY_START_NS + round(duration * 1e9)

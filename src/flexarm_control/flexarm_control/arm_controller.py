@@ -87,12 +87,15 @@ class ArmController:
     def __init__(self, model, law, settings, start_tolerance=0.01):
         n = model.n_joints
         self.model, self.law, self.answered_by = model, law, law
-        self.reference = ReferenceGenerator(model.joint_names, start_tolerance)
+        fastest = [j.limits.velocity for j in model.arm.joints]
+        self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
+        self._start_tolerance = start_tolerance
         self.torque = np.zeros(n)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
         self.enabled, self.saturated = False, False
         self.state = Supervisor.INACTIVE
         self._state_reason, self._trajectory_reason = "", ""
+        self._waiting = False  # joints known, deflections not yet
         self._order = SampleOrder()
         self._last_ns = 0
         self.configure(settings)
@@ -129,6 +132,9 @@ class ArmController:
     def offer(self, trajectory):
         """Offer a trajectory.
 
+        While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
+        explicit start passes before that is given up.
+
         Parameters
         ----------
         trajectory : JointTrajectoryData
@@ -138,7 +144,7 @@ class ArmController:
         Verdict
             Refusals are kept in `reason`; repeats are none.
         """
-        if self.state in (Supervisor.INACTIVE, Supervisor.FAULT):
+        if not (self.enabled or self._waiting):
             verdict = Verdict(False, f"no valid state: {self._state_reason or 'none yet'}", 0)
         else:
             verdict = self.reference.offer(trajectory)
@@ -162,12 +168,18 @@ class ArmController:
             `enabled`. Every sample is answered; a repeated (session, sequence) from what was answered before.
         """
         try:
-            fresh = self._accept(sample)
+            verdict = self._judge(sample)
         except MessageError as error:
             self.disable(str(error))
             return False
-        if not fresh:
+        if verdict == SampleOrder.REPEAT and (self.enabled or self._waiting):
             return self.enabled
+        if sample.amplitude is None or sample.rate is None:
+            self._wait(sample, verdict)
+            return False
+        if verdict == SampleOrder.RESTART or self.state == Supervisor.INACTIVE:
+            self._begin(sample, verdict)
+        self._state_reason = ""
         reference = self.reference
         reference.sample(sample.stamp_ns)
         q, qd = sample.position, sample.velocity
@@ -199,32 +211,56 @@ class ArmController:
         """
         self.enabled, self.state, self._state_reason = False, state, reason
         self.torque[:] = 0.0
-        self.saturated = False
+        self.saturated, self._waiting = False, False
 
-    def _accept(self, sample):
-        """Whether the sample is a new one; raises for one that can't be used."""
-        check_finite(sample.position, self.model.joint_names, "joint_position")
-        check_finite(sample.velocity, self.model.joint_names, "joint_velocity")
-        if sample.amplitude is None or sample.rate is None:
-            what = "modal_amplitude" if sample.amplitude is None else "modal_rate"
-            raise MessageError(f"{what} is not known yet")
-        check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
-        check_finite(sample.rate, self.model.mode_names, "modal_rate")
+    def _judge(self, sample):
+        """Class of the sample, which is the last one from now on; raises for one that can't be used."""
+        joints, modes = self.model.joint_names, self.model.mode_names
+        check_finite(sample.position, joints, "joint_position")
+        check_finite(sample.velocity, joints, "joint_velocity")
+        if sample.amplitude is not None:
+            check_finite(sample.amplitude, modes, "modal_amplitude")
+        if sample.rate is not None:
+            check_finite(sample.rate, modes, "modal_rate")
         verdict = self._order.judge(sample)
-        if verdict == SampleOrder.REPEAT and self.state != Supervisor.INACTIVE:
-            return False
         if verdict == SampleOrder.STALE:
             raise MessageError(
                 f"state {sample.sequence} is not newer than {self._order.sequence}: the stream went back"
             )
-        self._order.take(sample)
-        if verdict == SampleOrder.RESTART or self.state == Supervisor.INACTIVE:
+        if verdict != SampleOrder.REPEAT:
+            self._order.take(sample)
+        return verdict
+
+    def _wait(self, sample, verdict):
+        """No torque without deflections; the joints are known, so that trajectories may be offered."""
+        waiting = self._waiting and verdict != SampleOrder.RESTART
+        what = "modal_amplitude" if sample.amplitude is None else "modal_rate"
+        self.disable(f"{what} is not known yet")
+        self._waiting = True
+        if not waiting:
             self.reference.start(sample.position, sample.stamp_ns)
-            self.state = Supervisor.READY
-            self.torque[:] = 0.0
-            self._last_ns = sample.stamp_ns
-        self._state_reason = ""
-        return True
+
+    def _begin(self, sample, verdict):
+        """First torque of a session, or after a time without: from the position that is found."""
+        keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
+        if keeps and (given_up := self._left_behind(sample)):
+            self._trajectory_reason = given_up
+            keeps = False
+        if not keeps:
+            self.reference.start(sample.position, sample.stamp_ns)
+        self._waiting, self.state = False, Supervisor.READY
+        self.torque[:] = 0.0
+        self._last_ns = sample.stamp_ns
+
+    def _left_behind(self, sample):
+        """Why what was offered while waiting can't be followed from here; empty if it can."""
+        if self.reference.overdue(sample.stamp_ns):
+            return "the trajectory was to start before the observer had converged: send it again"
+        moved = np.abs(sample.position - self.reference.position)
+        if moved.max() > self._start_tolerance:
+            name = self.model.joint_names[int(np.argmax(moved))]
+            return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
+        return ""
 
     def _limited(self, u, dt):
         """Torque within its size and rate, into `torque`."""

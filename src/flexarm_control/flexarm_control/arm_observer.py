@@ -122,9 +122,7 @@ class ArmObserver:
             self.observer.update(sample, dt)
         except MessageError:
             raise
-        except (
-            Exception
-        ) as error:  # an observer may be anybody's: it costs this sample, not the node
+        except Exception as error:  # anybody's observer: it costs this sample, not the node
             name = type(self.observer).__name__
             raise MessageError(
                 f"observer {name} failed: {type(error).__name__}: {error}"

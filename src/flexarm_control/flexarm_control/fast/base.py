@@ -19,8 +19,6 @@ class FastLaw(ABC):
 
     #: Declared parameters, named ``fast.<name>`` in the controller node.
     PARAMETERS = ()
-    #: Whether the law needs amplitudes and rates of the deflections.
-    needs_deflections = True
 
     def __init__(self, model, parameters):
         self.model = model

@@ -8,8 +8,6 @@ from .base import FastLaw
 class NoFastLaw(FastLaw):
     """u_fast = 0."""
 
-    needs_deflections = False
-
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
         self._zero = np.zeros(model.n_joints)

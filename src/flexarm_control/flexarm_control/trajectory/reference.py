@@ -169,6 +169,15 @@ class ReferenceGenerator:
         jump = self._refuse_jump(trajectory)
         return Verdict(False, jump, 0) if jump else self._accept(trajectory)
 
+    @property
+    def pending(self):
+        """Whether an accepted trajectory has not begun."""
+        return self._pending is not None or self._starting is not None
+
+    def overdue(self, stamp_ns):
+        """Whether a trajectory with an explicit start waits, and a stamp is past that start."""
+        return self._pending is not None and stamp_ns > self._pending.start_ns
+
     def _refuse_jump(self, trajectory):
         """Return why the first point can't be reached from the reference at the start, or ''."""
         if trajectory.stamp_ns == 0:

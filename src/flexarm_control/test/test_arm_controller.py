@@ -1,0 +1,490 @@
+"""The controller of an arm: its states, what it answers to a bad sample, its limits."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from flexarm_control import trajectory
+from flexarm_control.arm_controller import PARAMETERS, ArmController, Supervisor
+from flexarm_control.composite import design
+from flexarm_control.samples import ArmSample
+from flexarm_dynamics.arm import Limits
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import check_all
+from flexarm_dynamics.units import POUND_FORCE_FOOT
+
+MS = 10**6  # [ns]
+FILE_LIMIT = 10.0 * POUND_FORCE_FOOT  # [N m] of arm R
+SLOW = {"type": "linear_model_following"}
+FAST = {"type": "lqr", "q": [20.0, 20.0, 1000.0, 6e5], "configuration": [np.pi / 2]}
+
+
+def stamp(k):
+    return 10**9 + k * MS
+
+
+def sample(k=0, position=0.0, session=1, n=1, **fields):
+    """Sample k of 1 kHz: arm at rest, straight; fields replace its own."""
+    s = ArmSample(n, 2)
+    s.stamp_ns, s.session, s.sequence = fields.pop("stamp_ns", stamp(k)), session, k
+    s.position[:], s.rate = position, np.zeros(2)
+    for name, value in fields.items():
+        setattr(s, name, None if value is None else np.array(value, float))
+    return s
+
+
+def controller(model, law=None, **settings):
+    law = law or design(model, SLOW, FAST)
+    checked = check_all(PARAMETERS, settings, {"joints": model.n_joints})
+    return ArmController(model, law, checked)
+
+
+def motion(end=0.1, duration=0.02, start=0.0, at_ns=0):
+    """A trajectory of one joint, 0.02 s long."""
+    ns = round(duration * 1e9)
+    points = [(0, [start], [0.0], [0.0], ()), (ns, [end], [0.0], [0.0], ())]
+    return trajectory.validate(["joint1"], ["joint1"], at_ns, points)
+
+
+def answer(core):
+    """All that an answer is made of."""
+    return (
+        core.enabled,
+        core.state,
+        core.saturated,
+        core.reason,
+        core.trajectory_id,
+        core.torque.tolist(),
+        core.reference.position.tolist(),
+        core.position_error.tolist(),
+        core.velocity_error.tolist(),
+    )
+
+
+class Scripted:
+    """A law that gives what it is told to."""
+
+    def __init__(self, *torques):
+        self.torques = list(torques)
+
+    def step(self, q, qd, delta, delta_d, reference):
+        value = self.torques.pop(0)
+        if isinstance(value, BaseException):
+            raise value
+        return np.atleast_1d(np.array(value, float))
+
+
+# --------------------------------------------------------------------------- states
+
+
+def test_states_go_from_inactive_over_ready_and_tracking_to_holding(arm_r):
+    core, seen = controller(arm_r), []
+    assert core.state == Supervisor.INACTIVE
+    for k in range(40):
+        assert core.step(sample(k)) is True
+        seen.append(core.state)
+        if k == 4:
+            assert core.offer(motion(at_ns=stamp(10))).accepted
+    R, T, H = Supervisor.READY, Supervisor.TRACKING, Supervisor.HOLDING
+    assert seen == [R] * 10 + [T] * 20 + [H] * 10
+    assert_array_equal(core.reference.position, [0.1])
+
+
+def test_a_second_motion_leads_from_holding_to_tracking_and_back(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.offer(motion())
+    for k in range(1, 30):
+        core.step(sample(k))
+    assert core.state == Supervisor.HOLDING
+    assert core.offer(motion(end=0.3, start=0.1)).trajectory_id == core.trajectory_id == 2
+    core.step(sample(30))
+    assert core.state == Supervisor.TRACKING
+    for k in range(31, 60):
+        core.step(sample(k))
+    assert core.state == Supervisor.HOLDING
+    assert_array_equal(core.reference.position, [0.3])
+
+
+def test_ready_holds_the_joint_where_it_was_found(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0, position=0.7))
+    assert_array_equal(core.reference.position, [0.7])
+    assert_array_equal(core.torque, [0.0])
+    core.step(sample(1, position=0.69))
+    assert_allclose(core.position_error, [0.01], rtol=1e-12)
+    assert core.torque[0] > 0.0
+    assert core.state == Supervisor.READY
+
+
+def test_the_torque_is_that_of_the_composite_control(arm_r):
+    core, law = controller(arm_r), design(arm_r, SLOW, FAST)
+    core.step(sample(0))
+    s = sample(1, 0.01, velocity=[0.2], amplitude=[0.001, 1e-4], rate=[0.01, 2e-3])
+    core.step(s)
+    reference = SimpleNamespace(
+        position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1)
+    )
+    wanted = law.step(s.position, s.velocity, s.amplitude, s.rate, reference)
+    assert_array_equal(core.torque, wanted)
+    assert_array_equal(core.position_error, [-0.01])
+    assert_array_equal(core.velocity_error, [-0.2])
+
+
+# --------------------------------------------------------------------------- repeats and restarts
+
+
+def test_a_repeated_sample_is_answered_from_the_cache_to_the_last_bit(arm_r):
+    core, clean = controller(arm_r), controller(arm_r)
+    for c in (core, clean):
+        c.step(sample(0))
+        c.offer(motion())
+    for k in range(1, 30):
+        assert core.step(sample(k, 1e-4 * k)) is clean.step(sample(k, 1e-4 * k))
+        for _ in range(3):
+            # what it carries does not matter, unless it can't be used
+            assert core.step(sample(k, position=0.5, stamp_ns=stamp(k + 7))) is True
+        assert answer(core) == answer(clean)
+
+
+def test_a_repeat_changes_no_rate_limited_torque(arm_r):
+    core = controller(arm_r, Scripted(5.0, 5.0, 5.0), torque_rate_limit=[100.0])
+    for k in range(3):
+        core.step(sample(k))
+        for _ in range(3):
+            core.step(sample(k))
+        assert_allclose(core.torque, [0.1 * k], rtol=1e-12)
+
+
+def test_a_new_session_starts_at_the_measured_position_with_no_trajectory(arm_r):
+    core = controller(arm_r)
+    core.step(sample(50))
+    core.offer(motion())
+    for k in range(51, 60):
+        core.step(sample(k))
+    assert core.state == Supervisor.TRACKING
+    # earlier stamps and numbers: the simulator was reset
+    for k in range(40):
+        assert core.step(sample(k, 0.02, session=2)) is True
+        assert core.state == Supervisor.READY
+        assert_array_equal(core.reference.position, [0.02])
+
+
+def test_an_older_sample_disables_and_the_next_one_is_ready_again(arm_r):
+    for stale in (sample(3), sample(7, stamp_ns=stamp(5)), sample(8, stamp_ns=stamp(1))):
+        core = controller(arm_r)
+        core.step(sample(5))
+        assert core.step(stale) is False
+        assert core.state == Supervisor.INACTIVE
+        assert "not newer than 5" in core.reason
+        assert core.step(sample(9)) is True
+        assert core.state == Supervisor.READY
+        assert core.reason == ""
+
+
+# --------------------------------------------------------------------------- unusable samples
+
+BAD = {
+    "joint_position of joint1 is nan": {"position": np.nan},
+    "joint_velocity of joint1 is inf": {"velocity": [np.inf]},
+    "modal_amplitude of link1_y_mode2 is nan": {"amplitude": [0.0, np.nan]},
+    "modal_rate of link1_y_mode1 is -2000000.0": {"rate": [-2e6, 0.0]},
+    "modal_amplitude is not known yet": {"amplitude": None},
+    "modal_rate is not known yet": {"rate": None},
+}
+
+
+@pytest.mark.parametrize("reason", BAD)
+def test_an_unusable_sample_disables_with_the_reason_and_forgets_the_trajectory(arm_r, reason):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.offer(motion(end=0.1, duration=0.5))
+    for k in range(1, 10):
+        core.step(sample(k, 0.05))
+    assert core.state == Supervisor.TRACKING
+    assert abs(core.torque[0]) > 0.1
+    for _ in range(2):  # sent again, the answer is the same
+        assert core.step(sample(10, **BAD[reason])) is False
+        assert core.enabled is False
+        assert core.state == Supervisor.INACTIVE
+        assert reason in core.reason
+        assert_array_equal(core.torque, [0.0])
+        assert core.saturated is False
+    for k in range(11, 60):
+        assert core.step(sample(k, 0.06)) is True
+        assert core.state == Supervisor.READY
+        assert core.reason == ""
+        assert_array_equal(core.reference.position, [0.06])
+        assert_array_equal(core.torque, [0.0])
+
+
+def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.step(sample(1, 0.2))
+    core.disable("no arm_state_estimate for 0.5 s")
+    assert (core.enabled, core.reason) == (False, "no arm_state_estimate for 0.5 s")
+    assert_array_equal(core.torque, [0.0])
+    assert core.step(sample(1, 0.2)) is True
+    assert core.state == Supervisor.READY
+    assert_array_equal(core.reference.position, [0.2])
+
+
+# --------------------------------------------------------------------------- failing laws
+
+
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("by zero"), KeyError("gain"), DesignError("late"), ValueError()]
+)
+def test_whatever_a_law_raises_disables_naming_it(arm_r, error):
+    core = controller(arm_r, Scripted(3.0, error, error, 4.0))
+    core.step(sample(0))
+    core.offer(motion(end=5.0, duration=9.0))
+    assert core.torque[0] == 3.0
+    for _ in range(2):
+        assert core.step(sample(1, 0.2)) is False
+        assert core.state == Supervisor.INACTIVE
+        assert f"{type(error).__name__}: {error}" in core.reason
+        assert_array_equal(core.torque, [0.0])
+    assert core.step(sample(2, 0.3)) is True
+    assert core.state == Supervisor.READY
+    assert_array_equal(core.reference.position, [0.3])
+    assert_array_equal(core.torque, [4.0])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_torque_that_is_no_number_disables_naming_the_joint(arm_r, value):
+    core = controller(arm_r, Scripted(3.0, value))
+    core.step(sample(0))
+    assert core.step(sample(1)) is False
+    assert core.reason == f"torque of joint1 came out as {value}"
+    assert core.state == Supervisor.INACTIVE
+    assert_array_equal(core.torque, [0.0])
+
+
+def test_an_interrupt_is_nobodys_fault(arm_r):
+    with pytest.raises(KeyboardInterrupt):
+        controller(arm_r, Scripted(KeyboardInterrupt())).step(sample(0))
+
+
+# --------------------------------------------------------------------------- limits
+
+
+@pytest.mark.parametrize(
+    ("setting", "limit"),
+    [([0.0], FILE_LIMIT), ([2.0], 2.0), ([1e5], FILE_LIMIT), ([FILE_LIMIT], FILE_LIMIT)],
+)
+def test_the_lower_of_the_files_and_the_parameters_torque_limit_holds(arm_r, setting, limit):
+    core = controller(arm_r, Scripted(1e4, -1e4, 0.5 * limit, limit), torque_limit=setting)
+    assert_allclose(core.torque_limit, [limit], rtol=1e-12)
+    given = [(limit, True), (-limit, True), (0.5 * limit, False), (limit, False)]
+    for k, (torque, saturated) in enumerate(given):
+        assert core.step(sample(k)) is True
+        assert_allclose(core.torque, [torque], rtol=1e-12)
+        assert core.saturated is saturated
+
+
+def test_the_torque_changes_no_faster_than_its_rate_limit_from_the_last_one_sent(arm_r):
+    law = Scripted(0.0, 8.0, 8.0, 8.0, 8.0, -8.0, 0.0)
+    core = controller(arm_r, law, torque_rate_limit=[2000.0])
+    given = []
+    for k in (0, 1, 2, 4, 5, 6, 13):  # after a gap of n periods, n times as far
+        core.step(sample(k))
+        given.append((core.torque[0], core.saturated))
+    wanted = [(0, False), (2, True), (4, True), (8, False), (8, False), (6, True), (0, False)]
+    assert_allclose([t for t, _ in given], [t for t, _ in wanted], atol=1e-12)
+    assert [s for _, s in given] == [s for _, s in wanted]
+
+
+def test_the_rate_limit_counts_from_the_torque_that_the_size_limit_let_through(arm_r):
+    law = Scripted(0.0, 100.0, -100.0)
+    core = controller(arm_r, law, torque_limit=[3.0], torque_rate_limit=[4000.0])
+    torques = []
+    for k in range(3):
+        core.step(sample(k))
+        torques.append(core.torque[0])
+    assert_allclose(torques, [0.0, 3.0, -1.0], atol=1e-12)
+
+
+def test_after_a_disable_the_rate_limit_starts_from_no_torque(arm_r):
+    law = Scripted(0.0, 8.0, 8.0, 8.0)
+    core = controller(arm_r, law, torque_rate_limit=[8000.0])
+    core.step(sample(0))
+    core.step(sample(1))
+    assert_allclose(core.torque, [8.0])
+    core.step(sample(2, np.nan))
+    core.step(sample(3))
+    assert_array_equal(core.torque, [0.0])
+    core.step(sample(4))
+    assert_allclose(core.torque, [8.0])
+
+
+def test_each_joint_has_its_own_limits(arm_r):
+    joints = [SimpleNamespace(limits=Limits(torque=t)) for t in (5.0, np.inf)]
+    arm = SimpleNamespace(joints=joints)
+    two = SimpleNamespace(
+        arm=arm, joint_names=("a", "b"), mode_names=arm_r.mode_names, n_joints=2, n_modes=2
+    )
+    law = Scripted([9.0, 9.0], [9.0, -9.0], [9.0, 1e9])
+    core = controller(two, law, torque_rate_limit=[1000.0, 0.0])
+    core.step(sample(0, n=2))  # the first, from rest, in no time: the limited joint stays at 0
+    assert_array_equal(core.torque, [0.0, 9.0])
+    core.step(sample(1, n=2))
+    assert_allclose(core.torque, [1.0, -9.0])
+    core.step(sample(2, n=2))
+    assert_allclose(core.torque, [2.0, 1e9])
+    assert core.saturated is True
+
+
+def test_limits_can_change_between_two_samples(arm_r):
+    core = controller(arm_r, Scripted(9.0, 9.0))
+    core.step(sample(0))
+    assert_array_equal(core.torque, [9.0])
+    core.configure(check_all(PARAMETERS, {"torque_limit": [1.0]}, {"joints": 1}))
+    core.step(sample(1))
+    assert_array_equal(core.torque, [1.0])
+
+
+# --------------------------------------------------------------------------- trajectories
+
+
+def test_a_trajectory_is_refused_before_the_first_state(arm_r):
+    core = controller(arm_r)
+    verdict = core.offer(motion())
+    assert (verdict.accepted, verdict.reason) == (False, "no valid state: none yet")
+    assert core.reason == verdict.reason
+    assert core.trajectory_id == 0
+
+
+def test_a_trajectory_is_refused_after_a_disable_saying_why(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.step(sample(1, np.nan))
+    verdict = core.offer(motion())
+    assert not verdict.accepted
+    assert "joint_position of joint1 is nan" in verdict.reason
+
+
+def test_a_refused_trajectory_leaves_the_present_one_and_shows_until_the_next_is_accepted(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.offer(motion(duration=0.5))
+    core.step(sample(1))
+    assert core.offer(motion(start=2.0)).accepted is False
+    assert "start_tolerance" in core.reason
+    core.step(sample(2))
+    assert core.state == Supervisor.TRACKING
+    assert "start_tolerance" in core.reason
+    core.refuse("joint_names: not this arm's")
+    assert core.reason == "joint_names: not this arm's"
+    assert core.offer(motion(end=0.05, at_ns=stamp(600), start=0.1)).accepted
+    assert core.reason == ""
+
+
+def test_why_the_state_is_bad_comes_before_why_a_trajectory_was_refused(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.refuse("no points")
+    core.step(sample(1, np.nan))
+    assert "joint_position" in core.reason
+    core.step(sample(2))
+    assert core.reason == "no points"
+
+
+def test_an_identical_trajectory_sent_again_is_no_refusal_and_no_restart(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    assert core.offer(motion(duration=0.5)).accepted
+    core.step(sample(1))
+    core.step(sample(100))
+    before = core.reference.position.copy()
+    verdict = core.offer(motion(duration=0.5))
+    assert (verdict.accepted, verdict.repeat, core.reason) == (False, True, "")
+    core.step(sample(101))
+    assert core.reference.position > before
+    assert core.trajectory_id == 1
+
+
+def test_a_trajectory_stamped_zero_starts_at_the_first_state_after_it(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0))
+    core.offer(motion(duration=0.02))
+    core.step(sample(0))  # a repeat is no later state
+    core.step(sample(5))
+    assert core.state == Supervisor.TRACKING
+    assert_array_equal(core.reference.position, [0.0])
+    core.step(sample(15))
+    assert_allclose(core.reference.position, [0.05], rtol=1e-12)
+
+
+# --------------------------------------------------------------------------- while the observer converges
+
+
+def converging(arm_r, *samples):
+    """A controller that has seen samples without rates."""
+    core = controller(arm_r)
+    for s in samples:
+        assert core.step(s) is False
+        assert core.state == Supervisor.INACTIVE
+        assert core.reason == "modal_rate is not known yet"
+    return core
+
+
+def unknown(k, *args, **more):
+    return sample(k, *args, rate=None, **more)
+
+
+def test_a_trajectory_offered_while_converging_is_kept_and_starts_at_its_stamp(arm_r):
+    core = converging(arm_r, unknown(0), unknown(0))
+    assert core.offer(motion(at_ns=stamp(10))).accepted
+    assert core.trajectory_id == 1
+    for k in range(1, 6):
+        assert core.step(unknown(k)) is False
+    for k in range(6, 11):
+        assert core.step(sample(k)) is True
+        assert core.reference.position[0] == 0.0
+    core.step(sample(15))
+    assert core.state == Supervisor.TRACKING
+    assert core.reference.position[0] != 0.0
+
+
+def test_one_with_stamp_0_starts_with_the_first_torque(arm_r):
+    core = converging(arm_r, unknown(0))
+    assert core.offer(motion()).accepted
+    for k in range(1, 50):
+        core.step(unknown(k))
+    assert core.step(sample(50)) is True
+    assert core.reference.position[0] == 0.0
+    assert core.state == Supervisor.TRACKING
+
+
+def test_one_whose_start_passed_meanwhile_is_given_up_with_the_reason(arm_r):
+    core = converging(arm_r, unknown(0))
+    core.offer(motion(at_ns=stamp(5)))
+    for k in range(1, 20):
+        core.step(unknown(k))
+    for k in range(20, 200):
+        assert core.step(sample(k)) is True
+        assert core.state == Supervisor.READY
+        assert core.reference.position[0] == 0.0
+    assert "before the observer had converged" in core.reason
+
+
+def test_one_from_where_the_arm_no_longer_is_is_given_up_with_the_reason(arm_r):
+    core = converging(arm_r, unknown(0))
+    core.offer(motion())
+    core.step(unknown(1, 0.02))
+    for k in range(2, 50):
+        assert core.step(sample(k, 0.02)) is True
+        assert core.reference.position[0] == 0.02
+    assert "joint1 moved 0.02 rad" in core.reason
+
+
+def test_a_new_session_while_converging_forgets_what_was_offered(arm_r):
+    core = converging(arm_r, unknown(0))
+    core.offer(motion())
+    core.step(unknown(0, session=2))
+    assert core.step(sample(1, session=2)) is True
+    assert core.state == Supervisor.READY

@@ -1,0 +1,234 @@
+"""The observer of an arm: strains, order of samples, what is refused and what that leaves behind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from flexarm_control.arm_observer import ArmObserver, design_observer
+from flexarm_control.samples import ArmSample
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.strain_map import gauge_rows
+
+MS = 10**6  # [ns]
+
+
+def sample(k=0, session=1, **fields):
+    """Sample k of 1 kHz, of an arm that swings; fields replace its own."""
+    s = ArmSample(1, 2, 2)
+    s.stamp_ns, s.session, s.sequence = fields.pop("stamp_ns", 10**9 + k * MS), session, k
+    s.position[:], s.velocity[:] = 0.1 * k, 0.7
+    s.amplitude[:] = 0.01 * np.sin(0.3 * k), 0.001 * k
+    s.strain, s.torque[:] = None, 0.5
+    for name, value in fields.items():
+        as_it_is = value is None or isinstance(value, bool)
+        setattr(s, name, value if as_it_is else np.array(value, float))
+    return s
+
+
+def observed(arm, name="filtered_derivative", **options):
+    return ArmObserver(arm, design_observer(name, arm, {}), **options)
+
+
+def state(core):
+    o = core.observer
+    return np.concatenate([core.velocity, o.amplitude, o.rate, o.innovation, [o.converged]])
+
+
+# --------------------------------------------------------------------------- strains
+
+
+def test_strains_are_mapped_to_the_amplitudes_that_bend_the_gauges_so(arm_r):
+    core = observed(arm_r)
+    delta = np.array([0.012, -0.003])
+    core.step(sample(strain=gauge_rows(arm_r, arm_r.arm.gauges) @ delta, amplitude=None))
+    assert_allclose(core.observer.amplitude, delta, rtol=1e-12)
+
+
+def test_gain_and_bias_of_the_gauges_are_taken_out(arm_r):
+    gauges = tuple(replace(g, gain=2.0, bias=1e-4) for g in arm_r.arm.gauges)
+    arm = model.build(replace(arm_r.arm, gauges=gauges))
+    core, delta = observed(arm), np.array([0.012, -0.003])
+    strain = 2.0 * gauge_rows(arm, gauges) @ delta + 1e-4
+    core.step(sample(strain=strain, amplitude=None))
+    assert_allclose(core.observer.amplitude, delta, rtol=1e-11)
+
+
+def test_given_amplitudes_come_before_strains(arm_r):
+    core = observed(arm_r)
+    core.step(sample(strain=[1.0, 1.0], amplitude=[0.012, -0.003]))
+    assert_array_equal(core.observer.amplitude, [0.012, -0.003])
+
+
+def test_strains_without_gauges_in_the_arm_file_are_refused(arm_r):
+    core = observed(model.build(replace(arm_r.arm, gauges=())))
+    with pytest.raises(MessageError, match="arm file of R has no gauges"):
+        core.step(sample(strain=[0.0, 0.0], amplitude=None))
+
+
+def test_neither_strain_nor_amplitude_is_refused(arm_r):
+    with pytest.raises(MessageError, match="neither strain nor modal_amplitude"):
+        observed(arm_r).step(sample(strain=None, amplitude=None))
+
+
+def test_an_arm_with_a_mode_that_it_does_not_observe_is_refused():
+    arm = replace(arm_file.load("R"), observed_modes=("link1_y_mode1",))
+    with pytest.raises(ModelError, match="link1_y_mode2"):
+        observed(model.build(arm))
+
+
+# --------------------------------------------------------------------------- order of samples
+
+
+@pytest.mark.parametrize("name", ["filtered_derivative", "luenberger", "true_rates"])
+def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
+    core = observed(arm_r, name)
+    for k in range(20):
+        core.step(sample(k, rate=[1.0, k]))
+        once, known = state(core), core.observer.converged
+        for _ in range(3):
+            # what it carries does not matter: it is known
+            assert core.step(sample(k, rate=[9.0, 9.0], amplitude=[0.5, 0.5])) is known
+        assert_array_equal(state(core), once)
+    fresh = observed(arm_r, name)
+    for k in range(20):
+        fresh.step(sample(k, rate=[1.0, k]))
+    assert_array_equal(state(core), state(fresh))
+
+
+def test_a_new_session_starts_the_observer_again(arm_r):
+    core, fresh = observed(arm_r), observed(arm_r)
+    for k in range(20):
+        core.step(sample(k, amplitude=[0.3 * k, 1.0], velocity_known=False))
+    assert core.observer.converged
+    for k in range(3):
+        # earlier stamps and sequence numbers: a simulator that was reset
+        args = {"session": 2, "velocity_known": False}
+        assert core.step(sample(k, **args)) is fresh.step(sample(k, **args)) is False
+        assert_array_equal(state(core), state(fresh))
+
+
+def test_an_older_sample_is_left_out_and_the_next_goes_on(arm_r):
+    core, clean = observed(arm_r), observed(arm_r)
+    for k in (0, 1, 2, 5):
+        core.step(sample(k))
+        clean.step(sample(k))
+    for stale in (sample(3), sample(6, stamp_ns=10**9 + 5 * MS), sample(7, stamp_ns=10**9)):
+        with pytest.raises(MessageError, match=r"state \d of 1\.00\d+ s is not newer than 5"):
+            core.step(stale)
+        assert_array_equal(state(core), state(clean))
+    core.step(sample(8))
+    clean.step(sample(8))
+    assert_array_equal(state(core), state(clean))
+
+
+def test_a_gap_is_bridged_with_the_true_time_step(arm_r):
+    core = observed(arm_r)
+    for k in (0, 1, 2, 7, 8, 20, 21, 22, 23, 24, 25, 26, 27, 28, 40):
+        core.step(sample(k, amplitude=[0.002 * k, -0.001 * k], position=[0.003 * k]))
+    assert_allclose(core.observer.rate, [2.0, -1.0], rtol=1e-12)
+
+
+# --------------------------------------------------------------------------- refusals
+
+BAD = {
+    "joint_position of joint1": {"position": [np.nan]},
+    "joint_velocity of joint1": {"velocity": [np.inf]},
+    "modal_amplitude of link1_y_mode2": {"amplitude": [0.0, np.nan]},
+    "modal_amplitude of link1_y_mode1": {"amplitude": [-1e6, 0.0]},
+    "modal_rate of link1_y_mode1": {"rate": [np.nan, 0.0]},
+    "strain of middle": {"amplitude": None, "strain": [0.0, 1e30]},
+    "strain of root": {"amplitude": None, "strain": [-np.inf, 0.0]},
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_an_unusable_value_is_refused_naming_where_it_stands(arm_r, name):
+    core, clean = observed(arm_r), observed(arm_r)
+    for k in range(10):
+        core.step(sample(k))
+        clean.step(sample(k))
+    (values,) = (v for v in BAD[name].values() if v is not None)
+    bad = next(v for v in values if not abs(v) < 1e6)
+    with pytest.raises(MessageError, match=f"{name} is {np.float64(bad)}".replace("+", r"\+")):
+        core.step(sample(10, **BAD[name]))
+    assert_array_equal(state(core), state(clean))
+    # and it was never there: the same sample, repaired, is new
+    assert core.step(sample(10)) is clean.step(sample(10)) is True
+    assert_array_equal(state(core), state(clean))
+
+
+def test_values_of_a_sane_size_are_taken(arm_r):
+    assert observed(arm_r).step(sample(position=[-999_999.0], strain=[1.0, 1.0])) is False
+
+
+def test_a_bad_joint_velocity_does_not_matter_where_none_was_given(arm_r):
+    core = observed(arm_r)
+    core.step(sample(0, velocity=[np.nan], velocity_known=False))
+    assert_array_equal(core.velocity, [0.0])
+
+
+def test_a_sample_that_the_observer_refuses_leaves_nothing_behind(arm_r):
+    """Its time step neither: the next estimate is the one of a stream that never had it."""
+    core, clean = observed(arm_r, "luenberger"), observed(arm_r, "luenberger")
+    for k in range(30):
+        args = {"velocity_known": False, "position": [0.01 * k**2]}
+        if k == 12:
+            for _ in range(2):  # sent again, it is refused again
+                with pytest.raises(MessageError, match="joint_torque is unknown"):
+                    core.step(sample(k, torque=[np.nan], **args))
+                assert_array_equal(state(core), state(clean))
+            continue
+        assert core.step(sample(k, **args)) == clean.step(sample(k, **args))
+        assert_array_equal(state(core), state(clean))
+
+
+def test_a_start_that_the_observer_refuses_is_no_start(arm_r):
+    core = observed(arm_r, "true_rates")
+    with pytest.raises(MessageError, match="modal_rate is empty"):
+        core.step(sample(0))
+    assert core.step(sample(0, rate=[1.0, 2.0])) is True
+
+
+def test_whatever_an_observer_raises_becomes_a_refusal_that_names_it(arm_r):
+    core = observed(arm_r)
+
+    def update(sample, dt):
+        raise ZeroDivisionError("no such thing")
+
+    core.observer.update = update
+    with pytest.raises(
+        MessageError, match="FilteredDerivative failed: ZeroDivisionError: no such thing"
+    ):
+        core.step(sample(0))
+
+
+# --------------------------------------------------------------------------- joint velocity
+
+
+def test_a_given_joint_velocity_is_passed_on(arm_r):
+    core = observed(arm_r)
+    for k in range(3):
+        core.step(sample(k, velocity=[0.2 * k]))
+        assert_array_equal(core.velocity, [0.2 * k])
+
+
+def test_an_absent_joint_velocity_is_the_filtered_derivative_of_the_position(arm_r):
+    core = observed(arm_r, joint_velocity_bandwidth=400.0)
+    for k in (0, 1, 2, 5, 6, 9, 30):
+        s = sample(k, position=[0.002 * k], velocity_known=False)
+        core.step(s)
+        assert_allclose(core.velocity, [2.0 * -np.expm1(-0.4 * k)], rtol=1e-11)
+        assert_array_equal(s.velocity, core.velocity)
+
+
+def test_luenberger_takes_its_friction_from_the_reconstructed_joint_velocity(heavy_arm):
+    known, unknown = observed(heavy_arm, "luenberger"), observed(heavy_arm, "luenberger")
+    for k in range(40):
+        args = {"position": [0.002 * k], "amplitude": [0.0, 0.0]}
+        known.step(sample(k, velocity=[2.0], **args))
+        unknown.step(sample(k, velocity=[99.0], velocity_known=False, **args))
+    assert_allclose(unknown.velocity, [2.0], rtol=1e-6)
+    assert_allclose(unknown.observer.rate, known.observer.rate, rtol=1e-4)

@@ -1,0 +1,164 @@
+"""Composite control (12), and laws found by name with checked parameters."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from flexarm_control.arm_observer import design_observer
+from flexarm_control.composite import FAST, SLOW, design, design_law
+from flexarm_dynamics.errors import FlexarmError, ParameterError, UnknownComponentError
+
+SLOW_LAW = {"type": "linear_model_following"}
+FAST_LAW = {"type": "lqr", "q": [20.0, 20.0, 1000.0, 6e5], "configuration": [np.pi / 2]}
+REFERENCE = SimpleNamespace(
+    position=np.array([0.6]), velocity=np.array([0.9]), acceleration=np.array([-0.5])
+)
+Q, QD = np.array([0.4]), np.array([1.3])
+DELTA, DELTA_D = np.array([0.02, -0.003]), np.array([0.1, 0.05])
+NONE = {"type": "none"}
+
+
+def stepped(model, slow=SLOW_LAW, fast=FAST_LAW, delta=DELTA, delta_d=DELTA_D):
+    law = design(model, slow, fast)
+    law.step(Q, QD, delta, delta_d, REFERENCE)
+    return law
+
+
+# --------------------------------------------------------------------------- (12)
+
+
+def test_12_the_torque_is_the_sum_of_slow_and_fast(arm_r):
+    law = stepped(arm_r)
+    assert_array_equal(law.torque, law.slow_torque + law.fast_torque)
+    assert_array_equal(law.slow_torque, stepped(arm_r, fast=NONE).torque)
+    z_f = np.concatenate([DELTA - law.quasi_steady, DELTA_D])
+    assert_array_equal(law.deviation, z_f)
+    assert_allclose(law.fast_torque, law.fast.K_f @ z_f, rtol=1e-14)
+    assert abs(law.fast_torque[0]) > 0.1
+
+
+def test_on_the_manifold_9_the_fast_control_is_exactly_zero(arm_r, heavy_arm):
+    for model in (arm_r, heavy_arm):
+        manifold = stepped(model).quasi_steady.copy()
+        law = stepped(model, delta=manifold, delta_d=np.zeros(2))
+        assert_array_equal(law.quasi_steady, manifold)  # it does not depend on the deflections
+        assert_array_equal(law.deviation, np.zeros(4))
+        assert_array_equal(law.fast_torque, [0.0])
+        assert_array_equal(law.torque, law.slow_torque)
+
+
+def test_slow_alone_ignores_the_deflections(arm_r):
+    bent, straight = (stepped(arm_r, fast=NONE, delta=d) for d in (DELTA, np.zeros(2)))
+    assert_array_equal(bent.torque, straight.torque)
+    assert_array_equal(bent.fast_torque, [0.0])
+
+
+def test_fast_alone_damps_around_the_undriven_manifold(arm_r):
+    law = stepped(arm_r, slow=NONE)
+    assert_array_equal(law.slow_torque, [0.0])
+    assert_array_equal(law.quasi_steady, [0.0, 0.0])
+    assert_allclose(law.torque, law.fast.K_f @ [*DELTA, *DELTA_D], rtol=1e-14)
+
+
+def test_without_any_law_there_is_no_torque(arm_r):
+    assert_array_equal(stepped(arm_r, NONE, NONE).torque, [0.0])
+
+
+def test_the_quasi_steady_state_has_the_centrifugal_stiffness_of_the_present_speed(arm_r):
+    law = stepped(arm_r)
+    c = arm_r.coefficients
+    # second row of (2) at rest on the manifold: h u / m11 + (K_e - qd^2 G) delta_bar = 0
+    K2 = c.K - QD[0] ** 2 * c.G
+    wanted = -np.linalg.solve(K2, c.h) * law.slow_torque[0] / c.rigid
+    assert_allclose(law.quasi_steady, wanted, rtol=1e-11)
+    assert not np.allclose(
+        wanted, -np.linalg.solve(c.K, c.h) * law.slow_torque / c.rigid, rtol=1e-4
+    )
+
+
+def test_under_gravity_the_quasi_steady_state_is_the_arms_sag(heavy_arm):
+    law = design(heavy_arm, {"type": "model_following"}, FAST_LAW)
+    rest = SimpleNamespace(position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1))
+    law.step(np.zeros(1), np.zeros(1), np.zeros(2), np.zeros(2), rest)
+    sag = law.quasi_steady
+    state = np.concatenate([[0.0], sag, np.zeros(3)])
+    assert_allclose(heavy_arm.derivative(state, law.slow_torque), 0.0, atol=1e-9)
+    assert heavy_arm.tip_deflection(sag)[0] < -1e-3
+
+
+# --------------------------------------------------------------------------- by name
+
+
+def test_an_unknown_law_is_refused_with_what_there_is_and_a_guess(arm_r):
+    with pytest.raises(UnknownComponentError, match=r"lqr, none.*did you mean 'lqr'"):
+        design_law(FAST, "lqrr", arm_r, {})
+    with pytest.raises(
+        UnknownComponentError, match="linear_model_following, model_following, none"
+    ):
+        design_law(SLOW, "pid", arm_r, {})
+    with pytest.raises(UnknownComponentError, match="filtered_derivative, luenberger, true_rates"):
+        design_observer("kalman", arm_r, {})
+
+
+@pytest.mark.parametrize(
+    ("slow", "fast", "message"),
+    [
+        ({"kq": [1.0]}, {}, r"slow\.kq: no such parameter; there are gain, kp, kv"),
+        ({"kp": [1.0, 2.0]}, {}, r"slow\.kp: 2 values where 1 \(joints\) are needed"),
+        ({"kp": [6]}, {}, r"slow\.kp: .*write \[6\.0\]"),
+        ({"kp": 6.25}, {}, r"slow\.kp: 6\.25 is not a list of numbers"),
+        ({"kp": "6.25"}, {}, r"slow\.kp: '6\.25' is not a list of numbers"),
+        ({"kp": [-1.0]}, {}, r"slow\.kp\[0\]: -1\.0 is below its lower limit 0\.0 \[1/s\^2\]"),
+        ({"kv": [np.nan]}, {}, r"slow\.kv\[0\]: nan is not finite"),
+        ({"gain": "h22"}, {}, r"slow\.gain: 'h22' is not one of m11, h11"),
+        ({}, {"alpha": 5}, r"fast\.alpha: 5 is an integer .* write 5\.0"),
+        ({}, {"alpha": 1e9}, r"fast\.alpha: .* above its upper limit"),
+        ({}, {"q": [1.0, 2.0]}, r"fast\.q: 2 values where 4 \(z\) are needed"),
+        ({}, {"q": [1.0, 1.0, True, 1.0]}, r"fast\.q\[2\]: True is not a number"),
+        ({}, {"r": [0.0]}, r"fast\.r\[0\]: 0\.0 is below"),
+        ({}, {"beta": 1.0}, r"fast\.beta: no such parameter; there are alpha"),
+        ({"type": 5}, {}, r"slow\.type: 5 is not a name"),
+        ({"type": None}, {}, r"slow\.type: missing"),
+    ],
+)
+def test_an_unusable_parameter_is_refused_naming_it_the_value_and_the_limit(
+    arm_r, slow, fast, message
+):
+    with pytest.raises(ParameterError, match=message):
+        design(arm_r, SLOW_LAW | slow, FAST_LAW | fast)
+
+
+def test_a_law_without_type_is_refused(arm_r):
+    with pytest.raises(ParameterError, match=r"fast\.type: missing"):
+        design(arm_r, SLOW_LAW, {"alpha": 5.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        (
+            "luenberger",
+            {"pole": 0.0},
+            r"observer\.pole: 0\.0 is below its lower limit 1\.0 \[1/s\]",
+        ),
+        ("filtered_derivative", {"pole": 9.0}, r"observer\.pole: no such parameter.*bandwidth"),
+        ("true_rates", {"bandwidth": 9.0}, r"observer\.bandwidth: no such parameter.*none"),
+    ],
+)
+def test_an_unusable_observer_parameter_is_refused(arm_r, name, values, message):
+    with pytest.raises(ParameterError, match=message):
+        design_observer(name, arm_r, values)
+
+
+def test_every_refusal_is_a_flexarm_error(arm_r):
+    for slow in ({"type": "?"}, {"type": "none", "kp": [1.0]}, {}):
+        with pytest.raises(FlexarmError):
+            design(arm_r, slow, NONE)
+
+
+def test_one_value_stands_for_all_and_defaults_fill_in(arm_r):
+    law = design_law(FAST, "lqr", arm_r, {"q": [2.0]})
+    assert law.parameters["q"] == [2.0] * 4
+    assert law.parameters["alpha"] == 5.0
