@@ -74,19 +74,19 @@ class ClosedLoop:
     #: The observer has this long to converge [s].
     LONGEST_START = 10.0
 
-    def _ready(self):
-        return self.controller.step(self.estimate(self.measure()))
-
     def step(self):
         """One sample: measure, estimate, control, and advance the plant; returns the torque sent or None."""
-        try:
-            enabled = self.controller.step(self.estimate(self.measure()))
-        except MessageError as error:
-            self.controller.disable(str(error))
-            enabled = False
-        torque = self.controller.torque if enabled else None
+        torque = self.controller.torque if self._answer() else None
         self.simulator.advance(torque)
         return torque
+
+    def _answer(self):
+        """Measure, estimate, control: whether torque is enabled; a sample that was answered is answered alike."""
+        try:
+            return self.controller.step(self.estimate(self.measure()))
+        except MessageError as error:
+            self.controller.disable(str(error))
+            return False
 
     def run(self, trajectory, duration):
         """Offer a trajectory and record `duration` seconds from its start.
@@ -102,41 +102,42 @@ class ClosedLoop:
         -------
         Record
         """
-        while not self._ready():
-            if self.simulator.time > self.LONGEST_START:
-                raise MessageError(f"the controller is not ready: {self.controller.reason}")
-            self.simulator.advance(None)
+        self._answer()
         verdict = self.controller.offer(trajectory)
         if not verdict.accepted:
             raise MessageError(f"trajectory refused: {verdict.reason}")
-        # The present sample is answered: "now" is the next one.
-        start = trajectory.stamp_ns or self.simulator.stamp_ns + self.simulator.period_ns
-        end = start + round(duration * 1e9)
-        rows = []
-        controller, law = self.controller, self.controller.law
-        while self.simulator.stamp_ns <= end:
-            stamp = self.simulator.stamp_ns
+        simulator, length = self.simulator, round(duration * 1e9)
+        start, stamps, rows = trajectory.stamp_ns or None, [], []
+        while start is None or simulator.stamp_ns <= start + length:
+            if start is None and simulator.time > self.LONGEST_START:
+                raise MessageError(f"the trajectory does not start: {self.controller.reason}")
+            stamps.append(simulator.stamp_ns)
             self.step()
-            m, e = self._measured, self._estimate
-            rate = e.rate if e.rate is not None else np.full(self.model.n_modes, np.nan)
-            rows.append(
-                np.concatenate(
-                    [
-                        [1e-9 * (stamp - start)],
-                        controller.reference.position,
-                        controller.reference.velocity,
-                        m.position,
-                        e.velocity,
-                        e.amplitude,
-                        rate,
-                        law.quasi_steady,
-                        law.slow_torque,
-                        law.fast_torque,
-                        controller.torque,
-                    ]
-                )
-            )
-        return split_record(np.array(rows), self.model.n_joints, self.model.n_modes)
+            rows.append(self._row())
+            if start is None and self.controller.reference.active:
+                start = stamps[-1]  # "now": with the first torque
+        time = 1e-9 * (np.array(stamps) - start)
+        return split_record(np.column_stack([time, rows]), self.model.n_joints, self.model.n_modes)
+
+    def _row(self):
+        """What a `Record` holds of the sample that was just answered, time aside."""
+        controller, law = self.controller, self.controller.law
+        estimate = self._estimate
+        rate = np.full(self.model.n_modes, np.nan) if estimate.rate is None else estimate.rate
+        return np.concatenate(
+            [
+                controller.reference.position,
+                controller.reference.velocity,
+                self._measured.position,
+                estimate.velocity,
+                estimate.amplitude,
+                rate,
+                law.quasi_steady,
+                law.slow_torque,
+                law.fast_torque,
+                controller.torque,
+            ]
+        )
 
 
 def split_record(rows, n, m):
