@@ -8,7 +8,7 @@ import sys
 import pytest
 from rclpy.serialization import deserialize_message
 
-from flexarm_bringup import case_study, closed_loop, lockstep, parameter_files, recorder, relay
+from flexarm_bringup import case_study, closed_loop, lockstep, recorder, relay
 from flexarm_bringup.processes import Processes, own_domain
 from flexarm_control import profiles
 from flexarm_dynamics import arm_file
@@ -18,11 +18,8 @@ RUN = case_study.Run("R", "m11", "composite", "observer")
 
 def record(directory, duration, run=RUN):
     """Samples and timing of a lockstep run of three new processes."""
-    file = parameter_files.find(run.file)
     with own_domain() as domain, Processes(domain, directory) as processes:
-        processes.start_node("simulator", {"lockstep": True, **run.simulator}, file)
-        processes.start_node("observer", run.observer, file)
-        processes.start_node("controller", run.controller, file)
+        case_study.start_nodes(processes, run)
         with lockstep.LockstepRun(processes) as line:
             joints = arm_file.load(run.arm).joint_names
             message = lockstep.trajectory_message(

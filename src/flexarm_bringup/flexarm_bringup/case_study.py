@@ -146,6 +146,19 @@ def continuous(run):
     return metrics.case_study_metrics(record, arm_model)
 
 
+def start_nodes(processes, run):
+    """Start the run's simulator, in lockstep and paused, observer and controller."""
+    from .recorder import keep_for_recording
+
+    for name, parameters in (
+        ("simulator", {"lockstep": True, **run.simulator}),
+        ("observer", run.observer),
+        ("controller", run.controller),
+    ):
+        parameters = parameters | keep_for_recording(name)
+        processes.start_node(name, parameters, parameter_files.find(run.file))
+
+
 def run_nodes(run, directory, progress=lambda fraction: None):
     """The run with simulator, observer and controller as three processes over DDS, recorded.
 
@@ -165,11 +178,8 @@ def run_nodes(run, directory, progress=lambda fraction: None):
     from . import lockstep, recorder
     from .processes import Processes, own_domain
 
-    file = parameter_files.find(run.file)
     with own_domain() as domain, Processes(domain, directory / "log") as processes:
-        processes.start_node("simulator", {"lockstep": True, **run.simulator}, file)
-        processes.start_node("observer", run.observer, file)
-        processes.start_node("controller", run.controller, file)
+        start_nodes(processes, run)
         with lockstep.LockstepRun(processes) as line:
             joints = arm_file.load(run.arm).joint_names
             start = closed_loop.TRAJECTORY_START_NS

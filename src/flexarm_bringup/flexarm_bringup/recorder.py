@@ -19,6 +19,22 @@ TOPICS = {
     "observer/state": ObserverState,
 }
 
+#: Publisher of each topic on the line.
+PUBLISHERS = {
+    "simulator": ("arm_state",),
+    "observer": ("arm_state_estimate", "observer/state"),
+    "controller": ("joint_torque", "controller/state"),
+}
+
+
+def keep_for_recording(node):
+    """Parameters of a node whose messages are recorded: the line itself keeps the newest sample alone.
+
+    A recorder that the machine leaves waiting is sent again what it missed only while the publisher has it.
+    """
+    return {f"qos_overrides./{topic}.publisher.depth": 1000 for topic in PUBLISHERS[node]}
+
+
 #: Deep enough for a reader that falls behind for seconds.
 DEEP = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
