@@ -68,7 +68,7 @@ def _check_keys(node, path, visited):
         seen = set()
         for key, child in node.value:
             line = f"line {key.start_mark.line + 1}"
-            if key.tag != "tag:yaml.org,2002:str":
+            if key.tag != "tag:yaml.org,2002:str" or not key.value:
                 what = repr(key.value) if isinstance(key, yaml.ScalarNode) else "a collection"
                 raise ArmFileError(path or line, f"the key {what} ({line}) is not a name")
             at = f"{path}.{key.value}" if path else key.value
@@ -483,9 +483,10 @@ def parse(text, where="arm"):
         description=top.text("description", ""),
         source=top.text("source", ""),
     )
-    arm = replace(arm, observed_modes=_observed(top, arm.modes, gauges))
+    # Misspelt fields first: a misspelt observed_modes would be taken for too few gauges.
+    top.has("observed_modes")
     top.done()
-    return arm
+    return replace(arm, observed_modes=_observed(top, arm.modes, gauges))
 
 
 def _model(top):
