@@ -1,6 +1,7 @@
 """The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
 
 import argparse
+import signal
 import sys
 
 from flexarm_dynamics.errors import FlexarmError
@@ -94,6 +95,8 @@ def parser():
 def main(argv=None):
     """Entry point; exit code 0, 1 for an error that has been said, 2 for wrong usage."""
     options = parser().parse_args(argv)
+    # As Ctrl-C: what was started is stopped on the way out.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         options.function(options)
     except FlexarmError as error:

@@ -116,6 +116,8 @@ class ClosedLoop:
             rows.append(self._row())
             if start is None and self.controller.reference.active:
                 start = stamps[-1]  # "now": with the first torque
+        if not (self.controller.reference.active or self.controller.reference.finished):
+            raise MessageError(f"the trajectory was not followed: {self.controller.reason}")
         time = 1e-9 * (np.array(stamps) - start)
         return split_record(np.column_stack([time, rows]), self.model.n_joints, self.model.n_modes)
 

@@ -126,7 +126,10 @@ def publish(options, ros_args=None):
                 before.rejected_reason,
             )
 
-        line.wait_for(answered, "the controller took no notice: a repeat of what it follows?")
+        last = f"; it last refused: {before.rejected_reason}" if before.rejected_reason else ""
+        line.wait_for(
+            answered, f"the controller took no notice: a repeat of what it follows?{last}"
+        )
         if line.state.accepted_trajectory_id == before.accepted_trajectory_id:
             raise FlexarmError(f"refused: {line.state.rejected_reason}")
         print(

@@ -204,12 +204,12 @@ class ArmController:
             self.state = Supervisor.HOLDING
         return True
 
-    def disable(self, reason, state=Supervisor.INACTIVE):
+    def disable(self, reason):
         """Send no torque until a valid state comes; the present trajectory is given up.
 
         The next valid state is where the arm is held.
         """
-        self.enabled, self.state, self._state_reason = False, state, reason
+        self.enabled, self.state, self._state_reason = False, Supervisor.INACTIVE, reason
         self.torque[:] = 0.0
         self.saturated, self._waiting = False, False
 
@@ -217,6 +217,8 @@ class ArmController:
         """Class of the sample, which is the last one from now on; raises for one that can't be used."""
         joints, modes = self.model.joint_names, self.model.mode_names
         check_finite(sample.position, joints, "joint_position")
+        if not sample.velocity_known:
+            raise MessageError("joint_velocity is empty: the observer is to fill it in")
         check_finite(sample.velocity, joints, "joint_velocity")
         if sample.amplitude is not None:
             check_finite(sample.amplitude, modes, "modal_amplitude")

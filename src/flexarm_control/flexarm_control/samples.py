@@ -50,6 +50,10 @@ class ArmSample:
         return self.session, self.sequence
 
 
+#: Sequence numbers on the topics are uint32.
+WRAP = 2**32
+
+
 class SampleOrder:
     """Tells new samples from repeats, restarts and those out of order; by number, never by a clock."""
 
@@ -62,9 +66,10 @@ class SampleOrder:
         """Class of `sample` beside the last one taken."""
         if sample.session != self.session:
             return self.RESTART
-        if sample.sequence == self.sequence:
+        ahead = (sample.sequence - self.sequence) % WRAP  # a uint32 wraps after 50 days at 1 kHz
+        if ahead == 0:
             return self.REPEAT
-        if sample.sequence < self.sequence or sample.stamp_ns <= self.stamp_ns:
+        if ahead >= WRAP // 2 or sample.stamp_ns <= self.stamp_ns:
             return self.STALE
         return self.NEW
 

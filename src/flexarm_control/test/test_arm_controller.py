@@ -173,7 +173,12 @@ def test_a_new_session_starts_at_the_measured_position_with_no_trajectory(arm_r)
 
 
 def test_an_older_sample_disables_and_the_next_one_is_ready_again(arm_r):
-    for stale in (sample(3), sample(7, stamp_ns=stamp(5)), sample(8, stamp_ns=stamp(1))):
+    for stale in (
+        sample(3),
+        sample(4, stamp_ns=stamp(6)),
+        sample(7, stamp_ns=stamp(5)),
+        sample(8, stamp_ns=stamp(1)),
+    ):
         core = controller(arm_r)
         core.step(sample(5))
         assert core.step(stale) is False

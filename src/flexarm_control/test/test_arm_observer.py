@@ -115,7 +115,12 @@ def test_an_older_sample_is_left_out_and_the_next_goes_on(arm_r):
     for k in (0, 1, 2, 5):
         core.step(sample(k))
         clean.step(sample(k))
-    for stale in (sample(3), sample(6, stamp_ns=10**9 + 5 * MS), sample(7, stamp_ns=10**9)):
+    for stale in (
+        sample(3),
+        sample(4, stamp_ns=10**9 + 6 * MS),
+        sample(6, stamp_ns=10**9 + 5 * MS),
+        sample(7, stamp_ns=10**9),
+    ):
         with pytest.raises(MessageError, match=r"state \d of 1\.00\d+ s is not newer than 5"):
             core.step(stale)
         assert_array_equal(state(core), state(clean))

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
 from flexarm_control.arm_observer import design_observer
+from flexarm_control.samples import ArmSample
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
@@ -255,3 +256,20 @@ def test_an_observer_keeps_no_hold_on_the_callers_arrays(arm_r, name):
     s.amplitude[:], s.rate[:] = 9.0, 9.0
     assert_array_equal(observer.amplitude, [0.1, 0.2])
     assert np.all(observer.rate != 9.0)
+
+
+def test_luenberger_starts_afresh_after_a_gap_in_which_the_fastest_mode_can_turn(arm_r):
+    observer = design_observer("luenberger", arm_r, {"pole": 300.0})
+    quarter = 0.5 * np.pi / arm_r.frequencies()[-1]
+    sample = ArmSample(1, 2)
+    sample.torque[:], sample.amplitude = 0.0, np.array([1e-3, -1e-4])
+    observer.update(sample, 0.0)
+    for _ in range(50):
+        observer.update(sample, 1e-3)
+    assert observer.converged
+    observer.update(sample, 0.99 * quarter)
+    assert observer.converged
+    assert np.abs(observer.rate).max() > 0.0
+    observer.update(sample, 1.01 * quarter)
+    assert not observer.converged
+    assert_array_equal(observer.rate, [0.0, 0.0])

@@ -1,6 +1,7 @@
 """The frame of every node: lifecycle with autostart, diagnostics, clean exit on signals."""
 
 import gc
+import re
 import signal
 import sys
 import traceback
@@ -13,13 +14,16 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
-from flexarm_dynamics.errors import FlexarmError, ParameterError
+from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import Parameter
 
 from .parameters import NodeParameters
 from .spin import Line, spin
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
+REPORT_EVERY = 10_000_000_000  # [ns]
 
 ARM = Parameter(
     "arm",
@@ -59,6 +63,7 @@ class ArmNode(LifecycleNode):
         self.line = None  # the control path, while active
         self._line = None
         self._made = []
+        self._reported = {}
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.failure = ""
 
@@ -115,9 +120,10 @@ class ArmNode(LifecycleNode):
     def on_configure(self, state):
         try:
             self.build()
-        except FlexarmError as error:
-            self.failure = str(error)
-            self.get_logger().error(f"not configured: {error}")
+        except Exception as error:  # what is not ours, a user's law say, rclpy drops without a word
+            known = isinstance(error, FlexarmError)
+            self.failure = str(error) if known else traceback.format_exc()
+            self.get_logger().error(f"not configured: {self.failure}")
             self._unmake()
             return TransitionCallbackReturn.FAILURE
         self.make_timer(1.0, self._publish_diagnostics)
@@ -175,11 +181,13 @@ class ArmNode(LifecycleNode):
         self._diagnostics.publish(array)
 
     def report(self, text):
-        """Log a refusal: at once when it is a new one, else every ten seconds."""
+        """Log a refusal: at once when it is a new one, else every ten seconds; numbers aside."""
+        kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
-        last, when = getattr(self, "_reported", ("", 0))
-        if text != last or now - when > 10_000_000_000:
-            self._reported = (text, now)
+        if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:
+            if len(self._reported) > 100:  # names in a message are anybody's
+                self._reported.clear()
+            self._reported[kind] = now
             self.get_logger().warning(text)
 
 
@@ -209,10 +217,7 @@ def run(node_class, args=None):
             return 1
         spin(node, stopped)
         return 0
-    except (ParameterError, ParameterException) as error:
-        print(f"{node_class.__name__}: {error}", file=sys.stderr)
-        return 1
-    except FlexarmError as error:
+    except (FlexarmError, ParameterException) as error:
         print(f"{node_class.__name__}: {error}", file=sys.stderr)
         return 1
     except (KeyboardInterrupt, ExternalShutdownException):

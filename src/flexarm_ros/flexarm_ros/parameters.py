@@ -18,8 +18,12 @@ def descriptor(parameter):
     """The ROS descriptor of a declared parameter: text for people, a range for sliders."""
     text = parameter.description + (f" [{parameter.unit}]" if parameter.unit != "-" else "")
     limits = []
-    if parameter.low is not None or parameter.high is not None:
+    if parameter.low is not None and parameter.high is not None:
         limits.append(f"from {parameter.low} to {parameter.high}")
+    elif parameter.low is not None:
+        limits.append(f"at least {parameter.low}")
+    elif parameter.high is not None:
+        limits.append(f"at most {parameter.high}")
     if parameter.choices:
         limits.append("one of " + ", ".join(parameter.choices))
     if parameter.length is not None:
@@ -64,10 +68,12 @@ class NodeParameters:
         }
         self._sizes = {}
         self._listener = None
-        for name, (_, parameter) in self._declared.items():
+        for name, (prefix, parameter) in self._declared.items():
             try:
                 node.declare_parameter(name, parameter.default, descriptor(parameter))
             except InvalidParameterValueException as error:
+                # A scalar out of range: our own check says it with the unit.
+                parameter.check(node._parameter_overrides[name].value, prefix=prefix)
                 raise ParameterError(f"{name}: {error}") from None
         self._warn_unknown()
         self._values = {}

@@ -72,8 +72,17 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     ModelError
         When the integration fails.
     """
+
+    def slope(t, s):
+        out = model.derivative(s, torque(t, s))
+        if not np.isfinite(out).all():  # solve_ivp would shorten its step for ever
+            raise ModelError(f"{model.arm.name}: integration stopped at {t} s: not finite any more")
+        return out
+
+    if times[0] == times[-1]:
+        return np.tile(state, (len(times), 1))
     result = solve_ivp(
-        lambda t, s: model.derivative(s, torque(t, s)),
+        slope,
         (times[0], times[-1]),
         state,
         method="DOP853",
@@ -82,5 +91,6 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
         atol=atol,
     )
     if not result.success:
-        raise ModelError(f"integration stopped at {result.t[-1] if result.t.size else times[0]} s")
+        reached = result.t[-1] if result.t.size else times[0]
+        raise ModelError(f"{model.arm.name}: integration stopped at {reached} s: {result.message}")
     return result.y.T

@@ -106,9 +106,9 @@ class Simulator:
         self.arm = arm
         self.nominal = model.build(arm)
         plant_arm = arm_file.load(settings["plant_arm"]) if settings["plant_arm"] else arm
-        self._same_names(plant_arm)
         if settings["plant_modes"]:
             plant_arm = plant_arm.with_modes(settings["plant_modes"])
+        self._same_names(plant_arm)
         # The order of the gauges is that of the arm file the others know.
         gauges = {g.name: g for g in plant_arm.gauges}
         plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
@@ -160,7 +160,7 @@ class Simulator:
         else:
             self.plant.advance(torque)
             self.torque[:] = torque
-        self.sequence += 1
+        self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         self._measure()
 

@@ -223,8 +223,10 @@ class ControllerNode(ArmNode):
             fast = self._design(FAST, values["fast."]) if FAST in groups else law.fast
             self.core.law = CompositeControl(self.model, slow, fast)
             self._good = values
-        except FlexarmError as error:
-            self.get_logger().error(f"design refused, the old law goes on: {error}")
+        except Exception as error:
+            # A law may be anybody's, and this thread would drop its error without a word.
+            what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+            self.get_logger().error(f"design refused, the old law goes on: {what}{error}")
             old = [
                 RosParameter(prefix + name, value=value)
                 for prefix, group in self._good.items()

@@ -15,7 +15,8 @@ The amplitudes are measured, the rates are predicted and corrected by the predic
     + L\,[\delta_k - \Phi_{11}\delta_{k-1} - \Phi_{12}\hat{\dot\delta}_{k-1} - \Gamma_1 u],
 
 with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`, which leaves the error
-:math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes, whatever the time step.
+:math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes, whatever the time step up to a quarter period of the
+fastest mode; after a longer gap the observer starts afresh.
 
 The joint torque is the one that was applied, from the sample. What (6) has in g2, friction and gravity, goes
 with it: u stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
@@ -56,6 +57,8 @@ class Luenberger(Observer):
         self._designs = {}
         self._elapsed = -1.0
         self.innovation = np.zeros(model.n_modes)
+        # Beyond a quarter period of the fastest mode the amplitudes no longer tell its rate: Phi12 turns singular.
+        self._longest = 0.5 * np.pi / model.frequencies()[-1]
 
     def reset(self):
         super().reset()
@@ -96,7 +99,8 @@ class Luenberger(Observer):
         return found
 
     def update(self, sample, dt):
-        if self._elapsed < 0.0:
+        if self._elapsed < 0.0 or dt > self._longest:
+            self.converged = False
             self.amplitude[:] = sample.amplitude
             self.rate[:] = 0.0
             self.innovation[:] = 0.0

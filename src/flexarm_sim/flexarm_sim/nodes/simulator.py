@@ -16,6 +16,9 @@ from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
 from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
 from flexarm_sim import simulator
 
+#: Sequence numbers on the topics are uint32.
+WRAP = 2**32
+
 PARAMETERS = (
     Parameter(
         "lockstep",
@@ -100,11 +103,13 @@ class SimulatorNode(ArmNode):
         self._pause_first()
         self._answered = None  # sequence of the state whose answer is kept while paused
         self._answer = None
+        self._safe = True  # in real time: whether the last period had the safe action
         self._writer, self._reader = StateWriter(self.arm), TorqueReader(self.arm)
         self._joint_state = JointState(name=list(self.arm.joint_names))
         self._fill()
         self._late, self._refused, self._waited, self._before = 0, 0, 0, 0
-        self._controllers, self._fault, self._second = set(), "", None
+        self._controllers, self._several, self._controller = set(), set(), None
+        self._fault = ""
         self._make_topics()
 
     def _make_topics(self):
@@ -143,7 +148,7 @@ class SimulatorNode(ArmNode):
             self.sim.settings["initial_position"] = self.parameters["initial_position"]
 
     def start(self):
-        self._resend()
+        self._publish()
 
     # Torque in, state out --------------------------------------------------------------------
 
@@ -165,21 +170,24 @@ class SimulatorNode(ArmNode):
             self._advance(torque)
             self._paused = self._paused or self.sim.sequence == self._pause_sequence
             self._publish()
-        elif self._answered is None or msg.sequence >= self._answered:
+        elif self._age(msg.sequence) <= min(self._age(self._answered), WRAP // 2):
             self._answered = msg.sequence
             self._answer = None if torque is None else torque.copy()
+
+    def _age(self, sequence):
+        """Samples since state `sequence`, as uint32 count; one from the future is very old, none older still."""
+        return WRAP if sequence is None else (self.sim.sequence - sequence) % WRAP
 
     def _on_period(self):
         """Real time: the newest torque, if it is fresh, else the safe action."""
         if not self.active or self._paused:
             return
-        sim = self.sim
-        fresh = (
-            self._answered is not None and sim.sequence - self._answered <= self._timeout_samples
-        )
+        fresh = self._age(self._answered) <= self._timeout_samples
         if not fresh and self._answered is not None:
             self._late += 1
-        self._advance(self._answer if fresh else None)
+        applied = self._answer if fresh else None
+        self._safe = applied is None
+        self._advance(applied)
         self._publish()
 
     def _advance(self, torque):
@@ -234,11 +242,15 @@ class SimulatorNode(ArmNode):
             )
 
     def _watch_controllers(self, controller_id):
-        self._controllers.add(controller_id)
-        if len(self._controllers) > 1 and self._second != controller_id:
-            self._second = controller_id
-            ids = ", ".join(str(i) for i in sorted(self._controllers))
+        """An id that comes back after another one: two controllers. One that was restarted has a new id."""
+        if controller_id == self._controller:
+            return
+        if controller_id in self._controllers:
+            self._several = {controller_id, self._controller}
+            ids = ", ".join(str(i) for i in sorted(self._several))
             self.report(f"joint_torque comes from several controllers ({ids}): stop all but one")
+        self._controller = controller_id
+        self._controllers.add(controller_id)
 
     # Services --------------------------------------------------------------------------------
 
@@ -246,10 +258,10 @@ class SimulatorNode(ArmNode):
         self.sim.reset()
         self._session = (self._session + 1) % 2**32
         self._answered, self._answer, self._fault = None, None, ""
-        self._controllers, self._second = set(), None
+        self._controllers, self._several, self._controller = set(), set(), None
         self._pause_first()
         self._fill()
-        self._resend()
+        self._publish()
         response.success, response.message = True, f"session {self._session}"
         return response
 
@@ -275,11 +287,12 @@ class SimulatorNode(ArmNode):
         }
         if self._fault:
             return ERROR, self._fault, values
-        if len(self._controllers) > 1:
+        several, self._several = self._several, set()
+        if several:
             return ERROR, "several controllers publish joint_torque: stop all but one", values
         if self._paused:
             return OK, "paused: call ~/pause with data false", values
-        if done == 0 or (not self._lockstep and self._answer is None):
+        if done == 0 or (not self._lockstep and self._safe):
             return WARN, "no fresh torque: the safe action is applied", values
         return OK, "", values
 

@@ -1,0 +1,187 @@
+"""The command line: help, wrong usage, options of the commands, progress."""
+
+import argparse
+import io
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexarm_bringup import cli, publish_trajectory
+from flexarm_bringup.progress import Progress
+from flexarm_dynamics.errors import TrajectoryError
+
+COMMANDS = ("demo", "publish", "run", "parameters")
+
+
+def exit_code(words):
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    return end.value.code
+
+
+def options(*words):
+    parser = argparse.ArgumentParser()
+    publish_trajectory.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def profile(*words, reference=(0.0,)):
+    return publish_trajectory.profile_of(options(*words), list(reference))
+
+
+# --------------------------------------------------------------------------- help and usage
+
+
+def test_help_lists_every_command(capsys):
+    assert exit_code(["--help"]) == 0
+    out = capsys.readouterr().out
+    for command in COMMANDS:
+        assert command in out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command, capsys):
+    assert exit_code([command, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"flexarm {command}" in out
+    assert "example:" in out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["dance"],
+        ["demo", "--fast"],
+        ["demo", "extra"],
+        ["publish"],
+        ["publish", "cubic"],
+        ["publish", "paper", "--duration", "long"],
+        ["publish", "paper", "--points", "1.5"],
+        ["publish", "paper", "--to"],
+        ["run", "flexarm_sim"],
+    ],
+)
+def test_wrong_usage_exits_2_and_says_how(words, capsys):
+    assert exit_code(words) == 2
+    assert "usage: flexarm" in capsys.readouterr().err
+
+
+def test_an_error_is_said_in_one_line_and_exits_1(monkeypatch, capsys):
+    def refuse(options, ros_args=None):
+        raise TrajectoryError("no such motion")
+
+    monkeypatch.setattr(publish_trajectory, "publish", refuse)
+    assert exit_code(["publish", "paper"]) == 1
+    assert capsys.readouterr().err == "flexarm publish: no such motion\n"
+    with pytest.raises(SystemExit) as end:
+        publish_trajectory.main(["paper"])
+    assert end.value.code == 1
+    assert capsys.readouterr().err == "publish_trajectory: no such motion\n"
+
+
+def test_an_interrupt_exits_130(monkeypatch):
+    def interrupt(options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(publish_trajectory, "publish", interrupt)
+    assert exit_code(["publish", "paper"]) == 130
+
+
+def test_ros_arguments_are_passed_on_apart(monkeypatch):
+    seen = []
+    monkeypatch.setattr(publish_trajectory, "publish", lambda o, r: seen.append((o.to, r)))
+    for words in (["quintic", "--to", "1.0", "--ros-args", "-r", "__ns:=/left"], ["paper"]):
+        with pytest.raises(SystemExit) as end:
+            publish_trajectory.main(words)
+        assert end.value.code == 0
+    assert seen[0] == ("1.0", ["--ros-args", "-r", "__ns:=/left"])
+    assert seen[1][1] == []
+
+
+# --------------------------------------------------------------------------- publish: the motion
+
+
+def test_without_options_it_is_the_papers_motion():
+    motion = profile("paper")
+    assert motion.duration == 2.0
+    assert_allclose([motion.position(0.0), motion.position(2.0)], [[0.0], [np.pi / 2]], rtol=1e-15)
+    assert_allclose(motion.velocity(1.0), [np.pi / 2], rtol=1e-12)  # 90 deg/s at half time
+
+
+@pytest.mark.parametrize("kind", ["paper", "quintic"])
+def test_a_motion_goes_from_where_to_where_and_as_long_as_it_is_told(kind):
+    motion = profile(kind, "--from", "0.5", "--to", "-1.25", "--duration", "3.5")
+    assert_allclose([motion.position(0.0), motion.position(3.5)], [[0.5], [-1.25]], rtol=1e-12)
+    assert_allclose([motion.velocity(0.0), motion.velocity(3.5)], 0.0, atol=1e-12)
+
+
+def test_a_motion_starts_at_the_reference_unless_it_is_told_otherwise():
+    assert_allclose(profile("quintic", reference=[0.7]).position(0.0), [0.7])
+    assert_allclose(profile("paper", reference=[0.7]).position(2.0), [np.pi / 2])
+    assert_allclose(profile("quintic", "--from", "0", reference=[0.7]).position(0.0), [0.0])
+
+
+def test_one_angle_stands_for_all_joints_and_a_list_for_each():
+    motion = profile("quintic", "--from=0", "--to=-1,2", reference=[9.0, 9.0])
+    assert_allclose(motion.position(0.0), [0.0, 0.0])
+    assert_allclose(motion.position(2.0), [-1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--to", "ninety"], r"--to 'ninety': write numbers, comma separated"),
+        (["--to", ""], r"--to '': write numbers"),
+        (["--to", "1,"], r"--to '1,': write numbers"),
+        (["--to", "1,2"], r"--to '1,2': 1 finite angles are wanted"),
+        (["--to", "nan"], r"--to 'nan': 1 finite angles"),
+        (["--from", "inf"], r"--from 'inf': 1 finite angles"),
+        (["--from", "0;1"], r"--from '0;1': write numbers"),
+        (["--duration", "0"], r"duration is 0\.0 s"),
+        (["--duration", "-2"], r"duration is -2\.0 s"),
+        (["--duration", "nan"], r"duration is nan s"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["paper", "quintic"])
+def test_an_unusable_option_is_refused_naming_it(kind, words, message):
+    with pytest.raises(TrajectoryError, match=message):
+        profile(kind, *words)
+
+
+# --------------------------------------------------------------------------- progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_writes_a_line_per_step_where_there_is_no_terminal():
+    out = io.StringIO()
+    show = Progress(out)
+    show.step("first", 1, 2)
+    show.fraction(0.5)
+    show.step("last")
+    show.done()
+    assert [line.split(" s ", 1)[1] for line in out.getvalue().splitlines()] == [
+        "[1/2] first",
+        "last",
+    ]
+
+
+def test_progress_fills_a_bar_on_a_terminal_and_ends_each_step_full():
+    out = Terminal()
+    show = Progress(out)
+    show.step("first", 1, 2)
+    show.fraction(0.5)
+    show.fraction(7.0)
+    show.step("last", 2, 2)
+    show.done()
+    assert 25 * "#" not in out.getvalue()
+    lines = out.getvalue().split("\n")
+    assert len(lines) == 3
+    assert "[" + 12 * "#" + 12 * "." + "] [1/2] first" in lines[0]
+    for line, label in zip(lines, ("first", "last"), strict=False):
+        assert line.endswith(f"[{24 * '#'}] [{'1' if label == 'first' else '2'}/2] {label}")

@@ -1,0 +1,22 @@
+"""Arms for the tests of the simulator package."""
+
+from dataclasses import replace
+
+import pytest
+
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import Friction
+
+
+@pytest.fixture(scope="session")
+def arm_r():
+    """Model of the paper's arm: no friction, no gravity, no damping."""
+    return model.build(arm_file.load("R"))
+
+
+@pytest.fixture(scope="session")
+def heavy_arm():
+    """Fully derived arm in a vertical plane, with joint friction."""
+    arm = arm_file.load("one_link")
+    joint = replace(arm.joints[0], friction=Friction(viscous=0.3, coulomb=0.2, smoothing=0.2))
+    return model.build(replace(arm, joints=(joint,), gravity=(0.0, -9.81, 0.0)))

@@ -1,0 +1,197 @@
+"""The plant: motion under torque, energy, safe actions, errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.errors import ModelError, ShapeError
+from flexarm_sim.integrators import integrate
+from flexarm_sim.plant import Plant
+
+DEGREE = np.pi / 180.0
+ARMS = ("R", "P3", "one_link")
+
+
+def built(name="R", modes=0, joint=None, **changed):
+    """Model of a shipped arm, with changes to its joint or to itself."""
+    arm = replace(arm_file.load(name), **changed)
+    if joint:
+        arm = replace(arm, joints=(replace(arm.joints[0], **joint),))
+    return model.build(arm.with_modes(modes) if modes else arm)
+
+
+def coasting(arm, seconds=1.0, speed=2.0):
+    """Joint speeds and energies from `speed` [rad/s] on under the safe action, at 1 kHz."""
+    plant = Plant(arm, 1e-3)
+    plant.qd[:] = speed
+    speeds, energies = [], [arm.energy(plant.state)]
+    for _ in range(round(1000 * seconds)):
+        plant.advance_safely()
+        speeds.append(abs(plant.qd[0]))
+        energies.append(arm.energy(plant.state))
+    return np.array(speeds), np.array(energies)
+
+
+# --------------------------------------------------------------------------- motion
+
+
+@pytest.mark.parametrize("name", ["arm_r", "heavy_arm"])
+def test_the_plant_moves_as_the_equations_of_motion_say(request, name):
+    arm = request.getfixturevalue(name)
+    plant = Plant(arm, 1e-3)
+    plant.reset([0.3], [0.02, -0.004])
+    start = plant.state.copy()
+    torque = np.array([2.0])
+    states = [start]
+    for _ in range(500):
+        plant.advance(torque)
+        states.append(plant.state.copy())
+    exact = integrate(arm, start, lambda t, s: torque, 1e-3 * np.arange(501), 1e-12, 1e-13)
+    assert_allclose(states, exact, atol=1e-9)
+
+
+@pytest.mark.parametrize("modes", [2, 3, 5])
+def test_the_energy_of_the_free_arm_drifts_less_than_1e_8_in_10_s(modes):
+    arm = built("R", modes)
+    plant = Plant(arm, 1e-3)
+    plant.state[:] = 0.0
+    plant.qd[:] = 1.0
+    plant.delta[:2] = 0.03, -0.01
+    plant.delta_d[-1] = 0.5
+    start, worst = arm.energy(plant.state), 0.0
+    for _ in range(100):
+        for _ in range(100):
+            plant.advance(np.zeros(1))
+        worst = max(worst, abs(arm.energy(plant.state) / start - 1.0))
+    assert worst < 1e-8
+
+
+def test_work_of_the_torque_becomes_energy(arm_r):
+    plant = Plant(arm_r, 1e-3)
+    torque, work = np.array([2.5]), 0.0
+    for _ in range(400):
+        before = plant.q[0]
+        plant.advance(torque)
+        work += torque[0] * (plant.q[0] - before)
+    assert_allclose(arm_r.energy(plant.state), work, rtol=1e-10)
+
+
+def test_an_arm_at_rest_stays_there_to_the_last_bit(arm_r):
+    plant = Plant(arm_r, 1e-3)
+    plant.reset([0.7])
+    for _ in range(10):
+        plant.advance(np.zeros(1))
+        plant.advance_safely()
+    assert_array_equal(plant.state, [0.7, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+# --------------------------------------------------------------------------- safe actions
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("action", ["damp", "brake"])
+def test_a_stopping_action_never_adds_energy(name, action):
+    _, energies = coasting(built(name, joint={"safe_action": action}))
+    assert np.diff(energies).max() <= 1e-12 * energies[0]
+    assert energies[-1] < 0.15 * energies[0]
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_brake_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s(name):
+    speeds, _ = coasting(built(name, joint={"safe_action": "brake"}), 2.0)
+    assert speeds[999:].max() < 1.0 * DEGREE
+    assert speeds[150:].max() < 1.0 * DEGREE  # the rigid arm would take 0.2 s at its torque limit
+
+
+def test_damp_brings_a_stiff_arms_joint_from_2_rad_s_below_1_deg_s_within_1_s():
+    link = arm_file.load("R").links[0]
+    stiff = replace(link, stiffness={"y": 100.0 * link.stiffness["y"]})
+    speeds, _ = coasting(built(links=(stiff,), joint={"safe_action": "damp"}))
+    assert speeds[-100:].max() < 1.0 * DEGREE
+    # the rigid arm's speed decays with 10 1/s
+    assert_allclose(speeds[199], 2.0 * np.exp(-2.0), rtol=0.05)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_damp_takes_the_swing_out_of_a_flexible_arm(name):
+    """Undamped beam and payload shake the joint on: what must go is the energy."""
+    speeds, energies = coasting(built(name, joint={"safe_action": "damp"}), 2.0)
+    assert speeds[999:].max() < 5.5 * DEGREE
+    assert energies[-1] < 0.01 * energies[0]
+
+
+def test_zero_lets_the_arm_coast_like_no_torque():
+    arm = built(joint={"safe_action": "zero"})
+    speeds, energies = coasting(arm)
+    assert_allclose(speeds, 2.0, rtol=0.2)
+    assert_allclose(energies, energies[0], rtol=1e-12)
+    safe, free = Plant(arm, 1e-3), Plant(arm, 1e-3)
+    for plant in (safe, free):
+        plant.reset([0.0], [0.02, 0.01])
+    for _ in range(50):
+        safe.advance_safely()
+        free.advance(np.zeros(1))
+    assert_array_equal(safe.state, free.state)
+
+
+def test_the_files_damping_and_braking_are_used_where_it_states_them():
+    J = built().coefficients.rigid
+    # as a rigid arm does, for the first few ms
+    speeds, _ = coasting(built(joint={"safe_action": "damp", "damp_coefficient": 0.0}), 0.1)
+    assert_allclose(speeds, 2.0, rtol=1e-3)
+    H11 = built()._terms_at_rest.H[0, 0]
+    speeds, _ = coasting(built(joint={"safe_action": "damp", "damp_coefficient": 3.0}), 0.002)
+    assert_allclose(speeds[0], 2.0 * np.exp(-3.0 * H11 * 1e-3), rtol=1e-5)
+    weak, _ = coasting(built(joint={"safe_action": "brake", "brake_torque": 0.0}), 0.1)
+    strong, _ = coasting(built(joint={"safe_action": "brake", "brake_torque": 50.0}), 0.1)
+    assert weak[-1] > 2.0 * np.exp(-1.5) > 0.2 > strong[-1]
+    assert J > 1.0
+
+
+def test_a_brake_far_too_strong_for_the_time_step_stops_the_arm_without_chatter():
+    arm = built(joint={"safe_action": "brake", "brake_torque": 1e5})
+    speeds, energies = coasting(arm)
+    assert np.diff(energies).max() <= 1e-12 * energies[0]
+    assert speeds[100:].max() < 1.0 * DEGREE
+
+
+def test_the_brake_holds_a_level_arm_against_gravity_but_for_a_creep():
+    arm = built("one_link", joint={"safe_action": "brake"}, gravity=(0.0, -9.81, 0.0))
+    plant = Plant(arm, 1e-3)
+    for _ in range(1000):
+        plant.advance_safely()
+    assert -0.005 < plant.q[0] < 0.0
+    assert abs(plant.qd[0]) < 0.3 * DEGREE
+    assert arm.tip_deflection(plant.delta)[0] < -0.005  # while the beam sags
+
+
+# --------------------------------------------------------------------------- errors
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("torque", [np.nan, np.inf, 1e200])
+def test_a_state_that_is_not_finite_is_an_error_that_names_the_arm(arm_r, torque):
+    plant = Plant(arm_r, 1e-3)
+    with pytest.raises(ModelError, match=r"state of R is no longer finite.*reset"):
+        for _ in range(20):
+            plant.advance(np.array([torque]))
+    plant.reset()
+    plant.advance(np.array([1.0]))
+    assert np.isfinite(plant.state).all()
+
+
+def test_an_initial_position_of_the_wrong_shape_is_refused_naming_both(arm_r):
+    with pytest.raises(ShapeError, match=r"\(2,\), wanted \(1,\)"):
+        Plant(arm_r, 1e-3).reset([0.0, 1.0])
+
+
+def test_reset_puts_the_arm_at_rest_where_it_is_told(arm_r):
+    plant = Plant(arm_r, 1e-3)
+    plant.advance(np.array([5.0]))
+    plant.reset([0.4], [0.01, 0.002])
+    assert_array_equal(plant.state, [0.4, 0.01, 0.002, 0.0, 0.0, 0.0])
+    plant.reset()
+    assert_array_equal(plant.state, np.zeros(6))
