@@ -217,15 +217,14 @@ def linear_table(summaries):
         f"{'':34}{'print':>12}{'P3':>12}{'R':>12}",
     ]
     labels = {
-        "open_loop_frequencies_rad_s": "open loop, mode {} [rad/s]",
-        "closed_loop_frequencies_rad_s": "closed loop, mode {} [rad/s]",
-        "closed_loop_damping": "damping ratio, mode {} [-]",
+        "open_loop_frequencies_rad_s": ("open loop, mode {} [rad/s]", "~{:.0f}"),
+        "closed_loop_frequencies_rad_s": ("closed loop, mode {} [rad/s]", "{:.2f}"),
+        "closed_loop_damping": ("damping ratio, mode {} [-]", "{:.3f}"),
     }
-    for key, label in labels.items():
-        about = "~" if key.startswith("open") else ""
+    for key, (label, digits) in labels.items():
         for i, printed in enumerate(PRINT[key]):
             lines.append(
-                f"{label.format(i + 1):34}{about + format(printed, 'g'):>12}"
+                f"{label.format(i + 1):34}{digits.format(printed):>12}"
                 f"{p3[key][i]:12.4f}{r[key][i]:12.4f}"
             )
     for i, printed in enumerate(PRINT["k_f"]):
@@ -369,3 +368,4 @@ def _print_tables(summary, references, figures, directory):
     if (directory / "R_m11_composite" / "bag").is_dir():
         print(f"Bags     {directory}/<run>/bag (MCAP): open in PlotJuggler or Foxglove")
     print(f"Numbers  {directory / 'summary.json'}")
+    print("Next     start the nodes yourself and move the arm: README.md, 'Run the nodes yourself'")
