@@ -1,0 +1,538 @@
+"""A bench for the nodes: processes on a DDS domain of their own, and what a user's programs do beside them.
+
+Nothing here sleeps: every wait serves an executor until a condition holds, for a bounded time, and then
+fails saying what it waited for and what the nodes' logs end with.
+"""
+
+import contextlib
+import os
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from flexarm_bringup.processes import NODES, Processes, arguments, executable, own_domain
+from flexarm_dynamics.parameters import check_all
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+from flexarm_ros import qos
+from flexarm_ros.messages import SECOND, StateWriter, set_stamp, stamp_ns
+from flexarm_sim import simulator
+
+SHM = Path("/dev/shm")
+#: Deep enough for a reader that falls behind for seconds.
+DEEP = QoSProfile(
+    history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
+)
+#: Number of each transition, and the state it leads to.
+TRANSITIONS = {
+    "configure": (Transition.TRANSITION_CONFIGURE, "inactive"),
+    "activate": (Transition.TRANSITION_ACTIVATE, "active"),
+    "deactivate": (Transition.TRANSITION_DEACTIVATE, "inactive"),
+    "cleanup": (Transition.TRANSITION_CLEANUP, "unconfigured"),
+}
+
+
+class Tap:
+    """Keeps what comes on a topic, in order, without waking an executor per message."""
+
+    def __init__(self, node, kind, topic):
+        self.messages = []
+        self._subscription = node.create_subscription(kind, topic, lambda message: None, DEEP)
+
+    def poll(self):
+        """Take what has come since the last call."""
+        handle, kind = self._subscription.handle, self._subscription.msg_type
+        with handle:
+            while (taken := handle.take_message(kind, False)) is not None:
+                self.messages.append(taken[0])
+
+    @property
+    def newest(self):
+        """The last message; None before the first."""
+        return self.messages[-1] if self.messages else None
+
+    def answers(self, session, sequence):
+        """The messages of one sample."""
+        return [m for m in self.messages if (m.session, m.sequence) == (session, sequence)]
+
+
+class Bench:
+    """Processes, and a node of this process beside them.
+
+    Parameters
+    ----------
+    directory : Path
+        For log files.
+    """
+
+    #: Longest wait for any one thing [s]; generous, so that a loaded machine fails no test.
+    PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "30"))
+
+    def __init__(self, directory):
+        self._stack = contextlib.ExitStack()
+        self.directory = Path(directory)
+        self.domain = self._stack.enter_context(own_domain())
+        self.processes = self._stack.enter_context(Processes(self.domain, directory))
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=self.domain)
+        quiet = {"start_parameter_services": False, "enable_rosout": False}
+        self.node = Node("bench", context=self.context, **quiet)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self._taps, self._clients, self._publishers = {}, {}, {}
+        self._tapping = Node("taps", context=self.context, **quiet)
+        self._killed = set()
+
+    # Processes -------------------------------------------------------------------------------
+
+    def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
+        """Start a node's installed executable; `key` names its log and process."""
+        command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
+        return self.processes.start(key or name, command)
+
+    def start_loop(self, simulator=None, observer=None, controller=None, **common):
+        """Start the three nodes."""
+        for name, own in (
+            ("simulator", simulator),
+            ("observer", observer),
+            ("controller", controller),
+        ):
+            self.start(name, {**common, **(own or {})})
+
+    def log(self, key):
+        """What a process has printed."""
+        return self.processes.log(key)
+
+    def kill(self, key):
+        """End a process as kill -9 does, and note what it leaves in shared memory."""
+        process = self.processes.running.pop(key)
+        self._killed |= segments(process.pid)
+        process.kill()
+        process.wait()
+
+    def stop(self, key, number):
+        """Signal one process and wait for its end; its exit code."""
+        process = self.processes.running.pop(key)
+        process.send_signal(number)
+        self.wait_for(f"{key} to end", lambda: process.poll() is not None)
+        return process.returncode
+
+    # Waiting ---------------------------------------------------------------------------------
+
+    def wait_for(self, what, condition, patience=None):
+        """Serve the executor and the taps until `condition` holds; return its value."""
+        end = time.monotonic() + (patience or self.PATIENCE)
+        while True:
+            for tap in self._taps.values():
+                tap.poll()
+            if value := condition():
+                return value
+            if time.monotonic() > end:
+                logs = "\n".join(
+                    f"--- {path.stem}\n" + "\n".join(path.read_text().splitlines()[-8:])
+                    for path in sorted(self.directory.glob("*.log"))
+                )
+                raise AssertionError(
+                    f"waited {patience or self.PATIENCE:g} s in vain for {what}\n{logs}"
+                )
+            self.executor.spin_once(timeout_sec=0.002)
+
+    def spin_for(self, seconds):
+        """Serve the executor for a while, where nothing is to happen."""
+        end = time.monotonic() + seconds
+        self.wait_for("the time to pass", lambda: time.monotonic() > end, seconds + 1.0)
+
+    # Topics ----------------------------------------------------------------------------------
+
+    def tap(self, kind, topic):
+        """The `Tap` of a topic."""
+        if topic not in self._taps:
+            self._taps[topic] = Tap(self._tapping, kind, topic)
+        return self._taps[topic]
+
+    def publisher(self, kind, topic, readers=1):
+        """A publisher (reliable, volatile, as ``ros2 topic pub``) that `readers` have found."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(kind, topic, qos.COMMAND)
+        publisher = self._publishers[topic]
+        self.wait_for(
+            f"{readers} reader of {topic}", lambda: publisher.get_subscription_count() >= readers
+        )
+        return publisher
+
+    def diagnostics(self, name):
+        """What a node says on /diagnostics, newest last."""
+        arrays = self.tap(DiagnosticArray, "/diagnostics").messages
+        return [s for a in arrays for s in a.status if s.name == name]
+
+    # Services --------------------------------------------------------------------------------
+
+    #: An answer is asked for again after so long [s]: a server that has not found the client yet drops it.
+    ASK_AGAIN = 3.0
+
+    def call(self, kind, name, **request):
+        """Call a service."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        self.wait_for(f"the service {name}", client.service_is_ready)
+        futures, again = [], 0.0
+
+        def answered():
+            nonlocal again
+            if time.monotonic() > again:
+                again = time.monotonic() + self.ASK_AGAIN
+                futures.append(client.call_async(kind.Request(**request)))
+            return next((f for f in futures if f.done()), None)
+
+        return self.wait_for(f"an answer of {name}", answered).result()
+
+    def set(self, node, **values):
+        """Set parameters one by one; dots as double underscores. The results, in order."""
+        return self.call(
+            SetParameters, f"{node}/set_parameters", parameters=_messages(values)
+        ).results
+
+    def set_atomically(self, node, **values):
+        """Set parameters all or none; the result."""
+        name = f"{node}/set_parameters_atomically"
+        return self.call(SetParametersAtomically, name, parameters=_messages(values)).result
+
+    def get(self, node, name):
+        """Value of a parameter, arrays as lists; None where there is no such parameter."""
+        answer = self.call(GetParameters, f"{node}/get_parameters", names=[name])
+        if not answer.values:
+            return None
+        value = parameter_value_to_python(answer.values[0])
+        return value.tolist() if hasattr(value, "tolist") else value
+
+    def change(self, node, transition):
+        """Call a lifecycle transition; whether the node is where it leads."""
+        number, goal = TRANSITIONS[transition]
+        self.call(ChangeState, f"{node}/change_state", transition=Transition(id=number))
+        return self.lifecycle(node) == goal
+
+    def lifecycle(self, node):
+        """Label of a node's lifecycle state."""
+        return self.call(GetState, f"{node}/get_state").current_state.label
+
+    # End -------------------------------------------------------------------------------------
+
+    def close(self):
+        """End all processes; remove what killed ones left behind."""
+        self.processes.stop()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self._tapping.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+        self._stack.close()
+        for path in abandoned(self._killed):
+            path.unlink(missing_ok=True)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def _messages(values):
+    return [
+        Parameter(name.replace("__", "."), value=value).to_parameter_msg()
+        for name, value in values.items()
+    ]
+
+
+class Arm:
+    """Topics and services of one arm, in one namespace.
+
+    Parameters
+    ----------
+    bench : Bench
+    namespace : str
+        With a slash at its end, or empty.
+    joints : sequence of str
+    """
+
+    #: Type of the service ~/reset.
+    reset_kind = Trigger
+
+    def __init__(self, bench, namespace="", joints=("joint1",)):
+        self.bench, self.namespace, self.joints = bench, namespace, list(joints)
+        self.measured = bench.tap(ArmState, f"{namespace}arm_state")
+        self.estimated = bench.tap(ArmState, f"{namespace}arm_state_estimate")
+        self.torques = bench.tap(JointTorque, f"{namespace}joint_torque")
+        self.states = bench.tap(CompositeState, f"{namespace}controller/state")
+        self.observer_states = bench.tap(ObserverState, f"{namespace}observer/state")
+
+    @property
+    def state(self):
+        """The newest controller/state; an empty one before the first."""
+        return self.states.newest or CompositeState()
+
+    @property
+    def now(self):
+        """Stamp of the newest controller/state [ns]."""
+        return stamp_ns(self.state.header.stamp)
+
+    def ready(self):
+        """Whether the controller sends torque."""
+        return self.state.supervisor_state != CompositeState.INACTIVE
+
+    def wait_ready(self):
+        """Until the controller sends torque, and every topic of the line has been found."""
+        self.bench.wait_for("the controller to be ready", self.ready)
+        line = (self.measured, self.estimated, self.torques)
+        self.bench.wait_for("something on every topic", lambda: all(t.messages for t in line))
+
+    def wait_until(self, stamp):
+        """Until the loop has come to a stamp [ns]."""
+        self.bench.wait_for(f"the loop to come to {stamp * 1e-9:.3f} s", lambda: self.now >= stamp)
+
+    def pause(self, paused):
+        """Call the simulator's ~/pause."""
+        answer = self.bench.call(SetBool, f"{self.namespace}simulator/pause", data=paused)
+        assert answer.success, answer.message
+
+    def paused_at(self):
+        """Stamp of the sample that is being sent again [ns]; 0 while the loop runs."""
+        last = [stamp_ns(m.header.stamp) for m in self.states.messages[-2:]]
+        return last[0] if len(last) == 2 and last[0] == last[1] else 0
+
+    def stand(self):
+        """Pause and wait until the loop stands; the stamp [ns]."""
+        self.pause(True)
+        seen = len(self.states.messages)
+        self.bench.wait_for(
+            "the loop to stand", lambda: len(self.states.messages) > seen + 1 and self.paused_at()
+        )
+        return self.paused_at()
+
+    def reset(self):
+        """Reset the simulator and wait until the controller answers in the new session."""
+        answer = self.bench.call(Trigger, f"{self.namespace}simulator/reset")
+        assert answer.success, answer.message
+        session = int(answer.message.split()[-1])
+        self.bench.wait_for(
+            "the new session to stand, ready",
+            lambda: self.state.session == session and self.ready() and self.paused_at(),
+        )
+        return session
+
+    def publish_trajectory(self, message):
+        """Publish on joint_trajectory, once."""
+        publisher = self.bench.publisher(JointTrajectory, f"{self.namespace}joint_trajectory")
+        publisher.publish(message)
+
+    def offer(self, message):
+        """Publish a trajectory, once a second, until it is accepted; its number.
+
+        As ``ros2 topic pub`` does: the first one may be lost on a controller that has just started.
+        """
+        before = self.state.accepted_trajectory_id
+        again = 0.0
+
+        def accepted():
+            nonlocal again
+            if self.state.accepted_trajectory_id > before:
+                return True
+            if time.monotonic() > again:
+                again = time.monotonic() + 1.0
+                self.publish_trajectory(message)
+            return False
+
+        try:
+            self.bench.wait_for("the trajectory to be accepted", accepted)
+        except AssertionError as error:
+            raise AssertionError(f"refused: {self.state.rejected_reason}\n{error}") from None
+        return self.state.accepted_trajectory_id
+
+    def refused(self, message):
+        """Publish a trajectory and wait until its refusal is shown; the reason."""
+        before = self.state.rejected_reason
+        self.publish_trajectory(message)
+        self.bench.wait_for(
+            "a new refusal in controller/state",
+            lambda: self.state.rejected_reason not in ("", before),
+        )
+        return self.state.rejected_reason
+
+    def samples(self, session=None):
+        """controller/state by stamp [ns], what was sent again once; of one session."""
+        session = self.state.session if session is None else session
+        return {stamp_ns(m.header.stamp): m for m in self.states.messages if m.session == session}
+
+
+def trajectory(joints, *points, stamp=0):
+    """A trajectory; each point is (time [s], positions, velocities, accelerations)."""
+    message = JointTrajectory(joint_names=list(joints))
+    set_stamp(message.header.stamp, stamp)
+    for at, *fields in points:
+        sec, nanosec = divmod(round(at * 1e9), SECOND)
+        names = ("positions", "velocities", "accelerations", "effort")
+        filled = dict(zip(names, fields, strict=False))
+        at = Duration(sec=sec, nanosec=nanosec)
+        message.points.append(JointTrajectoryPoint(time_from_start=at, **filled))
+    return message
+
+
+class Source:
+    """A driver of one's own: a simulated arm in this process, which publishes `arm_state`.
+
+    Parameters
+    ----------
+    bench : Bench
+    arm : str
+    settings : mapping
+        Of `flexarm_sim.simulator.PARAMETERS`.
+    """
+
+    def __init__(self, bench, arm="R", **settings):
+        self.bench = bench
+        self.sim = self.simulator(arm, **settings)
+        self.session, self.sequence = int.from_bytes(os.urandom(4), "little"), 0
+        self._publisher = bench.publisher(ArmState, "arm_state")
+        self.torques = bench.tap(JointTorque, "joint_torque")
+        self.states = bench.tap(CompositeState, "controller/state")
+
+    @staticmethod
+    def simulator(arm, **settings):
+        """A `flexarm_sim.simulator.Simulator` of this process."""
+        values = {"arm": arm, **settings}
+        return simulator.Simulator(check_all(simulator.PARAMETERS, values, {"joints": 1}))
+
+    def restart(self):
+        """A new session from rest."""
+        self.sim.reset()
+        self.session, self.sequence = (self.session + 1) % 2**32, 0
+
+    def state(self, **changes):
+        """The present sample as a message; `changes` replace fields."""
+        writer, sim = StateWriter(self.sim.arm), self.sim
+        writer.head(sim.stamp_ns, self.session, sim.sequence)
+        writer.write("joint_position", sim.position)
+        writer.write("joint_velocity", sim.velocity)
+        writer.write("joint_torque", sim.torque)
+        writer.write("strain", sim.strain)
+        writer.write("modal_amplitude", sim.amplitude)
+        for field, value in changes.items():
+            setattr(writer.message, field, value)
+        return writer.message
+
+    def exchange(self, message):
+        """Publish a state and wait for the torque that answers it, and its controller/state."""
+        key = (message.session, message.sequence)
+        seen, told = len(self.torques.messages), len(self.states.messages)
+
+        def of(messages):
+            return [m for m in messages if (m.session, m.sequence) == key]
+
+        again = 0.0
+
+        def answered():
+            nonlocal again
+            if of(self.torques.messages[seen:]) and of(self.states.messages[told:]):
+                return True
+            if (
+                time.monotonic() > again
+            ):  # as the simulator does: a node may not have been found yet
+                again = time.monotonic() + 0.5
+                self._publisher.publish(message)
+            return False
+
+        self.bench.wait_for(f"a torque that answers state {message.sequence}", answered)
+        return of(self.torques.messages[seen:])[-1], of(self.states.messages[told:])[-1]
+
+    def step(self, **changes):
+        """Exchange the present sample, and advance by the answer; a change may be a function of this."""
+        now = {k: v(self) if callable(v) else v for k, v in changes.items()}
+        torque, state = self.exchange(self.state(**now))
+        enabled = torque.mode == JointTorque.ENABLED
+        self.sim.advance(np.array(torque.torque) if enabled else None)
+        return torque, state
+
+    def until_enabled(self, most=30, **changes):
+        """Step until the torque is enabled; the last answer."""
+        for _ in range(most):
+            torque, state = self.step(**changes)
+            if torque.mode == JointTorque.ENABLED:
+                return torque, state
+        raise AssertionError(f"not enabled after {most} samples: {state.rejected_reason}")
+
+
+class Drive:
+    """Answers the simulator's states with torques, as a controller does."""
+
+    def __init__(self, bench, namespace=""):
+        self.bench = bench
+        self.states = bench.tap(ArmState, f"{namespace}arm_state")
+        self._publisher = bench.publisher(JointTorque, f"{namespace}joint_torque")
+        bench.wait_for("a state", lambda: self.states.newest)
+        self.first()
+
+    def first(self):
+        """The present state."""
+        seen = len(self.states.messages)
+        self.bench.wait_for("the state again", lambda: len(self.states.messages) > seen)
+        self.state = self.states.newest
+        return self.state
+
+    def send(self, **fields):
+        """Publish a torque, whatever it is."""
+        self._publisher.publish(JointTorque(**{"controller_id": 1, **fields}))
+
+    def step(self, torque, /, **changes):
+        """Answer the state; the next one."""
+        fields = {
+            "session": self.state.session,
+            "sequence": self.state.sequence,
+            "mode": JointTorque.ENABLED,
+            "joint_names": ["joint1"],
+            "torque": [torque],
+        }
+        self.send(**{**fields, **changes})
+        wanted = self.state.sequence + 1
+        self.bench.wait_for(f"state {wanted}", lambda: self.states.newest.sequence == wanted)
+        self.state = self.states.newest
+        return self.state
+
+
+# Shared memory -------------------------------------------------------------------------------
+
+
+def segments(pid):
+    """Files of FastDDS in shared memory that a process has open."""
+    found = set()
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/maps").read_text().splitlines():
+            match = re.search(r"(/dev/shm/\S*fastrtps\S*)", line)
+            if match:
+                found.add(Path(match[1]))
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                target = os.readlink(link)
+                if target.startswith("/dev/shm/") and "fastrtps" in target:
+                    found.add(Path(target))
+    return found
+
+
+def abandoned(paths):
+    """Those of `paths` that still exist and that no living process has open."""
+    paths = {p for p in paths if p.exists()}
+    for entry in Path("/proc").iterdir():
+        if paths and entry.name.isdigit():
+            paths -= segments(entry.name)
+    return paths

@@ -1,0 +1,259 @@
+"""Trajectories on the topic, published as users do: reliable, volatile, with stamp 0 or an explicit one."""
+
+import itertools
+import math
+import re
+
+import numpy as np
+import pytest
+from harness import Arm, trajectory
+
+from flexarm_control import profiles
+from flexarm_msgs.msg import CompositeState, JointTorque
+from flexarm_ros.messages import stamp_ns
+
+J = ["joint1"]
+MS = 1_000_000
+PERIOD = 1e-3  # [s]
+
+
+@pytest.fixture(scope="module")
+def loop(shared_bench):
+    """The three nodes in lockstep, paused at 10 ms, with an arm that has limits."""
+    shared_bench.start_loop(
+        {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02},
+        controller={"fast.type": "none"},
+        arm="one_link",
+    )
+    arm = Arm(shared_bench)
+    shared_bench.wait_for("the loop to stand, ready", lambda: arm.ready() and arm.paused_at())
+    return arm
+
+
+@pytest.fixture
+def arm(loop, counter=itertools.count(1)):  # noqa: B008
+    """The loop in a new session, paused at 10 ms, READY, nothing refused."""
+    # An accepted trajectory clears the reason of the last refusal, the reset then forgets it.
+    if not loop.paused_at():
+        loop.reset()
+    loop.offer(trajectory(J, (10.0 + 0.001 * next(counter), [0.0])))
+    loop.reset()
+    assert loop.state.supervisor_state == CompositeState.READY
+    assert loop.state.rejected_reason == ""
+    return loop
+
+
+def run(arm, seconds):
+    """Run on for so long, then pause; the samples of the session by stamp [ns]."""
+    end = arm.now + round(seconds * 1e9)
+    arm.pause(False)
+    arm.wait_until(end)
+    arm.stand()
+    return arm.samples()
+
+
+def column(samples, field, begin=0, end=2**63):
+    """A field of joint1 over the samples from begin to end [ns]."""
+    return np.array([getattr(m, field)[0] for s, m in samples.items() if begin <= s <= end])
+
+
+# Refusals --------------------------------------------------------------------------------------
+
+NAN, INF = math.nan, math.inf
+REFUSED = {
+    "wrong joint": (trajectory(["jointX"], (1.0, [0.1])), "'jointX', which is no joint"),
+    "no joints": (trajectory([], (1.0, [])), "lacks 'joint1'"),
+    "extra joint": (trajectory(["joint1", "joint2"], (1.0, [0.1, 0.1])), "'joint2', which is no"),
+    "joint twice": (trajectory(["joint1", "joint1"], (1.0, [0.1, 0.1])), "'joint1' 2 times"),
+    "too many positions": (
+        trajectory(J, (1.0, [0.1, 0.2])),
+        r"points\[0\]\.positions has length 2",
+    ),
+    "no positions": (trajectory(J, (1.0, [])), r"points\[0\]\.positions is empty"),
+    "too many velocities": (
+        trajectory(J, (1.0, [0.1], [0.0]), (2.0, [0.1], [0.0, 0.0])),
+        r"points\[1\]\.velocities has length 2",
+    ),
+    "velocities not everywhere": (
+        trajectory(J, (1.0, [0.1], [0.0]), (2.0, [0.1])),
+        r"points\[1\] has no velocities",
+    ),
+    "accelerations alone": (trajectory(J, (1.0, [0.1], [], [0.0])), "accelerations but no velo"),
+    "NaN position": (trajectory(J, (1.0, [NAN])), r"points\[0\]\.positions of joint joint1 is nan"),
+    "NaN velocity": (trajectory(J, (1.0, [0.1], [NAN])), r"\.velocities of joint joint1 is nan"),
+    "inf position": (
+        trajectory(J, (1.0, [0.1]), (2.0, [INF])),
+        r"points\[1\]\.positions of joint joint1 is inf",
+    ),
+    "inf acceleration": (
+        trajectory(J, (1.0, [0.1], [0.0], [-INF])),
+        r"\.accelerations of joint joint1 is -inf",
+    ),
+    "equal times": (
+        trajectory(J, (1.0, [0.1]), (1.0, [0.2])),
+        r"points\[1\]\.time_from_start is 1 s, not later than points\[0\]",
+    ),
+    "times that go back": (
+        trajectory(J, (2.0, [0.1]), (1.0, [0.2])),
+        r"points\[1\]\.time_from_start is 1 s, not later than points\[0\] at 2 s",
+    ),
+    "negative time": (trajectory(J, (-1.0, [0.1])), r"points\[0\]\.time_from_start is -1 s"),
+    "no points": (trajectory(J), "empty trajectory"),
+    "past stamp": (trajectory(J, (1.0, [0.1]), stamp=5 * MS), r"starts at 0\.005 s.* in the past"),
+    "beyond the position limit": (
+        trajectory(J, (5.0, [3.5])),
+        r"position of joint joint1 is 3\.5 rad, beyond its limit of 3\.14 rad",
+    ),
+    "below the position limit": (
+        trajectory(J, (5.0, [-3.2])),
+        r"position of joint joint1 is -3\.2 rad, beyond its limit of -3\.14 rad",
+    ),
+    "beyond the velocity limit": (
+        trajectory(J, (1.0, [0.1], [11.0]), (2.0, [0.2], [0.0])),
+        "velocity of joint joint1 is 11 rad/s, beyond its limit of 10 rad/s",
+    ),
+    "too fast between points": (
+        trajectory(J, (1.0, [0.0]), (1.1, [3.0])),
+        "joint joint1 would move at 30 rad/s on average",
+    ),
+    "too fast to the first point": (
+        trajectory(J, (0.1, [3.0])),
+        "joint joint1 would move at 30 rad/s on average",
+    ),
+    "moving at the end": (
+        trajectory(J, (1.0, [0.1], [0.5])),
+        "last point's velocity of joint joint1",
+    ),
+    "a jump at time 0": (trajectory(J, (0.0, [1.0])), "1 rad from the reference of joint joint1"),
+    "effort": (trajectory(J, (1.0, [0.1], [], [], [1.0])), r"points\[0\]\.effort is not empty"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_trajectory_that_cannot_be_followed_is_refused_with_a_reason_and_the_arm_holds(arm, case):
+    message, reason = REFUSED[case]
+    accepted = arm.state.accepted_trajectory_id
+    assert re.search(reason, arm.refused(message)), arm.state.rejected_reason
+    begin = arm.now
+    samples = run(arm, 0.02)
+    assert arm.state.accepted_trajectory_id == accepted
+    assert arm.state.supervisor_state == CompositeState.READY
+    for field in ("reference_position", "reference_velocity", "reference_acceleration"):
+        assert set(column(samples, field, begin)) == {0.0}, field
+    modes = {
+        m.mode for m in arm.torques.messages if m.session == arm.state.session and m.sequence > 10
+    }
+    assert modes == {JointTorque.ENABLED}
+
+
+def test_a_refused_trajectory_leaves_the_one_that_is_followed(arm):
+    quintic = profiles.quintic(0.0, 0.5, 0.4)
+    number = arm.offer(trajectory(J, (0.4, [0.5], [0.0], [0.0])))
+    start = arm.now + MS  # the first sample after the pause
+    run(arm, 0.1)
+    assert "nan" in arm.refused(trajectory(J, (1.0, [NAN])))
+    samples = run(arm, 0.4)
+    assert arm.state.accepted_trajectory_id == number
+    follows(samples, start, quintic, 0.4)
+
+
+def follows(samples, start, profile, duration, atol=1e-12):
+    """Every sample from the start on has the profile's reference, and holds its end."""
+    stamps = [s for s in samples if s >= start]
+    t = np.minimum((np.array(stamps) - start) * 1e-9, duration)
+    for field, of in (
+        ("reference_position", profile.position),
+        ("reference_velocity", profile.velocity),
+        ("reference_acceleration", profile.acceleration),
+    ):
+        expected = np.array([np.ravel(of(x))[0] for x in t])
+        if field != "reference_position":
+            expected[t >= duration] = 0.0
+        np.testing.assert_allclose(column(samples, field, start), expected, rtol=0, atol=atol * 1e3)
+
+
+# Acceptance ------------------------------------------------------------------------------------
+
+
+def test_stamp_0_starts_at_the_first_state_after_it_arrived(arm):
+    arm.offer(trajectory(J, (0.2, [0.3], [0.0], [0.0])))
+    standing = arm.now
+    samples = run(arm, 0.3)
+    assert column(samples, "reference_position", standing, standing) == [0.0]
+    follows(samples, standing + MS, profiles.quintic(0.0, 0.3, 0.2), 0.2)
+
+
+def test_an_explicit_stamp_starts_there_to_the_nanosecond(arm):
+    start = arm.now + 50 * MS + 300_000  # between two samples
+    arm.offer(trajectory(J, (0.2, [0.3], [0.0], [0.0]), stamp=start))
+    assert arm.state.supervisor_state == CompositeState.READY
+    samples = run(arm, 0.3)
+    assert set(column(samples, "reference_position", 0, start)) == {0.0}
+    follows(samples, start, profiles.quintic(0.0, 0.3, 0.2), 0.2)
+    tracking = [s for s, m in samples.items() if m.supervisor_state == CompositeState.TRACKING]
+    assert tracking[0] - start < MS and start + 200 * MS - tracking[-1] <= MS
+
+
+def test_a_single_point_with_positions_only_ramps_there_and_is_held(arm):
+    arm.offer(trajectory(J, (0.1, [0.05])))
+    start = arm.now + MS
+    samples = run(arm, 0.3)
+    ramp = column(samples, "reference_position", start, start + 100 * MS)
+    np.testing.assert_allclose(ramp, np.linspace(0.0, 0.05, 101), rtol=0, atol=1e-12)
+    held = column(samples, "reference_position", start + 100 * MS)
+    assert held.size > 150 and set(held) == {0.05}
+    assert set(column(samples, "reference_velocity", start + 100 * MS)) == {0.0}
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+
+
+def test_an_identical_repeat_does_not_restart_the_motion_under_way_or_after_its_end(arm):
+    motion = trajectory(J, (0.3, [0.4], [0.0], [0.0]))
+    number = arm.offer(motion)
+    start = arm.now + MS
+
+    def repeat(fence):
+        # On one publisher the order is kept: when the last one is refused, the repeats have been seen.
+        for _ in range(3):
+            arm.publish_trajectory(motion)
+        arm.refused(trajectory([fence], (1.0, [0.0])))
+
+    run(arm, 0.1)
+    repeat("fence1")
+    run(arm, 0.1)
+    repeat("fence2")
+    run(arm, 0.2)
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    repeat("fence3")
+    samples = run(arm, 0.05)
+    assert arm.state.accepted_trajectory_id == number
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    follows(samples, start, profiles.quintic(0.0, 0.4, 0.3), 0.3)
+
+
+@pytest.mark.parametrize("fields", (2, 3), ids=("positions, velocities", "and accelerations"))
+@pytest.mark.parametrize("stamped", (True, False), ids=("explicit stamp", "stamp 0"))
+def test_a_new_trajectory_takes_over_with_a_continuous_reference_velocity(arm, fields, stamped):
+    def point(at, position):
+        return (at, *([position], [0.0], [0.0])[:fields])
+
+    first = arm.offer(trajectory(J, point(4.0, 2.0)))
+    arm.pause(False)
+    arm.bench.wait_for("the motion", lambda: arm.state.reference_velocity[0] > 0.5)
+    arm.stand()
+    assert arm.state.reference_velocity[0] > 0.5
+    start = arm.now + 10 * MS if stamped else 0
+    goal = arm.state.reference_position[0] + 0.1
+    assert arm.offer(trajectory(J, point(0.3, goal), stamp=start)) == first + 1
+    samples = run(arm, 0.4)
+    velocity = column(samples, "reference_velocity")
+    acceleration = np.abs(column(samples, "reference_acceleration")).max()
+    assert np.abs(np.diff(velocity)).max() <= 1.01 * acceleration * PERIOD
+    assert np.abs(np.diff(velocity)).max() < 0.1  # a restart from rest would jump by more than 0.5
+    assert arm.state.reference_position[0] == goal
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+
+
+def test_the_stamps_of_all_samples_are_one_period_apart(arm):
+    samples = run(arm, 0.1)
+    stamps = [stamp_ns(m.header.stamp) for m in samples.values()]
+    assert set(np.diff(stamps)) == {MS}
