@@ -529,9 +529,13 @@ def segments(pid):
     return found
 
 
+#: FastDDS gives this port to all processes of the machine, whatever their domain: not one node's to leave.
+SHARED_PORT = SHM / "fastrtps_port7002"
+
+
 def abandoned(paths):
     """Those of `paths` that still exist and that no living process has open."""
-    paths = {p for p in paths if p.exists()}
+    paths = {p for p in paths if p.exists() and not p.name.startswith(SHARED_PORT.name)}
     for entry in Path("/proc").iterdir():
         if paths and entry.name.isdigit():
             paths -= segments(entry.name)
