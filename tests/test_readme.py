@@ -1,5 +1,6 @@
 """Every command of the README: what it starts exists, what it publishes moves the arm."""
 
+import contextlib
 import os
 import re
 import shlex
@@ -88,19 +89,26 @@ def test_parameter_tables_are_those_of_the_declarations():
     )
 
 
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory):
-    """The three nodes, started by the README's own commands, in real time."""
-    with own_domain() as domain, Processes(domain, tmp_path_factory.mktemp("log")) as processes:
-        for command in starting("./flexarm", "run"):
+@contextlib.contextmanager
+def started(commands, directory):
+    """The three nodes, by the README's own commands, in real time."""
+    with own_domain() as domain, Processes(domain, directory) as processes:
+        for command in commands:
             _, _, package, name, *rest = words_of(command)
-            if "--params-file" in rest:
-                rest = [str(ROOT / w) if w.startswith("config/") else w for w in rest]
-                processes.start(name, [executable(package, name), *rest])
+            rest = [w.replace("config/", f"{ROOT}/config/") for w in rest]
+            processes.start(name, [executable(package, name), *rest])
         assert set(processes.running) == {"simulator", "observer", "controller"}
         with LockstepRun(processes) as line:
             line.wait_for("the nodes", lambda: line.recorder.complete() and line.ready())
             yield line
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """The paper's arm."""
+    commands = [c for c in starting("./flexarm", "run") if "--params-file" in c]
+    with started(commands, tmp_path_factory.mktemp("log")) as line:
+        yield line
 
 
 def reference(line):
@@ -161,18 +169,33 @@ def test_param_set_example_is_taken(arm, command):
     assert reference(arm).supervisor_state != CompositeState.INACTIVE
 
 
-def test_publish_command_reaches_the_controller(arm):
-    (command,) = starting("./flexarm", "publish")
-    before = arm.accepted()
+def publish(line, command):
+    """Run a publish command of the README beside a running controller."""
+    before = line.accepted()
     done = subprocess.run(
         [sys.executable, "-m", "flexarm_bringup.cli", *words_of(command)[1:]],
-        env={**os.environ, "ROS_DOMAIN_ID": str(arm.processes.domain)},
+        cwd=ROOT,
+        env={**os.environ, "ROS_DOMAIN_ID": str(line.processes.domain)},
         capture_output=True,
         text=True,
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
-    arm.wait_for("acceptance", lambda: arm.accepted() > before)
+    line.wait_for("acceptance", lambda: line.accepted() > before)
+
+
+def test_publish_command_reaches_the_controller_even_while_the_arm_moves(arm):
+    command = starting("./flexarm", "publish")[0]
+    publish(arm, command)
+    publish(arm, command.replace("1.57", "0.3"))
+
+
+def test_commands_of_your_own_arm_move_it(tmp_path):
+    commands = [c for c in starting("./flexarm", "run") if "--params-file" not in c]
+    with started(commands, tmp_path) as line:
+        publish(line, starting("./flexarm", "publish")[1])
+        line.wait_for("the end", lambda: abs(reference(line).reference_position[0] - 1.0) < 1e-9)
+        line.wait_for("the joint", lambda: abs(reference(line).position_error[0]) < 0.02)
 
 
 def test_own_law_example_is_found_by_name_and_runs(tmp_path):

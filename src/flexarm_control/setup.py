@@ -17,8 +17,8 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "observer = flexarm_control.nodes.observer:main",
-            "controller = flexarm_control.nodes.controller:main",
+            "observer = flexarm_control.nodes:start_observer",
+            "controller = flexarm_control.nodes:start_controller",
         ],
         "flexarm.slow_laws": [
             "none = flexarm_control.slow.none:NoSlowLaw",

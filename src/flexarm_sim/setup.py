@@ -17,7 +17,7 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "simulator = flexarm_sim.nodes.simulator:main",
+            "simulator = flexarm_sim.nodes:start_simulator",
         ],
     },
 )

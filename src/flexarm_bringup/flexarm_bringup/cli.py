@@ -102,6 +102,9 @@ def main(argv=None):
     except FlexarmError as error:
         print(f"flexarm {options.command}: {error}", file=sys.stderr)
         sys.exit(1)
+    except OSError as error:
+        print(f"flexarm {options.command}: {error}", file=sys.stderr)
+        sys.exit(1)
     except KeyboardInterrupt:
         print("\nstopped", file=sys.stderr)
         sys.exit(130)

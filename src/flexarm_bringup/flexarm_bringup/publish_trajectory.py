@@ -117,14 +117,15 @@ def publish(options, ros_args=None):
         message = trajectory_message(
             names, profile_of(options, before.reference_position), options.points
         )
+        if options.profile == "quintic" and not options.start:
+            # The controller's own quintic to the last point begins at its reference, moving or not.
+            message.points = message.points[-1:]
         line.publisher.publish(message)
 
         def answered():
             now = line.state
-            return (now.accepted_trajectory_id, now.rejected_reason) != (
-                before.accepted_trajectory_id,
-                before.rejected_reason,
-            )
+            refused = now.rejected_reason not in ("", before.rejected_reason)
+            return now.accepted_trajectory_id != before.accepted_trajectory_id or refused
 
         last = f"; it last refused: {before.rejected_reason}" if before.rejected_reason else ""
         line.wait_for(

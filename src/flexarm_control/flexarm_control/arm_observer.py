@@ -142,7 +142,7 @@ class ArmObserver:
                 raise MessageError(
                     f"strain is given, but the arm file of {arm.name} has no gauges to map it"
                 )
-            check_finite(sample.strain, arm.gauge_names, "strain")
+            check_finite(sample.strain, arm.gauge_names, "strain", LARGEST_STRAIN)
         if sample.rate is not None:
             check_finite(sample.rate, arm.mode_names, "modal_rate")
 
@@ -154,12 +154,14 @@ class ArmObserver:
         return slope + (self.velocity - slope) * np.exp(-self.bandwidth * dt)
 
 
+#: No arm strains by a tenth: such a number is in microstrain, or a broken bridge's [-].
+LARGEST_STRAIN = 0.1
 #: Values beyond this are no measurement of an arm (rad, m, strain, and their rates).
 HUGE = 1e6
 
 
-def check_finite(values, names, field):
+def check_finite(values, names, field, largest=HUGE):
     """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
-    if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
-        i = int(np.argmin(np.abs(values) < HUGE))
+    if not np.abs(values).max(initial=0.0) < largest:  # false for NaN too
+        i = int(np.argmin(np.abs(values) < largest))
         raise MessageError(f"{field} of {names[i]} is {values[i]}: not a usable measurement")

@@ -383,6 +383,11 @@ def _gauge(s, links):
     distance = s.number("surface_distance", "length")
     if distance == 0.0:
         raise ArmFileError(s.at("surface_distance"), "0: a gauge on the neutral axis sees nothing")
+    if abs(distance) > 0.5 * links[link].length:
+        raise ArmFileError(
+            s.at("surface_distance"),
+            f"{distance:.6g} m from the neutral axis of a link {links[link].length:.6g} m long: in mm?",
+        )
     gauge = Gauge(
         name=name,
         link=link,

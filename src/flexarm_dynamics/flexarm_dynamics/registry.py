@@ -1,6 +1,7 @@
 """Components found by name through Python entry points, so that a user's package adds one."""
 
 import difflib
+import warnings
 from functools import cache
 from importlib.metadata import entry_points
 
@@ -11,6 +12,20 @@ from .errors import UnknownComponentError
 def names(group):
     """Sorted names that installed packages provide in an entry-point group."""
     return tuple(sorted({e.name for e in entry_points(group=group)}))
+
+
+def importable(group):
+    """Name to class of what can be imported; one broken package does not take the others with it.
+
+    What can't be imported is an error when it is asked for, by `find`.
+    """
+    found = {}
+    for name in names(group):
+        try:
+            found[name] = find(group, name)
+        except UnknownComponentError as error:
+            warnings.warn(str(error), stacklevel=2)
+    return found
 
 
 @cache

@@ -211,7 +211,11 @@ def run(node_class, args=None):
         signal.signal(number, lambda *_: stopped.append(True))
     node = None
     try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        except RuntimeError as error:  # what rcl says of a command line or parameter file
+            print(f"{node_class.__name__}: {error}", file=sys.stderr)
+            return 1
         node = node_class()
         if not node.autostart():
             return 1

@@ -3,6 +3,7 @@
 import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from time import perf_counter
 
 from rclpy.duration import Duration
@@ -53,13 +54,13 @@ def parameter_groups():
     """Declared parameters of this node, by prefix."""
 
     def laws(group):
-        return merge(*(registry.find(group, name).PARAMETERS for name in registry.names(group)))
+        return merge(*(law.PARAMETERS for law in registry.importable(group).values()))
 
     common = (*arm_controller.PARAMETERS, arm_controller.START_TOLERANCE, STATE_TIMEOUT)
     return {
         "": (ARM, *common),
-        "slow.": (SLOW_TYPE, *laws(SLOW)),
-        "fast.": (FAST_TYPE, *laws(FAST)),
+        "slow.": (replace(SLOW_TYPE, choices=registry.names(SLOW)), *laws(SLOW)),
+        "fast.": (replace(FAST_TYPE, choices=registry.names(FAST)), *laws(FAST)),
     }
 
 
@@ -88,7 +89,8 @@ class ControllerNode(ArmNode):
         self._torque = TorqueWriter(arm, int.from_bytes(os.urandom(4), "little"))
         self._state = CompositeStateWriter(self.model)
         self._limits = self._trajectory_limits()
-        self._samples, self._samples_before, self._saturations = 0, 0, 0
+        self._samples, self._samples_before = 0, 0
+        self._saturations, self._saturations_before = 0, 0
         self._ticks, self._seen = 0, False
         self._make_topics()
 
@@ -155,7 +157,10 @@ class ControllerNode(ArmNode):
             return
         self._seen = False
         timeout = self.parameters["state_timeout"]
-        self._disable(f"no arm_state_estimate for {timeout:g} s: is the observer running?")
+        self._disable(
+            f"no arm_state_estimate for {timeout:g} s: are the driver (or simulator) and the observer"
+            " running?"
+        )
 
     def _disable(self, reason):
         self.core.disable(reason)
@@ -203,7 +208,10 @@ class ControllerNode(ArmNode):
         law = registry.find(group, values["type"])
         declared = {p.name for p in law.PARAMETERS}
         chosen = {k: v for k, v in values.items() if k in declared}
-        return composite.design_law(group, values["type"], self.model, chosen)
+        made = composite.design_law(group, values["type"], self.model, chosen)
+        for warning in getattr(made, "warnings", tuple)():
+            self.get_logger().warning(warning)
+        return made
 
     def _changed(self, names):
         if names & {p.name for p in arm_controller.PARAMETERS}:
@@ -237,6 +245,12 @@ class ControllerNode(ArmNode):
 
     # Life cycle ------------------------------------------------------------------------------
 
+    def start(self):
+        slow, fast = self.parameters["slow.type"], self.parameters["fast.type"]
+        self.get_logger().info(
+            f"arm {self.arm.name}, slow {slow}, fast {fast}: torque with the first valid state"
+        )
+
     def stop(self):
         self.core.disable("the controller was stopped")
         self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
@@ -249,6 +263,8 @@ class ControllerNode(ArmNode):
 
     def diagnose(self):
         rate, self._samples_before = self._samples - self._samples_before, self._samples
+        saturated = self._saturations - self._saturations_before
+        self._saturations_before = self._saturations
         core = self.core
         values = {
             "state": core.state.name,
@@ -262,6 +278,8 @@ class ControllerNode(ArmNode):
             return OK, "not active", values
         if core.state == Supervisor.INACTIVE:
             return ERROR, core.reason or "no arm_state_estimate yet: start the observer", values
+        if saturated:
+            return WARN, f"torque at its limit in {saturated} of {rate} samples", values
         if core.reason:
             return WARN, core.reason, values
         return OK, "", values

@@ -1,6 +1,7 @@
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
 import sys
+from dataclasses import replace
 
 from flexarm_control import arm_observer, composite
 from flexarm_control.samples import ArmSample
@@ -24,11 +25,10 @@ TYPE = Parameter(
 
 def parameter_groups():
     """Declared parameters of this node, by prefix."""
-    laws = [
-        registry.find(arm_observer.OBSERVERS, name).PARAMETERS
-        for name in registry.names(arm_observer.OBSERVERS)
-    ]
-    return {"": (ARM,), "observer.": (TYPE, *arm_observer.PARAMETERS, *merge(*laws))}
+    group = arm_observer.OBSERVERS
+    laws = [law.PARAMETERS for law in registry.importable(group).values()]
+    kind = replace(TYPE, choices=registry.names(group))
+    return {"": (ARM,), "observer.": (kind, *arm_observer.PARAMETERS, *merge(*laws))}
 
 
 class ObserverNode(ArmNode):
@@ -50,6 +50,7 @@ class ObserverNode(ArmNode):
         self._sample = ArmSample(len(arm.joints), len(arm.modes), len(arm.gauges))
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
         self._samples, self._refused, self._samples_before = 0, 0, 0
+        self._refused_before, self._refusal = 0, ""
         options = qos.overridable()
         self._estimate_pub = self.make_publisher(
             ArmState, "arm_state_estimate", qos.LINE, qos_overriding_options=options
@@ -71,10 +72,15 @@ class ObserverNode(ArmNode):
         return arm_observer.design_observer(name, self.model, values)
 
     def _changed(self, names):
-        """Swap in a new observer; it starts afresh, and the controller waits until it has converged."""
+        """Swap in a new observer, which goes on from the old one's estimate."""
         self.core.bandwidth = self.parameters["observer.joint_velocity_bandwidth"]
         if names - {"observer.joint_velocity_bandwidth"}:
-            self.core.observer = self._design()
+            observer = self._design()
+            observer.resume(self.core.observer)
+            self.core.observer = observer
+
+    def start(self):
+        self.get_logger().info(f"arm {self.arm.name}, observer {self.parameters['observer.type']}")
 
     def _on_state(self, msg):
         if not self.active:
@@ -85,6 +91,7 @@ class ObserverNode(ArmNode):
             known = core.step(sample)
         except MessageError as error:
             self._refused += 1
+            self._refusal = str(error)
             self.report(f"arm_state {msg.sequence}: {error}")
             self._forward_unknown(msg)
             return
@@ -124,8 +131,11 @@ class ObserverNode(ArmNode):
             "samples refused": self._refused,
             "converged": self.core.observer.converged,
         }
+        refused, self._refused_before = self._refused - self._refused_before, self._refused
         if not self.active:
             return OK, "not active", values
+        if refused:
+            return ERROR, f"{refused} states refused: {self._refusal}", values
         if rate == 0:
             return ERROR, "no usable arm_state: start the simulator or driver", values
         if not self.core.observer.converged:

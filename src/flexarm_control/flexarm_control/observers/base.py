@@ -41,10 +41,16 @@ class Observer(ABC):
         self.innovation = np.zeros(0)
         self.covariance_diagonal = np.zeros(0)
         self.converged = False
+        self._elapsed = -1.0  # [s] since the first sample; negative before it
 
     def reset(self):
         """Forget the past; the next sample is the first."""
-        self.converged = False
+        self.converged, self._elapsed = False, -1.0
+
+    def resume(self, other):
+        """Go on from another observer's estimate: a redesign does not begin anew."""
+        self.amplitude[:], self.rate[:] = other.amplitude, other.rate
+        self.converged, self._elapsed = other.converged, other._elapsed
 
     @abstractmethod
     def update(self, sample, dt):

@@ -40,11 +40,6 @@ class FilteredDerivative(Observer):
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
         self.bandwidth = self.parameters["bandwidth"]
-        self._elapsed = -1.0
-
-    def reset(self):
-        super().reset()
-        self._elapsed = -1.0
 
     def update(self, sample, dt):
         if self._elapsed < 0.0:

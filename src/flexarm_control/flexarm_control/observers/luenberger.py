@@ -16,7 +16,7 @@ The amplitudes are measured, the rates are predicted and corrected by the predic
 
 with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`, which leaves the error
 :math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes, whatever the time step up to a quarter period of the
-fastest mode; after a longer gap the observer starts afresh.
+fastest mode. Over a longer gap (lost samples) the rates are predicted and not corrected, L = 0.
 
 The joint torque is the one that was applied, from the sample. What (6) has in g2, friction and gravity, goes
 with it: u stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
@@ -55,14 +55,9 @@ class Luenberger(Observer):
         super().__init__(model, parameters)
         self.pole = self.parameters["pole"]
         self._designs = {}
-        self._elapsed = -1.0
         self.innovation = np.zeros(model.n_modes)
         # Beyond a quarter period of the fastest mode the amplitudes no longer tell its rate: Phi12 turns singular.
         self._longest = 0.5 * np.pi / model.frequencies()[-1]
-
-    def reset(self):
-        super().reset()
-        self._elapsed = -1.0
 
     def design(self, dt, q):
         """Transition of (11) over dt and the gain L; at rest, in configuration q.
@@ -83,6 +78,8 @@ class Luenberger(Observer):
         flow = expm(big * dt)
         Phi, Gamma = flow[: 2 * m, : 2 * m], flow[: 2 * m, 2 * m :]
         decay = np.exp(-self.pole * dt)
+        if dt > self._longest:
+            return Phi, Gamma, np.zeros((m, m))
         L = np.linalg.solve(Phi[:m, m:].T, (Phi[m:, m:] - decay * np.eye(m)).T).T
         return Phi, Gamma, L
 
@@ -99,8 +96,7 @@ class Luenberger(Observer):
         return found
 
     def update(self, sample, dt):
-        if self._elapsed < 0.0 or dt > self._longest:
-            self.converged = False
+        if self._elapsed < 0.0:
             self.amplitude[:] = sample.amplitude
             self.rate[:] = 0.0
             self.innovation[:] = 0.0

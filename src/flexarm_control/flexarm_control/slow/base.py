@@ -47,6 +47,10 @@ class SlowLaw(ABC):
         self.model = model
         self.parameters = dict(parameters)
 
+    def warnings(self):
+        """What a person should know of this law on this arm; each a sentence."""
+        return ()
+
     @abstractmethod
     def torque(self, q, qd, reference, terms):
         """Slow torque.

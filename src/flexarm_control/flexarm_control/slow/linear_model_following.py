@@ -49,6 +49,14 @@ class LinearModelFollowing(SlowLaw):
             self._cached = (terms.M, np.linalg.inv(B))
         return self._cached[1]
 
+    def warnings(self):
+        if any(self.model.arm.gravity):
+            return (
+                "slow.type linear_model_following does not compensate gravity: the arm sags; use"
+                " model_following",
+            )
+        return ()
+
     def torque(self, q, qd, reference, terms):
         v = reference.position - q
         v *= self.kp

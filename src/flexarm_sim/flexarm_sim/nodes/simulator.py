@@ -148,6 +148,8 @@ class SimulatorNode(ArmNode):
             self.sim.settings["initial_position"] = self.parameters["initial_position"]
 
     def start(self):
+        mode = "lockstep" if self._lockstep else "real time"
+        self.get_logger().info(f"arm {self.arm.name}, {mode}, {self.parameters['rate']:g} Hz")
         self._publish()
 
     # Torque in, state out --------------------------------------------------------------------
@@ -186,6 +188,8 @@ class SimulatorNode(ArmNode):
         if not fresh and self._answered is not None:
             self._late += 1
         applied = self._answer if fresh else None
+        if applied is None and not self._safe:
+            self.report("no fresh torque: the safe action is applied")
         self._safe = applied is None
         self._advance(applied)
         self._publish()
