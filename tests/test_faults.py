@@ -487,7 +487,7 @@ def test_when_the_observer_is_killed_the_controller_disables_after_state_timeout
     bench.wait_for(
         "an error on /diagnostics",
         lambda: any(
-            level == DiagnosticStatus.ERROR and "is the observer running?" in message
+            level == DiagnosticStatus.ERROR and "no arm_state_estimate for" in message
             for level, message in levels(bench, "controller", since)
         ),
     )
