@@ -1,7 +1,7 @@
 """The paper's case study: its runs, what is reported of them, and the table beside print.
 
-Nothing here imports ROS but `run_nodes`, which starts the three executables; `run_without_ros` calls the very
-objects that the nodes call.
+Nothing here imports ROS but `start_nodes` and `run_nodes`, which run the three executables, and `_relay`;
+`run_without_ros` calls the very objects that the nodes call.
 """
 
 import json

@@ -24,6 +24,10 @@ class FastLaw(ABC):
         self.model = model
         self.parameters = dict(parameters)
 
+    def warnings(self):
+        """What a person should know of this law on this arm; each a sentence."""
+        return ()
+
     @abstractmethod
     def torque(self, z_f):
         """Fast torque, shape (n,) [N m], for z_f = z - z_bar, shape (2m,) [m, m/s]."""

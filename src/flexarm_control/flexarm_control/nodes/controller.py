@@ -209,7 +209,7 @@ class ControllerNode(ArmNode):
         declared = {p.name for p in law.PARAMETERS}
         chosen = {k: v for k, v in values.items() if k in declared}
         made = composite.design_law(group, values["type"], self.model, chosen)
-        for warning in getattr(made, "warnings", tuple)():
+        for warning in made.warnings():
             self.get_logger().warning(warning)
         return made
 
