@@ -23,8 +23,8 @@ setup(
     zip_safe=False,
     entry_points={
         "console_scripts": [
-            "flexarm = flexarm_bringup.cli:main",
-            "publish_trajectory = flexarm_bringup.publish_trajectory:main",
+            "flexarm = flexarm_bringup.cli:entry",
+            "publish_trajectory = flexarm_bringup.publish_trajectory:entry",
         ],
     },
 )

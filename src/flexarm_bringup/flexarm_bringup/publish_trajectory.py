@@ -159,5 +159,12 @@ def main(args=None):
     sys.exit(0)
 
 
+def entry():
+    """Entry point of the process."""
+    from flexarm_ros.start import leave_after
+
+    leave_after(main)
+
+
 if __name__ == "__main__":
-    main()
+    entry()

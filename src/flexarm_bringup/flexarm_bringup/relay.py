@@ -162,4 +162,6 @@ def measure(arm, log_directory, count=3000, recorder=None):
 
 
 if __name__ == "__main__":
-    main()
+    from flexarm_ros.start import leave_after
+
+    leave_after(main)

@@ -1,12 +1,44 @@
-"""Starts a node's process: a signal ends it cleanly from the first moment, while it still imports."""
+"""Starts and ends a node's process: a signal ends it cleanly from the first moment, while it still imports."""
 
+import faulthandler
 import importlib
 import os
 import signal
+import sys
 
 
 def start(module):
     """Import a node's module and call its `main`."""
+    faulthandler.enable()  # a crash in the middleware says where
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
     importlib.import_module(module).main()
+
+
+def leave(code):
+    """End this process, whose nodes are destroyed and whose context is shut down, with an exit code.
+
+    Without the destructors of the middleware's libraries: under load Fast DDS was seen to corrupt its heap or
+    to hang in them, some three times in a thousand exits, after the interpreter had finished.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError, AttributeError):
+            pass  # nobody reads it any more
+    os._exit(code)
+
+
+def leave_after(main):
+    """Run a `main` of a process that may use the middleware, then `leave` with the code it exits with."""
+    code = 0
+    try:
+        main()
+    except SystemExit as error:
+        code = error.code
+        if isinstance(code, str):
+            print(code, file=sys.stderr)
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = 1
+    leave(1 if isinstance(code, str) else code or 0)

@@ -1,7 +1,6 @@
 """Controller node: `arm_state_estimate` and `joint_trajectory` in, `joint_torque` and `controller/state` out."""
 
 import os
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
@@ -22,6 +21,7 @@ from flexarm_ros import qos
 from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter, stamp_ns
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
+from flexarm_ros.start import leave
 
 SLOW_TYPE = Parameter(
     "type",
@@ -287,7 +287,7 @@ class ControllerNode(ArmNode):
 
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control controller``."""
-    sys.exit(run(ControllerNode, args))
+    leave(run(ControllerNode, args))
 
 
 if __name__ == "__main__":

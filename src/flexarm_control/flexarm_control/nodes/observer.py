@@ -1,6 +1,5 @@
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
-import sys
 from dataclasses import replace
 
 from flexarm_control import arm_observer, composite
@@ -13,6 +12,7 @@ from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
+from flexarm_ros.start import leave
 
 TYPE = Parameter(
     "type",
@@ -145,7 +145,7 @@ class ObserverNode(ArmNode):
 
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control observer``."""
-    sys.exit(run(ObserverNode, args))
+    leave(run(ObserverNode, args))
 
 
 if __name__ == "__main__":

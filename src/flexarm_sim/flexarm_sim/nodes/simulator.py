@@ -1,7 +1,6 @@
 """Simulator node: `joint_torque` in, `arm_state` and `joint_states` out; in lockstep or in real time."""
 
 import os
-import sys
 from array import array
 
 from sensor_msgs.msg import JointState
@@ -14,6 +13,7 @@ from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
 from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
+from flexarm_ros.start import leave
 from flexarm_sim import simulator
 
 #: Sequence numbers on the topics are uint32.
@@ -303,7 +303,7 @@ class SimulatorNode(ArmNode):
 
 def main(args=None):
     """Entry point of ``ros2 run flexarm_sim simulator``."""
-    sys.exit(run(SimulatorNode, args))
+    leave(run(SimulatorNode, args))
 
 
 if __name__ == "__main__":
