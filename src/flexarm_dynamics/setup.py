@@ -17,6 +17,7 @@ setup(
     zip_safe=False,
     entry_points={
         "flexarm.models": [
+            "chain = flexarm_dynamics.chain:Chain",
             "one_link = flexarm_dynamics.one_link:OneLink",
             "paper_appendix = flexarm_dynamics.paper_appendix:PaperAppendix",
         ],

@@ -138,7 +138,9 @@ class Arm:
     gauges: tuple = ()
     observed_modes: tuple = ()  # names; all of the arm's modes unless the file says otherwise
     gravity: tuple = (0.0, 0.0, 0.0)  # [m/s^2] in the base frame
-    model: str = "one_link"  # name of the model class, found through entry points
+    foreshortening: bool = False  # links keep their length: stiffer when spun
+    finite_slope: bool = False  # and their curvature and tips' angles hold for large slopes
+    model: str = "chain"  # name of the model class, found through entry points
     model_options: dict = field(default_factory=dict)  # what that class alone understands, SI
     description: str = ""
     source: str = ""

@@ -151,6 +151,12 @@ class _Section:
             raise ArmFileError(self.at(key), f"{value!r} is not one of {', '.join(choices)}{hint}")
         return value
 
+    def flag(self, key):
+        value = self.raw(key, False)
+        if not isinstance(value, bool):
+            raise ArmFileError(self.at(key), f"{_kind(value)} is neither true nor false")
+        return value
+
     def name(self):
         value = self.text("name")
         if not value.strip():
@@ -350,6 +356,11 @@ def _link(s):
                 if direction not in stiffness:
                     raise ArmFileError(s.at(key), f"missing: the link is flexible in {direction}")
         f.done()
+    if "twist" in flexible and not polar > 0.0:
+        raise ArmFileError(
+            s.at("polar_inertia_per_length"),
+            "missing: a link that twists needs the polar inertia of its sections (rho I_p), or a section",
+        )
     s.done()
     return Link(name, length, per_length, stiffness, flexible, polar)
 
@@ -483,6 +494,8 @@ def parse(text, where="arm"):
         payload=_payload(top.section("payload")) if top.has("payload") else Payload(),
         gauges=gauges,
         gravity=top.vector("gravity", 3, "acceleration", (0.0, 0.0, 0.0)),
+        foreshortening=top.flag("foreshortening"),
+        finite_slope=top.flag("finite_slope"),
         model=model,
         model_options=options,
         description=top.text("description", ""),
@@ -496,7 +509,7 @@ def parse(text, where="arm"):
 
 def _model(top):
     """Name of the model class, and the section that belongs to `paper_appendix` alone."""
-    model = top.text("model", "one_link")
+    model = top.text("model", "chain")
     options = {}
     if top.has("paper_appendix"):
         if model != "paper_appendix":

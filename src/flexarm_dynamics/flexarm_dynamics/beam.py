@@ -284,3 +284,81 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
 def natural_frequencies(beta, length, mass_per_length, stiffness):
     r""":math:`\omega_i = (\beta_i/L)^2\sqrt{EI/\rho A}` [rad/s], shape (m,)."""
     return (np.asarray(beta) / length) ** 2 * np.sqrt(stiffness / mass_per_length)
+
+
+def overlap(one, other):
+    r""":math:`\int_0^1\phi_i\psi_j\,d\xi` of two families of shapes, shape (m, k)."""
+    xi, w = one._quadrature() if one.beta.max() > other.beta.max() else other._quadrature()
+    return one(xi).T @ (w[:, None] * other(xi))
+
+
+@dataclass(frozen=True)
+class TwistShapes:
+    r"""Shapes :math:`\theta_i = a_i\sin\beta_i\xi` of a uniform bar in torsion, clamped at its base.
+
+    Attributes
+    ----------
+    beta : ndarray, shape (m,)
+        Wave numbers [-].
+    """
+
+    beta: np.ndarray
+
+    def __post_init__(self):
+        self.beta.setflags(write=False)
+
+    @property
+    def count(self):
+        """Number of modes."""
+        return self.beta.size
+
+    @property
+    def _scale(self):
+        return 1.0 / np.sqrt(0.5 - np.sin(2.0 * self.beta) / (4.0 * self.beta))
+
+    def __call__(self, xi, derivative=0):
+        r"""Values of :math:`d^k\theta_i/d\xi^k`, shape (m,) or (p, m), as `ModeShapes`."""
+        x = self.beta * np.asarray(xi, dtype=float)[..., None]
+        wave = (np.sin(x), np.cos(x), -np.sin(x), -np.cos(x))[derivative % 4]
+        return self._scale * self.beta**derivative * wave
+
+    integral = ModeShapes.integral
+    gram = ModeShapes.gram
+    _quadrature = ModeShapes._quadrature
+
+
+def twist(modes, length, polar_inertia_per_length, tip_inertia=0.0):
+    r"""Exact torsional modes of a clamped bar that carries an inertia at its tip.
+
+    .. math:: \beta\tan\beta = \rho I_p L/J, \qquad \omega = \frac{\beta}{L}\sqrt{GJ/\rho I_p}
+
+    Parameters
+    ----------
+    modes : int
+        How many, from the lowest.
+    length : float
+        L [m].
+    polar_inertia_per_length : float
+        rho I_p [kg m].
+    tip_inertia : float
+        J about the bar's axis [kg m^2]; 0: free tip.
+
+    Returns
+    -------
+    TwistShapes
+    """
+    ratio = tip_inertia / (polar_inertia_per_length * length)
+
+    def tip_condition(b):
+        return np.cos(b) - ratio * b * np.sin(b)
+
+    # A hair beyond pi/2: with a free tip the root is there, and its cosine rounds to either side of zero.
+    brackets = [(i * np.pi, (i + 0.5) * np.pi + 1e-9) for i in range(modes)]
+    roots = [brentq(tip_condition, lo, hi, xtol=1e-15, rtol=8.9e-16) for lo, hi in brackets]
+    return TwistShapes(np.array(roots))
+
+
+def twist_from_frequencies(frequencies, length, polar_inertia_per_length, torsional_stiffness):
+    r"""Shapes with :math:`\beta_i = 2\pi f_i L\sqrt{\rho I_p/GJ}` from measured frequencies [Hz]."""
+    omega = 2.0 * np.pi * np.atleast_1d(np.asarray(frequencies, dtype=float))
+    return TwistShapes(omega * length * np.sqrt(polar_inertia_per_length / torsional_stiffness))

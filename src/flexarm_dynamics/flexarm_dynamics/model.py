@@ -120,19 +120,20 @@ class ArmModel(ABC):
         """Viscous, Coulomb and smoothing speed of each joint, shape (n, 3)."""
 
     @abstractmethod
-    def stepper(self, tableau, weights):
-        """Compiled fixed-step explicit Runge-Kutta integrator.
+    def stepper(self, method):
+        """Compiled fixed-step integrator.
 
         Parameters
         ----------
-        tableau, weights : ndarray, shape (p, p), (p,)
-            Butcher coefficients.
+        method : Tableau or None
+            An explicit Runge-Kutta method; None: the implicit one, which damps stiff modes.
 
         Returns
         -------
         callable
-            ``advance(state, torque, step, substeps, friction)``, which overwrites the state; torque (n,) is
-            constant meanwhile, friction (n, 3) is as in `friction_table`.
+            ``advance(state, torque, step, substeps, friction, change=0)``, which overwrites the state; torque
+            (n,) goes to torque + change over the substeps, friction (n, 3) is as in `friction_table`. It
+            releases the interpreter's lock; each thread wants a stepper of its own.
         """
 
     def friction(self, qd):
@@ -189,6 +190,30 @@ class ArmModel(ABC):
             mass = mass - t.M[n:, :n] @ np.linalg.solve(t.M[:n, :n], t.M[:n, n:])
         squares = np.linalg.eigvals(np.linalg.solve(mass, t.K2)).real
         return np.sqrt(np.sort(squares))
+
+
+@dataclass(frozen=True)
+class Tableau:
+    """An explicit Runge-Kutta method: Butcher coefficients (p, p), (p,) and (p,)."""
+
+    A: np.ndarray
+    weights: np.ndarray
+    nodes: np.ndarray
+
+
+def explicit_stepper(module, method, data, model):
+    """`ArmModel.stepper` of a compiled module that has ``slope`` and the integrators."""
+    n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
+    stages = np.zeros((method.weights.size + 1, size))
+    net, none = np.zeros((2, n)), np.zeros(n)
+
+    def advance(state, torque, step, substeps, friction, change=none):
+        module.runge_kutta(
+            state, torque, change, step, substeps, method.A, method.weights, method.nodes, stages,
+            net, friction, data,
+        )  # fmt: skip
+
+    return advance
 
 
 def build(arm):

@@ -29,7 +29,9 @@ import numpy as np
 
 from . import beam
 from .errors import ModelError
-from .model import ArmModel, Terms, damping_matrix
+from .kernels import integrators, load
+from .kernels import one_link as kernel
+from .model import ArmModel, Terms, damping_matrix, explicit_stepper
 
 
 @dataclass(frozen=True)
@@ -166,25 +168,18 @@ class OneLinkEquations(ArmModel):
         f = self.joint.friction
         return np.array([[f.viscous, f.coulomb, f.smoothing]])
 
-    def stepper(self, tableau, weights):
-        # Only who integrates pays for importing numba.
-        from .kernels import one_link as kernel
-
+    def stepper(self, method):
+        if method is None:
+            raise ModelError(
+                f"model {self.arm.model} has no implicit integrator: take an explicit one, or model chain"
+            )
         c = self.coefficients
-        scalars = np.array([c.rigid, c.moment, self._gravity[0], self._gravity[1], 0.0, 0.0, 1.0])
+        scalars = np.array([c.rigid, c.moment, self._gravity[0], self._gravity[1]])
         inverse = np.linalg.inv(c.M22)
         inverse = 0.5 * (inverse + inverse.T)
-        data = (c.h, inverse, inverse @ c.h, c.G, c.K, c.D, c.s)
-        data = tuple(np.ascontiguousarray(x) for x in data)
-        stages = np.zeros((weights.size + 1, 2 + 2 * c.h.size))
-
-        def advance(state, torque, step, substeps, friction):
-            scalars[4:7] = friction[0]
-            kernel.advance(
-                state, torque[0], step, substeps, tableau, weights, stages, scalars, *data
-            )
-
-        return advance
+        data = (scalars, c.h, inverse, inverse @ c.h, c.G, c.K, c.D, c.s)
+        module = load.joined("one_link", (load.source(kernel), load.source(integrators)))
+        return explicit_stepper(module, method, tuple(map(np.ascontiguousarray, data)), self)
 
 
 class OneLink(OneLinkEquations):

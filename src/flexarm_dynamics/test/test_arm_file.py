@@ -149,7 +149,7 @@ def test_what_is_left_out_takes_its_default():
     assert joint.brake_torque is None
     assert arm.payload.mass == 0.0
     assert arm.modes == () and arm.observed_modes == () and arm.gauges == ()
-    assert arm.model == "one_link"
+    assert arm.model == "chain"
 
 
 def test_observed_modes_come_in_the_order_of_the_modal_coordinates():

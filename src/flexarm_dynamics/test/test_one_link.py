@@ -13,12 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from flexarm_dynamics.arm import Arm, Flexibility, Friction, Joint, Link, Payload
 from flexarm_dynamics.errors import ModelError, ShapeError
+from flexarm_dynamics.model import Tableau
 from flexarm_dynamics.one_link import OneLink
 from flexarm_dynamics.paper_appendix import PaperAppendix
 from flexarm_dynamics.units import FOOT, POUND_FORCE
 
-TABLEAU = np.ascontiguousarray(DOP853.A[: DOP853.n_stages, : DOP853.n_stages])
-WEIGHTS = np.ascontiguousarray(DOP853.B)
+METHOD = Tableau(
+    np.ascontiguousarray(DOP853.A[: DOP853.n_stages, : DOP853.n_stages]),
+    np.ascontiguousarray(DOP853.B),
+    np.ascontiguousarray(DOP853.C[: DOP853.n_stages]),
+)
 FREE = np.array([[0.0, 0.0, 1.0]])  # no friction
 
 
@@ -364,7 +368,7 @@ def test_unforced_undamped_arm_keeps_its_energy_when_integrated_by_scipy():
 def test_unforced_undamped_arm_keeps_its_energy_in_the_compiled_stepper():
     """Ten seconds at 1 ms."""
     model = OneLink(an_arm())
-    advance = model.stepper(TABLEAU, WEIGHTS)
+    advance = model.stepper(METHOD)
     state = np.array([0.4, 0.03, -0.002, 0.0005, 0.8, 0.2, -0.1, 0.05])
     energy, potential = [], []
     for _ in range(1000):
@@ -379,7 +383,7 @@ def test_compiled_stepper_follows_scipy_under_torque_and_friction():
     start = np.array([0.4, 0.03, -0.002, 0.0005, 0.8, 0.2, -0.1, 0.05])
     torque = np.array([1.7])
     state = start.copy()
-    model.stepper(TABLEAU, WEIGHTS)(state, torque, 2.5e-4, 4000, model.friction_table())
+    model.stepper(METHOD)(state, torque, 2.5e-4, 4000, model.friction_table())
     result = solve_ivp(
         lambda t, s: model.derivative(s, torque), (0, 1), start, "DOP853", rtol=1e-10, atol=1e-12
     )
@@ -389,7 +393,7 @@ def test_compiled_stepper_follows_scipy_under_torque_and_friction():
 def test_stepper_takes_the_friction_that_it_is_given():
     """A brake of the plant is friction of another size, not the joint's own."""
     model = OneLink(an_arm(gravity=(0, 0, 0), friction=Friction(0.2, 0.4, 0.5)))
-    advance = model.stepper(TABLEAU, WEIGHTS)
+    advance = model.stepper(METHOD)
     state = np.zeros(8)
     state[4] = 1.0
     braked = state.copy()
@@ -440,7 +444,7 @@ def kernel_difference(modes):
     """
     arm = an_arm(modes=modes, damping=(0.01,), friction=Friction(0.2, 0.4, 0.5))
     model = OneLink(arm)
-    advance = model.stepper(np.zeros((1, 1)), np.ones(1))
+    advance = model.stepper(Tableau(np.zeros((1, 1)), np.ones(1), np.zeros(1)))
     rng = np.random.default_rng(7)
     worst = 0.0
     for _ in range(20):
@@ -465,7 +469,7 @@ def test_kernel_gives_the_same_without_compilation():
         "assert numba.config.DISABLE_JIT;"
         "d = t.kernel_difference(3); assert d < 1e-12, d;"
         "m = t.OneLink(t.an_arm()); x = t.np.full(8, 0.01);"
-        "m.stepper(t.TABLEAU, t.WEIGHTS)(x, t.np.ones(1), 1e-3, 3, t.FREE);"
+        "m.stepper(t.METHOD)(x, t.np.ones(1), 1e-3, 3, t.FREE);"
         "print(x.tolist())"
     )
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
@@ -474,7 +478,7 @@ def test_kernel_gives_the_same_without_compilation():
     )
     assert run.returncode == 0, run.stderr
     state = np.full(8, 0.01)
-    OneLink(an_arm()).stepper(TABLEAU, WEIGHTS)(state, np.ones(1), 1e-3, 3, FREE)
+    OneLink(an_arm()).stepper(METHOD)(state, np.ones(1), 1e-3, 3, FREE)
     plain = np.array([float(v) for v in run.stdout.strip("[]\n").split(",")])
     np.testing.assert_allclose(state, plain, rtol=1e-12, atol=1e-14)
 
@@ -505,7 +509,7 @@ def test_tip_follows_two_independent_multibody_codes(data, parameters):
     model = OneLink(pulse_arm(parameters))
     table = np.genfromtxt(data / "one_link_pulse.csv", delimiter=",", names=True)
     T = parameters["one_link_pulse"]["T"]
-    advance = model.stepper(TABLEAU, WEIGHTS)
+    advance = model.stepper(METHOD)
     state = np.zeros(6)
     tip, angle, across = [], [], []
     for t in table["t"]:
@@ -567,7 +571,7 @@ def test_frequencies_depend_on_gravity_only_through_the_joint():
 
 def test_two_links_are_refused():
     arm = an_arm()
-    arm = replace(arm, joints=arm.joints * 2, links=arm.links * 2)
+    arm = replace(arm, joints=arm.joints * 2, links=arm.links * 2, model="one_link")
     with pytest.raises(ModelError, match="model one_link: test has 2 links; this model is for one"):
         OneLink(arm)
 

@@ -10,6 +10,7 @@ from scipy.linalg import solve_continuous_are
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics import singular_perturbation as sp
 from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.model import Tableau
 from flexarm_dynamics.one_link import OneLink
 from flexarm_dynamics.paper_appendix import PaperAppendix
 from flexarm_dynamics.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
@@ -189,7 +190,11 @@ def test_it_keeps_its_own_energy(name, shipped):
 def test_compiled_stepper_keeps_its_energy(name, shipped):
     arm_model = shipped(name)
     stages = DOP853.n_stages
-    advance = arm_model.stepper(np.ascontiguousarray(DOP853.A[:stages, :stages]), DOP853.B)
+    advance = arm_model.stepper(
+        Tableau(
+            np.ascontiguousarray(DOP853.A[:stages, :stages]), DOP853.B, DOP853.C[:stages].copy()
+        )
+    )
     state = np.array([0.1, 0.02, -0.002, 1.5, -0.1, 0.2])
     before = arm_model.energy(state)
     advance(state, REST, 1e-3, 10_000, np.array([[0.0, 0.0, 1.0]]))

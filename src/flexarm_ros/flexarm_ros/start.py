@@ -1,5 +1,6 @@
 """Starts and ends a node's process: a signal ends it cleanly from the first moment, while it still imports."""
 
+import contextlib
 import faulthandler
 import importlib
 import os
@@ -22,10 +23,8 @@ def leave(code):
     to hang in them, some three times in a thousand exits, after the interpreter had finished.
     """
     for stream in (sys.stdout, sys.stderr):
-        try:
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody reads it any more
             stream.flush()
-        except (OSError, ValueError, AttributeError):
-            pass  # nobody reads it any more
     os._exit(code)
 
 

@@ -9,10 +9,25 @@ import numpy as np
 from scipy.integrate import DOP853, solve_ivp
 
 from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.model import Tableau
 
 _STAGES = DOP853.n_stages
-TABLEAU = np.ascontiguousarray(DOP853.A[:_STAGES, :_STAGES])
-WEIGHTS = np.ascontiguousarray(DOP853.B)
+
+#: Fixed-step methods: two explicit Runge-Kutta methods, of order 8 and 4, and a linearly implicit one of
+#: order 2 (`kernels.chain.implicit_step`), which stays stable however stiff the highest modes are.
+METHODS = {
+    "dop853": Tableau(
+        np.ascontiguousarray(DOP853.A[:_STAGES, :_STAGES]),
+        np.ascontiguousarray(DOP853.B),
+        np.ascontiguousarray(DOP853.C[:_STAGES]),
+    ),
+    "rk4": Tableau(
+        np.array([[0, 0, 0, 0], [0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1.0, 0]]),
+        np.array([1, 2, 2, 1]) / 6.0,
+        np.array([0, 0.5, 0.5, 1.0]),
+    ),
+    "implicit": None,
+}
 
 #: Highest angular frequency times substep.
 PHASE_PER_STEP = 0.5

@@ -34,7 +34,7 @@ class Plant:
         self.state = np.zeros(2 * (n + m))
         self.q, self.delta, self.qd, self.delta_d = np.split(self.state, [n, n + m, 2 * n + m])
         self.substeps = integrators.substeps(model, period)
-        self._advance = model.stepper(integrators.TABLEAU, integrators.WEIGHTS)
+        self._advance = model.stepper(integrators.METHODS["dop853"])
         self._friction = model.friction_table()
         self._safe = self._friction + self._safe_friction()
         self._safe[:, 2] = self._brake_smoothing()

@@ -10,14 +10,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import ModelError
 from flexarm_sim.integrators import (
+    METHODS,
     MOST_SUBSTEPS,
     PHASE_PER_STEP,
-    TABLEAU,
-    WEIGHTS,
     integrate,
     substeps,
 )
 
+METHOD = METHODS["dop853"]
+TABLEAU, WEIGHTS = METHOD.A, METHOD.weights
 START = np.array([0.3, 0.02, -0.004, 1.5, 0.1, 0.3])  # bent and turning
 TORQUE = np.array([3.0])
 
@@ -25,7 +26,7 @@ TORQUE = np.array([3.0])
 def stepped(arm, step, count):
     """The compiled integrator's state after `count` steps from START."""
     state = START.copy()
-    arm.stepper(TABLEAU, WEIGHTS)(state, TORQUE, step, count, arm.friction_table())
+    arm.stepper(METHOD)(state, TORQUE, step, count, arm.friction_table())
     return state
 
 

@@ -1,1 +1,1 @@
-"""Compiled hot loops; set NUMBA_DISABLE_JIT=1 to run the very same code as plain Python."""
+"""Hot loops: plain Python on arrays, which `kernels.load` compiles with numba."""

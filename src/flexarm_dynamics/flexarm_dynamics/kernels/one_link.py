@@ -1,4 +1,4 @@
-r"""One flexible link, compiled: accelerations and a fixed-step explicit Runge-Kutta integrator.
+r"""Right-hand side of one flexible link.
 
 The equations of motion (2) of one link with m modes, every term of which is in `one_link.Coefficients`:
 
@@ -10,42 +10,36 @@ The equations of motion (2) of one link with m modes, every term of which is in 
     = \begin{bmatrix}\tau\\0\end{bmatrix}.
 
 `M22` and `h` are constant, so that its inverse is a datum and an evaluation needs no factorisation.
-Right-hand side and integrator share a file because numba's cache watches only the file of the outer function.
 """
 
 import numpy as np
-from numba import njit
 
 
-@njit(cache=True)
-def acceleration(state, torque, scalars, h, a, ah, g, k, d, s, out):
+def slope(state, torque, data, out):
     """Fill `out` with the time derivative of `state`.
 
     Parameters
     ----------
     state : ndarray, shape (2 + 2 m,)
         (q, delta, qd, delta_d) [rad, m, rad/s, m/s].
-    torque : float
-        Joint torque [N m].
-    scalars : ndarray, shape (7,)
-        J, first moment of mass, gravity along x and y of the joint's frame, viscous, Coulomb, smoothing.
-    h, a, ah, g, k, d, s : ndarray
-        Coupling (m,), inverse of M22 (m, m), their product (m,), centrifugal (m, m), stiffness (m, m),
+    torque : ndarray, shape (1,)
+        Joint torque, friction taken off [N m].
+    data : tuple of ndarray
+        scalars (4,): J, first moment of mass, gravity along x and y of the joint's frame; then h, a, ah, g, k,
+        d, s: coupling (m,), inverse of M22 (m, m), their product (m,), centrifugal (m, m), stiffness (m, m),
         damping (m, m), gravity on the modes (m,).
     out : ndarray, shape (2 + 2 m,)
         Written.
     """
+    scalars, h, a, ah, g, k, d, s = data
     m = h.size
     q, qd = state[0], state[1 + m]
     rigid, moment, gx, gy = scalars[0], scalars[1], scalars[2], scalars[3]
     cos, sin = np.cos(q), np.sin(q)
     along, across = gx * cos + gy * sin, -gx * sin + gy * cos
 
-    friction = scalars[4] * qd
-    if scalars[5] != 0.0:
-        friction += scalars[5] * np.tanh(qd / scalars[6])
     inertia = rigid
-    r1 = torque - friction + moment * across
+    r1 = torque[0] + moment * across
     coupling = 0.0
     for i in range(m):
         gi = 0.0
@@ -72,40 +66,3 @@ def acceleration(state, torque, scalars, h, a, ah, g, k, d, s, out):
     out[1 + m] = qdd
     for i in range(m):
         out[1 + i] = state[2 + m + i]
-
-
-@njit(cache=True)
-def advance(state, torque, step, substeps, tableau, weights, stages, scalars, h, a, ah, g, k, d, s):
-    """Advance `state` in place by `substeps` explicit Runge-Kutta steps under constant torque.
-
-    Parameters
-    ----------
-    state : ndarray, shape (2 + 2 m,)
-        Overwritten.
-    torque : float
-        Constant over the interval [N m].
-    step : float
-        Length of one substep [s].
-    substeps : int
-        How many.
-    tableau, weights : ndarray, shape (p, p) and (p,)
-        Butcher coefficients.
-    stages : ndarray, shape (p + 1, 2 + 2 m)
-        Work space; the last row holds the state of a stage.
-    scalars, h, a, ah, g, k, d, s : ndarray
-        As for `acceleration`.
-    """
-    p, n = weights.size, state.size
-    for _ in range(substeps):
-        for i in range(p):
-            for v in range(n):
-                acc = 0.0
-                for j in range(i):
-                    acc += tableau[i, j] * stages[j, v]
-                stages[p, v] = state[v] + step * acc
-            acceleration(stages[p], torque, scalars, h, a, ah, g, k, d, s, stages[i])
-        for v in range(n):
-            acc = 0.0
-            for j in range(p):
-                acc += weights[j] * stages[j, v]
-            state[v] += step * acc

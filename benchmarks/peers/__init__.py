@@ -1,0 +1,163 @@
+"""Other ways to simulate the reference cases, to compare flexarm's accuracy and speed with.
+
+Every module has one or more classes with the interface of `Peer`. They import nothing of ROS; each
+imports its own third-party package at its top, so import only what is installed.
+"""
+
+import re
+
+import numpy as np
+
+#: Rate at which every peer reports [Hz].
+RATE = 100
+
+#: Distance from a stage to a pulse's edge that still counts as on it [s].
+EDGE = 1e-9
+
+_SINE = re.compile(r"\s*([-+.\deE]+)\*sin\(2\*pi\*([.\deE]+)\*t\)\s*")
+
+
+class Peer:
+    """A simulation of one reference case that starts at rest.
+
+    Parameters
+    ----------
+    case : str
+        ``one_link_pulse``, ``two_link_torque`` or ``two_link_torque_x0p1``.
+    parameters : dict
+        That case's entry of ``parameters.json``.
+    **settings
+        What the code can be told: step, segments, tolerance.
+    """
+
+    name = ""
+
+    def __init__(self, case, parameters, **settings):
+        self.case, self.parameters, self.settings = case, parameters, settings
+        self.two_links = case.startswith("two_link")
+        self.torque = Torque(case, parameters)
+
+    def run(self, duration):
+        """Simulate from rest.
+
+        Parameters
+        ----------
+        duration : float
+            How long [s].
+
+        Returns
+        -------
+        t : ndarray, shape (n,)
+            Times, `RATE` a second, 0 and `duration` included [s].
+        columns : dict of str to ndarray, shape (n,)
+            theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m].
+        """
+        raise NotImplementedError
+
+
+class Torque:
+    """Joint torques of a case as functions of time.
+
+    Parameters
+    ----------
+    case : str
+        Name of the case.
+    parameters : dict
+        Its entry of ``parameters.json``.
+
+    Attributes
+    ----------
+    count : int
+        Number of joints.
+    edges : tuple of float
+        Times at which a torque jumps [s].
+    level : tuple of float
+        Torque between the edges, one more than these [N m]; empty when nothing jumps.
+    sines : list of tuple of float
+        Amplitude [N m] and angular frequency [rad/s] of each joint's sine; empty for a pulse.
+    """
+
+    def __init__(self, case, parameters):
+        if case == "one_link_pulse":
+            height = parameters["T"]
+            self.count, self.edges, self.level = 1, (0.5, 1.0), (height, -height, 0.0)
+            self.sines = []
+        else:
+            self.count, self.edges, self.level = 2, (), ()
+            self.sines = []
+            for key in ("tau1", "tau2"):
+                match = _SINE.fullmatch(parameters[key])
+                if match is None:
+                    raise ValueError(f"{key}: {parameters[key]!r} is not amplitude*sin(2*pi*f*t)")
+                self.sines.append((float(match[1]), 2.0 * np.pi * float(match[2])))
+
+    def __call__(self, t):
+        """Torques [N m] at time t [s], shape (count,); on an edge the later level."""
+        if self.edges:
+            return np.array([self.level[sum(t >= edge for edge in self.edges)]])
+        return np.array([a * np.sin(w * t) for a, w in self.sines])
+
+    def sample(self, t):
+        """Torques [N m] at many times [s], shape (n, count); on an edge the mean of both levels."""
+        t = np.asarray(t)
+        if not self.edges:
+            return np.stack([a * np.sin(w * t) for a, w in self.sines], axis=-1)
+        level = np.array(self.level)
+        before = np.searchsorted(self.edges, t - EDGE)
+        after = np.searchsorted(self.edges, t + EDGE)
+        return (0.5 * (level[before] + level[after]))[:, None]
+
+    def stages(self, steps, step):
+        """Torques [N m] at each step's start, middle and end, shape (steps, 3, count).
+
+        A pulse's edge on a step's boundary is seen from inside the step: otherwise the last stage
+        of Runge-Kutta sees the torque of the next step and the method is of first order.
+        """
+        t = step * np.arange(steps)
+        if not self.edges:
+            half = self.sample(0.5 * step * np.arange(2 * steps + 1))
+            return np.stack([half[:-1:2], half[1::2], half[2::2]], axis=1)
+        inside = (t + 2.0 * EDGE, t + 0.5 * step, t + step - 2.0 * EDGE)
+        return np.stack([self.sample(s) for s in inside], axis=1)
+
+
+def steps_per_sample(step):
+    """Steps between two reports; raises ValueError when the step does not divide the interval."""
+    count = round(1.0 / (RATE * step))
+    if count < 1 or abs(count * step * RATE - 1.0) > 1e-9:
+        raise ValueError(f"a step of {step} s does not divide 1/{RATE} s")
+    return count
+
+
+def times(duration):
+    """Times of the report [s], shape (n,)."""
+    return np.arange(round(duration * RATE) + 1) / RATE
+
+
+def errors(columns, reference):
+    """Largest deviations from a truth file.
+
+    Parameters
+    ----------
+    columns : dict of str to ndarray
+        What `Peer.run` returned; may end before the reference.
+    reference : path-like or mapping of str to ndarray
+        Truth at `RATE`, as CSV with a header or already read.
+
+    Returns
+    -------
+    dict of str to float
+        ``tip``: largest distance of tip from tip [m]; ``theta1``: largest deviation [rad].
+    """
+    if not hasattr(reference, "keys"):
+        table = np.genfromtxt(reference, delimiter=",", names=True)
+        reference = {name: table[name] for name in table.dtype.names}
+    n = len(columns["theta1"])
+
+    def off(key):
+        return columns[key] - reference[key][:n]
+
+    return {
+        "tip": float(np.max(np.hypot(off("tip_x"), off("tip_y")))),
+        "theta1": float(np.max(np.abs(off("theta1")))),
+    }

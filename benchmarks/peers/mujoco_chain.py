@@ -1,0 +1,221 @@
+r"""MuJoCo model of one or two planar flexible links as chains of rigid segments.
+
+A link is a chain of rigid segments with a spring hinge between neighbours. With hinges at the nodes
+:math:`x_k` of a quadrature rule on the link and stiffness :math:`EI/(w_k L)` the chain's deflection
+under any static load is the quadrature of :math:`\int M(x)\dots/EI\,dx`, so
+
+- ``uniform``: equal cells with the hinge in each one's middle (half a segment is clamped in the
+  hub, half a segment is left at the tip), the midpoint rule. Its tip deflection under a tip force
+  is low by :math:`1/(4N^2)`, which the stiffness is corrected for.
+- ``gauss``: Gauss-Legendre nodes and weights. Deflection and slope under a tip force or moment are
+  exact from two hinges on, and the first frequencies converge much faster than those of equal
+  segments: of one_link_pulse's clamped link the first two are off by 2e-4 and -6e-2 with three
+  hinges, -4e-5 and 1e-3 with four; uniform, by 4e-3 and 4e-2 with four, 1e-3 and 9e-3 with eight.
+
+The rigid segments carry the beam's mass where it is, rotary inertia of each as a rod. What moves is
+a chain of true rotations: foreshortening and large slopes are in it.
+"""
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from . import Peer, steps_per_sample, times
+
+#: Versions tried: mujoco 3.17.0 (wheels for CPython 3.10 to 3.14; 4.0.0 has none for 3.10).
+PINNED = "mujoco==3.17.0"
+
+#: Fastest settings that keep the tip within 0.5 mm (one_link_pulse), 50 um (two_link_torque_x0p1)
+#: and 0.1 mm (two_link_torque). Scanned: both layouts, 2 to 6 hinges, steps of 10 ms over 1 to 80;
+#: a setting counts only if half its step keeps the target too (not asked of semi-implicit Euler in
+#: two_link_torque). Of the uniform layout, one_link_pulse takes 4 hinges and 5 ms (0.48 mm), x0p1 3
+#: and 5 ms (21 um).
+BEST = {
+    "MujocoChain": {
+        "one_link_pulse": {"segments": 3, "step": 5e-3},
+        "two_link_torque_x0p1": {"segments": 2, "step": 1e-2},
+        "two_link_torque": {"segments": 4, "step": 2.5e-3},
+    },
+    "MujocoChainEuler": {
+        "one_link_pulse": {"segments": 3, "step": 1.0 / 600.0},
+        "two_link_torque_x0p1": {"segments": 2, "step": 1.0 / 600.0},
+        "two_link_torque": {"segments": 3, "step": 1.25e-4},
+    },
+}
+
+_OPTION = """
+ <compiler angle="radian" boundmass="0" boundinertia="0"/>
+ <option timestep="{step!r}" integrator="{integrator}" gravity="0 0 0">
+  <flag constraint="disable" contact="disable" eulerdamp="disable" autoreset="disable"/>
+ </option>
+"""
+
+
+def hinges(count, layout):
+    """Places and flexibilities of a link's hinges.
+
+    Parameters
+    ----------
+    count : int
+        Number of hinges.
+    layout : str
+        ``uniform`` or ``gauss``.
+
+    Returns
+    -------
+    places : ndarray, shape (count,)
+        Position along the link, of 0 to 1 [-].
+    weights : ndarray, shape (count,)
+        Flexibility over that of the whole link, L/EI [-].
+    """
+    if layout == "uniform":
+        places = (np.arange(count) + 0.5) / count
+        return places, np.full(count, 1.0 / (count - 0.25 / count))
+    if layout == "gauss":
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        return 0.5 * (nodes + 1.0), 0.5 * weights
+    raise ValueError(f"layout {layout!r}: uniform or gauss")
+
+
+def _body(rods, points, spin):
+    """Mass, centre and inertia about it of a segment.
+
+    Parameters
+    ----------
+    rods : tuple of float
+        Mass and length of the segment, which starts at its frame.
+    points : list of tuple of float
+        Masses and positions of point masses.
+    spin : float
+        Inertia without mass.
+    """
+    mass, length = rods
+    total = mass + sum(m for m, _ in points)
+    centre = (0.5 * mass * length + sum(m * x for m, x in points)) / total
+    inertia = mass * (length**2 / 12.0 + (0.5 * length - centre) ** 2)
+    inertia += sum(m * (x - centre) ** 2 for m, x in points)
+    return total, centre, inertia + spin
+
+
+def chain(parameters, segments, layout, step, integrator):
+    """Model of a case.
+
+    Parameters
+    ----------
+    parameters : dict
+        Entry of ``parameters.json``.
+    segments : int
+        Hinges per link.
+    layout : str
+        As for `hinges`.
+    step : float
+        Step [s].
+    integrator : str
+        ``RK4`` or ``Euler`` (semi-implicit).
+
+    Returns
+    -------
+    str
+        MJCF. Joints in order: base, link 1's hinges, elbow, link 2's hinges.
+    """
+    p = parameters
+    length, rho, stiffness = p["L"], p["rhoA"], p["EI"]
+    places, weights = hinges(segments, layout)
+    bounds = np.concatenate([[0.0], places * length, [length]])
+    two = "Jh2" in p
+    hubs = (p["Jh1"], p["Jh2"]) if two else (p["Jh"],)
+    text, depth, offset = [], 0, 0.0
+    for number, hub in enumerate(hubs):
+        last = number == len(hubs) - 1
+        for k in range(segments + 1):
+            size = float(bounds[k + 1] - bounds[k])
+            points, spin = [], hub if k == 0 else 0.0
+            if k == segments:
+                points.append((p["Mp"] if last else p["Mm"], size))
+                spin += p["Jp"] if last else 0.0
+            mass, centre, inertia = _body((rho * size, size), points, spin)
+            if k == 0:
+                joint = f'<joint name="q{number + 1}" axis="0 0 1"/>'
+            else:
+                spring = stiffness / (float(weights[k - 1]) * length)
+                joint = f'<joint axis="0 0 1" stiffness="{spring!r}"/>'
+            # Only the inertia about z matters; three equal ones are always a legal body.
+            text.append(
+                f'<body pos="{offset!r} 0 0">{joint}<inertial pos="{centre!r} 0 0"'
+                f' mass="{mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>'
+            )
+            offset, depth = size, depth + 1
+    motors = "".join(f'<motor joint="q{n + 1}"/>' for n in range(len(hubs)))
+    return (
+        "<mujoco>"
+        + _OPTION.format(step=float(step), integrator=integrator)
+        + f"<worldbody>{''.join(text)}{'</body>' * depth}</worldbody>"
+        + f"<actuator>{motors}</actuator></mujoco>"
+    )
+
+
+class MujocoChain(Peer):
+    """Hinge chain under `mujoco.rollout`.
+
+    Parameters
+    ----------
+    case, parameters
+        As for `Peer`.
+    step : float
+        Step [s]; divides 10 ms. The torque of each step is that of its middle.
+    segments : int
+        Hinges per link.
+    layout : str
+        As for `hinges`.
+    """
+
+    integrator = "RK4"
+    name = "MuJoCo rollout, RK4"
+
+    def __init__(self, case, parameters, *, step=1e-3, segments=4, layout="gauss"):
+        super().__init__(case, parameters, step=step, segments=segments, layout=layout)
+        self.step, self.every, self.segments = step, steps_per_sample(step), segments
+        self.model = mujoco.MjModel.from_xml_string(
+            chain(parameters, segments, layout, step, self.integrator)
+        )
+        self.data = mujoco.MjData(self.model)
+        places, _ = hinges(segments, layout)
+        self.sizes = np.diff(np.concatenate([[0.0], places, [1.0]])) * parameters["L"]
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        self.start = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self.data, self.start, kind)
+        self.rollout = rollout.Rollout(nthread=0)
+
+    def run(self, duration):
+        t = times(duration)
+        steps = (t.size - 1) * self.every
+        torque = self.torque.sample(self.step * (np.arange(steps) + 0.5))
+        states, _ = self.rollout.rollout(self.model, self.data, self.start, torque)
+        angles = np.empty((t.size, self.model.nq))
+        angles[0] = self.start[1 : 1 + self.model.nq]
+        angles[1:] = states[0, self.every - 1 :: self.every, 1 : 1 + self.model.nq]
+        return t, self.columns(angles)
+
+    def columns(self, angles):
+        """Report columns from joint angles, shape (n, joints)."""
+        direction = np.cumsum(angles, axis=1)
+        cos, sin = np.cos(direction), np.sin(direction)
+        n = self.segments + 1
+        x, y = cos[:, :n] @ self.sizes, sin[:, :n] @ self.sizes
+        if not self.two_links:
+            return {"theta1": angles[:, 0], "tip_x": x, "tip_y": y}
+        return {
+            "theta1": angles[:, 0],
+            "tip_x": x + cos[:, n:] @ self.sizes,
+            "tip_y": y + sin[:, n:] @ self.sizes,
+            "elbow_x": x,
+            "elbow_y": y,
+            "alpha2": direction[:, n],
+        }
+
+
+class MujocoChainEuler(MujocoChain):
+    """The same with MuJoCo's semi-implicit Euler."""
+
+    integrator = "Euler"
+    name = "MuJoCo rollout, semi-implicit Euler"

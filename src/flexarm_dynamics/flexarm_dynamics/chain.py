@@ -1,0 +1,648 @@
+r"""Arms of any number of links, rigid or flexible: the general model, evaluated by `kernels.chain`.
+
+Every link is a uniform beam along its frame's x axis, which bends (Euler-Bernoulli, no rotary inertia of the
+sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm file:
+:math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. The mass matrix depends on the deflections; nothing of the
+Lagrangian is left out at the arm's `level`:
+
+- first order: displacements linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
+- `foreshortening`: the axis keeps its length to second order, and with that stiffens when it spins;
+- `finite_slope`: the axis keeps its length exactly, its curvature is y''/sqrt(1 - y'^2), the tip turns by
+  arcsin y'.
+
+The hub's inertia turns with its link; a rotor behind a gear of ratio N spins at ``a . w_carrier + N qd``; the
+motor's mass sits at the joint and hangs on the previous link. The paper's control model (assumptions a) and
+b): no deflections in the mass matrix, no products of deflections) is what `Chain.terms` gives without
+deflections.
+"""
+
+from functools import cached_property
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from . import beam
+from .errors import ModelError, ShapeError
+from .kernels import chain as plain
+from .kernels import generated, integrators, load
+from .model import ArmModel, Terms, damping_matrix, explicit_stepper
+
+_KIND = {"y": plain.Y, "z": plain.Z, "twist": plain.TWIST}
+
+CHAIN_SOURCES = (load.source(plain), load.source(integrators))
+
+#: Imaginary step of the complex-step derivatives: no difference is taken, so that it costs no digits.
+STEP = 1e-30
+
+
+class Chain(ArmModel):
+    """A serial chain of flexible links (module docstring).
+
+    Parameters
+    ----------
+    arm : Arm
+    compiled : bool
+        False: evaluate the kernels as plain Python, for debugging; some hundred times slower.
+    """
+
+    def __init__(self, arm, compiled=True):
+        super().__init__(arm)
+        self._compiled = compiled
+        self._shapes = {}
+        loads = _outboard(arm)
+        for link, body in zip(arm.links, loads, strict=True):
+            for direction, flexibility in link.flexible.items():
+                self._shapes[link.name, direction] = _shapes(link, direction, flexibility, body)
+        self.data = _assemble(arm, self._shapes, loads)
+
+    @cached_property
+    def kernel(self):
+        """The kernels: compiled on first use, or plain."""
+        return load.joined("chain", CHAIN_SOURCES, self._compiled)
+
+    def _packed(self, values):
+        return packed(values) if self._compiled else (values,)
+
+    @cached_property
+    def _data(self):
+        return self._packed(self.data)
+
+    @cached_property
+    def _work(self):
+        return self._packed(work_space(self.data))
+
+    @cached_property
+    def _complex_work(self):
+        return self._packed(work_space(self.data, complex))
+
+    def mode_shapes(self, link, direction):
+        try:
+            return self._shapes[link, direction]
+        except KeyError:
+            raise ModelError(f"{link} has no modes in direction {direction}") from None
+
+    def friction_table(self):
+        return np.array(
+            [
+                [j.friction.viscous, j.friction.coulomb, j.friction.smoothing]
+                for j in self.arm.joints
+            ]
+        )
+
+    # Equations of motion -----------------------------------------------------------------------
+
+    def mass_matrix(self, q, delta=None):
+        """M of (2), shape (n + m, n + m)."""
+        n, m = self.n_joints, self.n_modes
+        q, delta = self._joint(q, "q"), self._modal(delta, "delta")
+        M = np.zeros((n + m, n + m))
+        self.kernel.mass_matrix(
+            self._data, self._work, q, delta, np.zeros(n), np.zeros(m), np.zeros(3), M
+        )
+        return M
+
+    def forces(self, q, qd, delta=None, delta_d=None):
+        """What the joints and modes must give at zero acceleration, friction aside; shape (n + m,).
+
+        Coriolis, centrifugal, gravitational and elastic forces and modal damping: all of (2) but M.
+        """
+        n, m = self.n_joints, self.n_modes
+        out = np.zeros(n + m)
+        self.kernel.bias_forces(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            self._joint(qd, "qd"), self._modal(delta_d, "delta_d"), np.zeros(n), np.zeros(m), out,
+        )  # fmt: skip
+        return out
+
+    def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
+        """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
+
+        Of a free motion the modal part is zero.
+        """
+        accelerations = np.concatenate([self._joint(qdd, "qdd"), self._modal(delta_dd, "delta_dd")])
+        out = self.forces(q, qd, delta, delta_d) + self.mass_matrix(q, delta) @ accelerations
+        out[: self.n_joints] += self.friction(self._joint(qd, "qd"))
+        return out
+
+    def linearisation(self, q, qd, delta=None, delta_d=None):
+        r"""Derivatives of `forces` by delta and by its rates, to machine precision (complex step).
+
+        Returns
+        -------
+        K, C : ndarray, shape (n + m, m)
+            :math:`\partial/\partial\delta` and :math:`\partial/\partial\dot\delta`.
+        """
+        n, m = self.n_joints, self.n_modes
+        q, qd = self._joint(q, "q").astype(complex), self._joint(qd, "qd").astype(complex)
+        delta = self._modal(delta, "delta").astype(complex)
+        delta_d = self._modal(delta_d, "delta_d").astype(complex)
+        out = np.zeros(n + m, complex)
+        result = []
+        for variable in (delta, delta_d):
+            matrix = np.zeros((n + m, m))
+            for j in range(m):
+                kept = variable[j]
+                variable[j] = kept + 1j * STEP
+                self.kernel.bias_forces(
+                    self._data, self._complex_work, q, delta, qd, delta_d,
+                    np.zeros(n, complex), np.zeros(m, complex), out,
+                )  # fmt: skip
+                matrix[:, j] = out.imag / STEP
+                variable[j] = kept
+            result.append(matrix)
+        return tuple(result)
+
+    def terms(self, q, qd, delta=None, delta_d=None):
+        """Terms of (2).
+
+        C and K are the derivatives of the forces by delta_d and delta at the straight arm (Jacobian of the
+        elastic, centrifugal, Coriolis and gravitational forces). Without deflections f is what is left at
+        the straight arm: the paper's control model, assumptions a) and b). With deflections f takes the
+        products of deflections as well, so that f + C delta_d + K delta is exact.
+        """
+        n = self.n_joints
+        q, qd = self._joint(q, "q"), self._joint(qd, "qd")
+        K, C = self.linearisation(q, qd)
+        if delta is None:
+            f = self.forces(q, qd)
+        else:
+            delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
+            f = self.forces(q, qd, delta, delta_d) - K @ delta - C @ delta_d
+        f[:n] += self.friction(qd)
+        return Terms(
+            M=self.mass_matrix(q, delta), f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:]
+        )
+
+    def derivative(self, state, torque):
+        n, m = self.n_joints, self.n_modes
+        state = np.asarray(state, float)
+        if state.shape != (2 * (n + m),):
+            raise ShapeError(f"state has shape {state.shape}, wanted {(2 * (n + m),)}")
+        out = np.empty_like(state)
+        net = np.asarray(torque, float) - self.friction(state[n + m : 2 * n + m])
+        self.kernel.slope(state, net, (self._data, self._work, *self._none), out)
+        return out
+
+    @cached_property
+    def _none(self):
+        """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
+        n, K = self.data.links, self.data.s.shape[1]
+        return np.zeros(n), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
+
+    def kinetic_energy(self, q, qd, delta, delta_d):
+        v = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
+        return 0.5 * v @ self.mass_matrix(q, delta) @ v
+
+    def potential_energy(self, q, delta):
+        delta = self._modal(delta, "delta")
+        return float(
+            self.kernel.potential_energy(self._data, self._work, self._joint(q, "q"), delta,
+                                         np.zeros(self.n_joints), np.zeros(self.n_modes))
+        )  # fmt: skip
+
+    def momentum(self, q, qd, delta=None, delta_d=None):
+        """Linear momentum, and angular momentum about the base's origin, in the base frame.
+
+        Returns
+        -------
+        linear, angular : ndarray, shape (3,)
+            [kg m/s], [kg m^2/s]; rotors count with their spin about their joint's axis.
+        """
+        out = np.zeros((2, 3))
+        self.kernel.momentum(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            self._joint(qd, "qd"), self._modal(delta_d, "delta_d"), out,
+        )  # fmt: skip
+        return out[0], out[1]
+
+    # Kinematics --------------------------------------------------------------------------------
+
+    def frames(self, q, delta=None):
+        """Orientation and origin of each link's base frame, and last of the tip's, in the base frame.
+
+        Returns
+        -------
+        R : ndarray, shape (n + 1, 3, 3)
+        p : ndarray, shape (n + 1, 3)
+        """
+        n = self.n_joints
+        R, p = np.zeros((n + 1, 3, 3)), np.zeros((n + 1, 3))
+        self.kernel.frames(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            np.zeros(n), np.zeros(self.n_modes), R, p,
+        )  # fmt: skip
+        return R, p
+
+    def point(self, link, position, q, delta=None, offset=(0.0, 0.0, 0.0)):
+        """Position of a point of a link in the base frame, shape (3,) [m].
+
+        Parameters
+        ----------
+        link : str
+        position : float
+            From the link's base along its axis [m].
+        q, delta : ndarray
+        offset : array_like, shape (3,)
+            From the axis, in the section's frame [m].
+        """
+        return self._point(link, position, q, delta, offset)[0]
+
+    def jacobian(self, link, position, q, delta=None, offset=(0.0, 0.0, 0.0)):
+        """Jacobian of a point's velocity and of its section's angular velocity, shape (6, n + m).
+
+        Rows: linear [m/s], angular [rad/s], in the base frame; columns: (qd, delta_d).
+        """
+        return self._point(link, position, q, delta, offset)[1]
+
+    def velocity(self, link, position, q, qd, delta=None, delta_d=None, offset=(0.0, 0.0, 0.0)):
+        """Linear and angular velocity of a point of a link in the base frame, shape (6,)."""
+        rates = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
+        return self.jacobian(link, position, q, delta, offset) @ rates
+
+    def _point(self, link, position, q, delta, offset):
+        index = [item.name for item in self.arm.links].index(link)
+        piece = self._cut(index, float(position))
+        n, m = self.n_joints, self.n_modes
+        jacobian, place = np.zeros((6, n + m)), np.zeros(3)
+        self.kernel.point(
+            self._packed(piece), self._work, index, self._joint(q, "q"), self._modal(delta, "delta"),
+            np.zeros(n), np.zeros(m), np.asarray(offset, float), place, jacobian,
+        )  # fmt: skip
+        return place, jacobian
+
+    def _cut(self, index, position):
+        """The data with link `index` ending at `position`, for the kinematics of that section."""
+        link = self.arm.links[index]
+        if not 0.0 <= position <= link.length * (1.0 + 1e-12):
+            raise ModelError(f"{link.name}: {position} m is not on a link of {link.length} m")
+        d = self.data
+        xi = position / link.length
+        tip, slope, length = d.tip.copy(), d.slope.copy(), d.length.copy()
+        bishop, cumulate = d.bishop.copy(), d.cumulate.copy()
+        length[index] = position
+        for j, (shapes, number, direction) in enumerate(_modes_of(link, self._shapes)):
+            tip[index, j] = 0.0 if direction == "twist" else shapes(xi)[number]
+            slope[index, j] = shapes(xi, 0 if direction == "twist" else 1)[number] / (
+                1.0 if direction == "twist" else link.length
+            )
+        if d.level != plain.FIRST_ORDER:
+            points = d.node_x[index] / link.length
+            cumulate[index, -1] = link.length * cumulative(points, np.array([xi]))[0]
+            bishop[index] = _bishop(d, index, cumulate[index, -1])
+        return d._replace(
+            links=index + 1, tip=tip, slope=slope, length=length, bishop=bishop,
+            cumulate=cumulate,
+        )  # fmt: skip
+
+    def tip_position(self, q, delta):
+        return self.frames(q, delta)[1][-1]
+
+    def tip_velocity(self, q, qd, delta, delta_d):
+        link = self.arm.links[-1]
+        return self.velocity(link.name, link.length, q, qd, delta, delta_d)[:3]
+
+    def tip_deflection(self, delta, link=None):
+        """Deflection of a link's tip along y and z of its base frame (last link if not named), (2,) [m]."""
+        delta = self._modal(delta, "delta")
+        names = [item.name for item in self.arm.links]
+        i = len(names) - 1 if link is None else names.index(link)
+        d = self.data
+        out = np.zeros(2)
+        for j in range(d.count[i]):
+            if d.direction[i, j] != plain.TWIST:
+                out[d.direction[i, j] - 1] += d.tip[i, j] * delta[d.first[i] + j]
+        return out
+
+    # Integration -------------------------------------------------------------------------------
+
+    @cached_property
+    def straight_line(self):
+        """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
+        if self.data.level != plain.FIRST_ORDER or not self._compiled:
+            return None
+        source, constants, operations = generated.right_hand_side(
+            self.data, work_space(self.data, object)
+        )
+        if operations > generated.MOST_OPERATIONS:
+            return None
+        return load.joined("generated", (source, load.source(integrators))), constants
+
+    def stepper(self, method, straight_line=True):
+        if method is not None and straight_line and self.straight_line is not None:
+            module, constants = self.straight_line
+            return explicit_stepper(module, method, constants, self)
+        none = tuple(np.zeros_like(part) for part in self._none)
+        data = (self._data, self._packed(work_space(self.data)), *none)
+        if method is not None:
+            return explicit_stepper(self.kernel, method, data, self)
+        n, size = self.n_joints, 2 * (self.n_joints + self.n_modes)
+        stages, net, steady = np.zeros((4, size)), np.zeros((2, n)), np.zeros(n)
+        extra = (np.zeros_like(none[0]), np.zeros_like(none[1]))
+
+        def advance(state, torque, step, substeps, friction, change=steady):
+            self.kernel.implicit_step(
+                state, torque, change, step, substeps, stages, net, extra, friction, data
+            )
+
+        return advance
+
+    def driven_stepper(self, method):
+        """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion."""
+        none = list(np.zeros_like(part) for part in self._none)
+        none[2][:] = 1
+        data = (self._data, self._packed(work_space(self.data)), *none)
+        return explicit_stepper(self.kernel, method, data, self)
+
+    def _joint(self, value, name):
+        value = np.ascontiguousarray(value, float)
+        if value.shape != (self.n_joints,):
+            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_joints,)}")
+        return value
+
+    def _modal(self, value, name):
+        value = np.zeros(self.n_modes) if value is None else np.ascontiguousarray(value, float)
+        if value.shape != (self.n_modes,):
+            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_modes,)}")
+        return value
+
+
+def rotation(rpy):
+    """Fixed-axis roll, pitch, yaw, as in URDF; shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def _shape(spec, sizes):
+    return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
+
+
+def _sizes(data):
+    sizes = {"N": data.links, "K": data.s.shape[1], "G": data.nodes}
+    return sizes | {"N+1": data.links + 1, "G+1": data.nodes + 1}
+
+
+def work_space(data, dtype=float):
+    """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
+    sizes = _sizes(data)
+    return plain.Work(
+        **{name: np.zeros(_shape(spec, sizes), dtype) for name, spec in plain.WORK.items()}
+    )
+
+
+def packed(values):
+    """A namedtuple of arrays as an array of one record, which compiled code takes by reference.
+
+    Shapes are part of a record's type: with them fixed the compiler unrolls, and no array is passed or counted.
+    """
+    fields = {name: np.asarray(value) for name, value in values._asdict().items()}
+    kind = np.dtype([(name, v.dtype, v.shape) for name, v in fields.items()], align=True)
+    record = np.zeros(1, kind).view(np.recarray)
+    for name, v in fields.items():
+        record[name][0] = v
+    return record
+
+
+def cumulative(points, ends):
+    """Matrix that integrates a function given at Gauss points of [0, 1] from 0 to each of `ends`."""
+    values = legendre.legvander(2.0 * points - 1.0, points.size - 1)
+    primitives = [legendre.legint(row, lbnd=-1.0) for row in np.eye(points.size)]
+    integrals = np.array([legendre.legval(2.0 * ends - 1.0, p) for p in primitives]).T
+    return 0.5 * np.linalg.solve(values.T, integrals.T).T
+
+
+def _modes_of(link, shapes):
+    """(shapes, number, direction) of each mode of a link, in the order of the arm's modal coordinates."""
+    return [
+        (shapes[link.name, direction], i, direction)
+        for direction in _KIND_ORDER
+        if direction in link.flexible
+        for i in range(link.flexible[direction].modes)
+    ]
+
+
+_KIND_ORDER = ("y", "z", "twist")
+
+
+class _Load:
+    """A rigid body at a link's tip, in the tip's frame: mass, first moment, inertia about the tip."""
+
+    def __init__(self, mass, moment, inertia):
+        self.mass, self.moment, self.inertia = mass, moment, inertia
+
+    def moved(self, R, p):
+        """The same body in a frame where this one's origin is p and its axes are R's columns."""
+        moment = R @ self.moment
+        cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+        first = np.outer(moment, p)
+        shift = 2.0 * (moment @ p) * np.eye(3) - first - first.T
+        return _Load(
+            self.mass,
+            moment + self.mass * p,
+            R @ self.inertia @ R.T + shift - self.mass * cross @ cross,
+        )
+
+    def __add__(self, other):
+        return _Load(
+            self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
+        )
+
+
+def _payload(arm):
+    p = arm.payload
+    c = np.asarray(p.offset)
+    inertia = np.asarray(p.inertia) + p.mass * (c @ c * np.eye(3) - np.outer(c, c))
+    return _Load(p.mass, p.mass * c, inertia)
+
+
+def _straight(link, joint):
+    """A link's undeformed self with its hub and the motor at its base, in its base frame."""
+    L, rho = link.length, link.mass_per_length
+    a = np.asarray(joint.axis)
+    second = rho * L**3 / 3.0
+    inertia = np.diag([link.polar_inertia_per_length * L, second, second])
+    return _Load(
+        joint.motor_mass + rho * L,
+        np.array([rho * L**2 / 2.0, 0.0, 0.0]),
+        inertia + joint.hub_inertia * np.outer(a, a),
+    )
+
+
+def _outboard(arm):
+    """What hangs on each link's tip when all joints are at zero and all links straight."""
+    loads = [_payload(arm)]
+    for link, joint in list(zip(arm.links, arm.joints, strict=True))[:0:-1]:
+        rotor = joint.rotor_inertia * np.outer(joint.axis, joint.axis)
+        whole = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0])) + _straight(
+            link, joint
+        )
+        whole.inertia = whole.inertia + rotor
+        loads.insert(0, whole.moved(rotation(joint.origin_rpy), np.asarray(joint.origin_xyz)))
+        loads[0].inner = True
+    return loads
+
+
+def _shapes(link, direction, flexibility, load):
+    """Mode shapes of a link in a direction, of the kind that the arm file names.
+
+    The load of an inner link is averaged over the turns of the joints beyond: its mass sits at the tip, its
+    inertia about the tip counts, its first moment does not.
+    """
+    L, rho, modes = link.length, link.mass_per_length, flexibility.modes
+    if direction == "twist":
+        polar, GJ = link.polar_inertia_per_length, link.stiffness["twist"]
+        if flexibility.shape == "from_frequencies":
+            return beam.twist_from_frequencies(flexibility.frequencies[:modes], L, polar, GJ)
+        tip = load.inertia[0, 0] if flexibility.shape == "loaded" else 0.0
+        return beam.twist(modes, L, polar, tip)
+    if flexibility.shape == "clamped_free":
+        return beam.clamped_free(modes)
+    if flexibility.shape == "from_frequencies":
+        return beam.from_frequencies(
+            flexibility.frequencies[:modes], L, rho, link.stiffness[direction]
+        )
+    mass, inertia, offset = _bending_load(load, direction)
+    return beam.loaded(modes, L, rho, mass, inertia - mass * offset**2, offset)
+
+
+def _bending_load(load, direction):
+    """Mass, inertia about the tip, and distance along x of a load's centre of mass."""
+    axis = 2 if direction == "y" else 1
+    offset = 0.0
+    if load.mass > 0.0 and not getattr(load, "inner", False):
+        offset = load.moment[0] / load.mass
+    return load.mass, load.inertia[axis, axis], offset
+
+
+def _clamped_mass(link, direction, shapes, load):
+    """Modal mass of a link with its base held and its load at its tip: what modal damping refers to."""
+    if direction == "twist":
+        tip = shapes(1.0)
+        return link.polar_inertia_per_length * link.length * shapes.gram() + load.inertia[
+            0, 0
+        ] * np.outer(tip, tip)
+    mass, inertia, offset = _bending_load(load, direction)
+    tip, slope = shapes(1.0), shapes(1.0, 1) / link.length
+    centre = tip + offset * slope
+    return (
+        link.mass * shapes.gram()
+        + mass * np.outer(centre, centre)
+        + (inertia - mass * offset**2) * np.outer(slope, slope)
+    )
+
+
+def _bishop(data, index, weights):
+    """int phi_j'' phi_k' dx for j along y and k along z of a link, from the nodes; shape (K, K)."""
+    y, z = data.direction[index] == plain.Y, data.direction[index] == plain.Z
+    out = np.einsum("g,gj,gk->jk", weights, data.node_bend[index], data.node_slope[index])
+    return out * np.outer(y, z)
+
+
+def _assemble(arm, shapes, loads):
+    """`kernels.chain.Data` of an arm."""
+    N = len(arm.links)
+    modes = [_modes_of(link, shapes) for link in arm.links]
+    K = max(1, *(len(m) for m in modes)) if N > 1 else max(1, len(modes[0]))
+    level = plain.FIRST_ORDER
+    if arm.foreshortening:
+        level = plain.FORESHORTENING
+    if arm.finite_slope:
+        level = plain.FINITE_SLOPE
+    most = max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
+    G = 1 if level == plain.FIRST_ORDER or not most else 12 + 4 * most
+    points, weights = np.polynomial.legendre.leggauss(G)
+    points, weights = 0.5 * (points + 1.0), 0.5 * weights
+    integrate = cumulative(points, np.append(points, 1.0))
+    z = np.zeros
+    a = {
+        "links": N,
+        "level": level,
+        "nodes": G,
+        "count": np.array([len(m) for m in modes], np.int64),
+        "first": np.cumsum([0] + [len(m) for m in modes])[:-1].astype(np.int64),
+        "direction": np.zeros((N, K), np.int64),
+        "axis": np.array([j.axis for j in arm.joints]),
+        "xyz": np.array([j.origin_xyz for j in arm.joints]),
+        "turn": np.array([rotation(j.origin_rpy) for j in arm.joints]),
+        "gear": np.array([j.gear_ratio for j in arm.joints]),
+        "rotor": np.array([j.rotor_inertia for j in arm.joints]),
+        "length": np.array([link.length for link in arm.links]),
+        "mass": z(N), "moment": z(N), "inertia": z((N, 3, 3)), "s": z((N, K)), "e": z((N, K)),
+        "gram": z((N, K, K)), "stiffness": z((N, K, K)), "damping": z((N, K, K)), "tip": z((N, K)),
+        "slope": z((N, K)), "node_x": z((N, G)), "node_mass": z((N, G)), "node_phi": z((N, G, K)),
+        "node_slope": z((N, G, K)), "node_bend": z((N, G, K)), "node_ei": z((N, G, 2)),
+        "cumulate": z((N, G + 1, G)), "bishop": z((N, K, K)),
+    }  # fmt: skip
+    for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
+        L, rho = link.length, link.mass_per_length
+        body = _straight(link, joint)
+        a["mass"][i], a["moment"][i], a["inertia"][i] = body.mass, body.moment[0], body.inertia
+        a["node_x"][i], a["node_mass"][i] = L * points, L * rho * weights
+        a["cumulate"][i] = L * integrate
+        for c, direction in enumerate(("y", "z")):
+            a["node_ei"][i, :, c] = L * weights * link.stiffness.get(direction, 0.0)
+        for j, (shape, number, direction) in enumerate(modes[i]):
+            _fill_mode(a, i, j, link, shape, number, direction, points)
+        for j, (shape, number, direction) in enumerate(modes[i]):
+            for k, (other, second, across) in enumerate(modes[i]):
+                a["gram"][i, j, k] = _gram(link, shape, number, direction, other, second, across)
+        start = 0
+        for direction in _KIND_ORDER:
+            if direction not in link.flexible:
+                continue
+            shape = shapes[link.name, direction]
+            block = (i, slice(start, start + shape.count), slice(start, start + shape.count))
+            start += shape.count
+            power = 1 if direction == "twist" else 2
+            stiff = link.stiffness[direction] / L ** (2 * power - 1) * shape.gram(power)
+            a["stiffness"][block] = stiff
+            a["damping"][block] = damping_matrix(
+                _clamped_mass(link, direction, shape, loads[i]),
+                stiff,
+                link.flexible[direction].damping,
+            )
+    body = _payload(arm)
+    data = plain.Data(
+        **a,
+        payload_mass=np.array([body.mass]),
+        payload_moment=body.moment,
+        payload_inertia=body.inertia,
+        gravity=np.asarray(arm.gravity, float),
+    )
+    if level != plain.FIRST_ORDER:
+        for i in range(N):
+            data.bishop[i] = _bishop(data, i, data.cumulate[i, -1])
+    return data
+
+
+def _fill_mode(a, i, j, link, shape, number, direction, points):
+    """The constants of one mode that concern no other."""
+    L, rho = link.length, link.mass_per_length
+    a["direction"][i, j] = _KIND[direction]
+    if direction == "twist":
+        a["s"][i, j] = link.polar_inertia_per_length * L * shape.integral()[number]
+        a["slope"][i, j] = shape(1.0)[number]
+        return
+    a["s"][i, j] = rho * L * shape.integral()[number]
+    a["e"][i, j] = rho * L**2 * shape.integral(lambda xi: xi)[number]
+    a["tip"][i, j] = shape(1.0)[number]
+    a["slope"][i, j] = shape(1.0, 1)[number] / L
+    a["node_phi"][i, :, j] = shape(points)[:, number]
+    a["node_slope"][i, :, j] = shape(points, 1)[:, number] / L
+    a["node_bend"][i, :, j] = shape(points, 2)[:, number] / L**2
+
+
+def _gram(link, shape, number, direction, other, second, across):
+    """int phi_j phi_k dm of two modes of a link; zero between bending and twist."""
+    if (direction == "twist") != (across == "twist"):
+        return 0.0
+    if direction == "twist":
+        return link.polar_inertia_per_length * link.length * shape.gram()[number, second]
+    if direction == across:
+        return link.mass * shape.gram()[number, second]
+    return link.mass * beam.overlap(shape, other)[number, second]

@@ -1,0 +1,1202 @@
+r"""Equations of motion of a serial chain of flexible links, recursively, in O(number of links).
+
+The same functions run in three ways: as they stand (for reading and debugging), compiled by numba
+(`kernels.compiled`), and on symbols, which turns them into straight-line code for one arm's structure
+(`kernels.generated`). Hence scalar arithmetic on arrays that the caller provides, and no test of a value.
+
+Floating frames: link i's frame sits at its base, x along the undeformed axis. A point of the axis is at
+
+.. math:: r(x, \delta) = (x - s,\ \sum\phi_j\delta_j,\ \sum\phi_k\delta_k), \qquad
+   s = \int_0^x f\,dx', \quad f = 0,\ \tfrac12 u,\ 1 - \sqrt{1 - u}, \quad u = y'^2 + z'^2,
+
+for the levels FIRST_ORDER, FORESHORTENING and FINITE_SLOPE. With the frame's angular velocity w, its angular
+acceleration and its origin's acceleration (al, a0), all in link coordinates, the principle of virtual power
+with the partial velocities (1, -r x, r_j = dr/d delta_j) gives each link's equations
+
+.. math::
+    n &= J\,al + c\times a_0 + l\,\ddot\delta + N, \\
+    f &= m\,a_0 + al\times c + p\,\ddot\delta + F, \\
+    Q_j &= l_j\cdot al + p_j\cdot a_0 + M_{jk}\ddot\delta_k + q_j,
+
+where c, J, p, l, M are the integrals of r, -r x r x, r_j, r x r_j, r_j r_k over the mass and (N, F, q) those of
+w x (w x r) + 2 w x r' + r_jk delta_j' delta_k'. The tip's frame is turned against the base's by three angles,
+R = Rz(a) Ry(-b) Rx(t): a = y', b = z', t = twist at first order.
+
+Recursive assembly: Book (1984), Int. J. Robotics Research 3(3); articulated-body form: Featherstone (2008),
+Rigid Body Dynamics Algorithms, ch. 7, here with modal coordinates eliminated link by link.
+"""
+
+from collections import namedtuple
+
+import numpy as np
+
+TWIST, Y, Z = 0, 1, 2
+FIRST_ORDER, FORESHORTENING, FINITE_SLOPE = 0, 1, 2
+
+#: Constants of an arm: N links, at most K modes each, G quadrature nodes. SI.
+DATA = {
+    "links": (),  # N; arrays may be longer than that
+    "level": (),  # FIRST_ORDER, FORESHORTENING or FINITE_SLOPE
+    "nodes": (),  # G
+    "count": ("N",),  # modes of each link
+    "first": ("N",),  # where they start in delta
+    "direction": ("N", "K"),  # TWIST, Y or Z
+    "axis": ("N", 3),  # of the joint, in the joint's frame
+    "xyz": ("N", 3),  # joint's origin in the previous tip's frame
+    "turn": ("N", 3, 3),  # and its orientation
+    "gear": ("N",),
+    "rotor": ("N",),  # rotor inertia, motor side
+    "length": ("N",),
+    "mass": ("N",),  # beam, and the motor at its base
+    "moment": ("N",),  # int x dm
+    "inertia": ("N", 3, 3),  # of the straight link about its frame's origin, hub included
+    "s": ("N", "K"),  # int phi dm; twist: int theta rho I_p dx
+    "e": ("N", "K"),  # int x phi dm
+    "gram": (
+        "N",
+        "K",
+        "K",
+    ),  # int phi_j phi_k dm, across directions too; twist: int theta theta rho I_p dx
+    "stiffness": ("N", "K", "K"),
+    "damping": ("N", "K", "K"),
+    "tip": ("N", "K"),  # phi(L)
+    "slope": ("N", "K"),  # phi'(L); twist: theta(L)
+    "node_x": ("N", "G"),
+    "node_mass": ("N", "G"),  # quadrature weight times rho A
+    "node_phi": ("N", "G", "K"),
+    "node_slope": ("N", "G", "K"),
+    "node_bend": ("N", "G", "K"),  # phi''
+    "node_ei": ("N", "G", 2),  # quadrature weight times EI along y and z
+    "cumulate": ("N", "G+1", "G"),  # integrals from the base to each node and to the tip
+    "bishop": ("N", "K", "K"),  # int phi_y'' phi_z' dx
+    "payload_mass": (1,),
+    "payload_moment": (3,),  # in the tip's frame, about the tip
+    "payload_inertia": (3, 3),
+    "gravity": (3,),  # in the base frame
+}
+
+#: Work space, filled by `prepare` (kinematics and inertia) and by the recursions. Row N is the tip's.
+WORK = {
+    "frame": ("N+1", 3, 3),  # link to previous link's coordinates
+    "omega": ("N+1", 3),  # angular velocity of each link's frame, in its coordinates
+    "carrier": (
+        "N+1",
+        3,
+    ),  # angular velocity of what carries the joint, link coordinates; N: of the tip, link N - 1's
+    "arm": ("N+1", 3),  # from link i - 1's base to joint i, its coordinates
+    "partial": ("N+1", "K", 3),  # d arm / d delta of link i - 1
+    "turning": ("N+1", "K", 3),  # angular partial velocity of its tip
+    "bias_a": (
+        "N+1",
+        3,
+    ),  # acceleration of joint i that its parent's al, a0, delta_dd do not explain
+    "bias_al": ("N+1", 3),  # angular likewise
+    "c": ("N", 3),
+    "J": ("N", 3, 3),
+    "p": ("N", "K", 3),
+    "l": ("N", "K", 3),
+    "M": ("N", "K", "K"),
+    "N": ("N", 3),
+    "F": ("N", 3),
+    "q": ("N", "K"),  # velocity terms of the modes; the elastic force is apart
+    "elastic": ("N", "K"),
+    "al": ("N+1", 3),
+    "a0": ("N+1", 3),
+    "X": ("N+1", 3, 3),  # articulated inertia: n = X al + Y a0 + zn, f = Y' al + Z a0 + zf
+    "Y": ("N+1", 3, 3),
+    "Z": ("N+1", 3, 3),
+    "zn": ("N+1", 3),
+    "zf": ("N+1", 3),
+    "B": (
+        "N",
+        "K",
+        "K",
+    ),  # L of the articulated modal mass L D L', on its diagonal the inverse of D
+    "Bd": ("N", "K", "K"),  # L D
+    "Ca": ("N", "K", 3),  # rows of its coupling to al
+    "Cf": ("N", "K", 3),  # and to a0
+    "rhs": ("N", "K"),
+    "Ua": ("N", 3),
+    "Uf": ("N", 3),
+    "D": ("N",),
+    "u": ("N",),
+    "t": (12, 3),  # scratch
+    "tm": (6, 3, 3),  # scratch
+    "node": (5, "G+1"),  # integrands at the nodes and what they integrate to
+    "node_partial": (2, "G+1", "K"),
+}
+
+Data = namedtuple("Data", DATA)
+Work = namedtuple("Work", WORK)
+
+
+def cross(a, b, out):
+    """Out = a x b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+def dot(a, b):
+    """Return a . b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def apply(R, a, out):
+    """Out = R a."""
+    for i in range(3):
+        out[i] = R[i, 0] * a[0] + R[i, 1] * a[1] + R[i, 2] * a[2]
+
+
+def apply_transposed(R, a, out):
+    """Out = R' a."""
+    for i in range(3):
+        out[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
+
+
+def product(A, B, out):
+    """Out = A B."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+def congruence(R, A, scratch, out):
+    """Out = R A R'."""
+    product(R, A, scratch)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = scratch[i, 0] * R[j, 0] + scratch[i, 1] * R[j, 1] + scratch[i, 2] * R[j, 2]
+
+
+def symmetric_congruence(R, A, scratch, out):
+    """Out = R A R' for a symmetric A."""
+    product(R, A, scratch)
+    for i in range(3):
+        for j in range(i + 1):
+            out[i, j] = scratch[i, 0] * R[j, 0] + scratch[i, 1] * R[j, 1] + scratch[i, 2] * R[j, 2]
+            out[j, i] = out[i, j]
+
+
+def about_axis(a, angle, out):
+    """Out = rotation by an angle about the unit vector a: a a' + (1 - a a') cos + [a] sin."""
+    s, c = np.sin(angle), np.cos(angle)
+    for i in range(3):
+        out[i, i] = a[i] * a[i] + (1.0 - a[i] * a[i]) * c
+        for j in range(i):
+            out[i, j] = a[i] * a[j] - a[i] * a[j] * c
+            out[j, i] = out[i, j]
+    out[0, 1] -= a[2] * s
+    out[1, 0] += a[2] * s
+    out[0, 2] += a[1] * s
+    out[2, 0] -= a[1] * s
+    out[1, 2] -= a[0] * s
+    out[2, 1] += a[0] * s
+
+
+def shorten(d, w, i, delta, delta_d):
+    """Foreshortening s of link i at its nodes and tip, its partials, and its second derivative along delta_d."""
+    K, G, first = d.count[i], d.nodes, d.first[i]
+    for g in range(G):
+        sy, sz, syd, szd = 0.0, 0.0, 0.0, 0.0
+        for j in range(K):
+            slope = d.node_slope[i, g, j]
+            if d.direction[i, j] == Y:
+                sy += slope * delta[first + j]
+                syd += slope * delta_d[first + j]
+            elif d.direction[i, j] == Z:
+                sz += slope * delta[first + j]
+                szd += slope * delta_d[first + j]
+        u, half, dd = sy * sy + sz * sz, sy * syd + sz * szd, syd * syd + szd * szd
+        if d.level == FINITE_SLOPE:
+            root = np.sqrt(1.0 - u)
+            w.node[0, g] = u / (1.0 + root)  # 1 - root, without cancellation
+            gain = 1.0 / root
+            dd = (dd + half * half / (1.0 - u)) / root
+        else:
+            w.node[0, g] = 0.5 * u
+            gain = 1.0
+        w.node[1, g] = dd
+        for j in range(K):
+            if d.direction[i, j] == Y:
+                w.node_partial[0, g, j] = gain * sy * d.node_slope[i, g, j]
+            elif d.direction[i, j] == Z:
+                w.node_partial[0, g, j] = gain * sz * d.node_slope[i, g, j]
+            else:
+                w.node_partial[0, g, j] = 0.0
+    for h in range(G + 1):
+        s, sdd = 0.0, 0.0
+        for g in range(G):
+            s += d.cumulate[i, h, g] * w.node[0, g]
+            sdd += d.cumulate[i, h, g] * w.node[1, g]
+        w.node[2, h], w.node[3, h] = s, sdd
+        sd = 0.0
+        for j in range(K):
+            acc = 0.0
+            for g in range(G):
+                acc += d.cumulate[i, h, g] * w.node_partial[0, g, j]
+            w.node_partial[1, h, j] = acc
+            sd += acc * delta_d[first + j]
+        w.node[4, h] = sd
+
+
+def body_first_order(d, w, i, delta, delta_d, om):
+    """Integrals of link i over its mass for r linear in delta, from constants."""
+    K, first = d.count[i], d.first[i]
+    yy, zz, yz, xy, xz = 0.0, 0.0, 0.0, 0.0, 0.0
+    ryy, rzz, ryz, rzy, rxy, rxz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    cy, cz, cyd, czd, spin = 0.0, 0.0, 0.0, 0.0, 0.0
+    wx, wy, wz = om[0], om[1], om[2]
+    w2 = wx * wx + wy * wy + wz * wz
+    for j in range(K):
+        dj, vj = delta[first + j], delta_d[first + j]
+        kind = d.direction[i, j]
+        # Sums over the modes of each direction: G Y, G Z and their rates.
+        gy, gz, gyd, gzd = 0.0, 0.0, 0.0, 0.0
+        for k in range(K):
+            g = d.gram[i, j, k]
+            if d.direction[i, k] == Y:
+                gy += g * delta[first + k]
+                gyd += g * delta_d[first + k]
+            elif d.direction[i, k] == Z:
+                gz += g * delta[first + k]
+                gzd += g * delta_d[first + k]
+            w.M[i, j, k] = g if kind == d.direction[i, k] else 0.0
+        for k in range(3):
+            w.p[i, j, k] = 0.0
+            w.l[i, j, k] = 0.0
+        s, e = d.s[i, j], d.e[i, j]
+        if kind == TWIST:
+            w.l[i, j, 0] = s
+            spin += s * vj
+            w.q[i, j] = 0.0
+            continue
+        along = wx * e + wy * gy + wz * gz
+        if kind == Y:
+            cy += s * dj
+            cyd += s * vj
+            xy += e * dj
+            rxy += e * vj
+            yy += dj * gy
+            yz += dj * gz
+            ryy += dj * gyd
+            ryz += dj * gzd
+            w.p[i, j, 1] = s
+            w.l[i, j, 0] = -gz
+            w.l[i, j, 2] = e
+            w.q[i, j] = wy * along - w2 * gy - 2.0 * wx * gzd
+        else:
+            cz += s * dj
+            czd += s * vj
+            xz += e * dj
+            rxz += e * vj
+            zz += dj * gz
+            rzz += dj * gzd
+            rzy += dj * gyd
+            w.p[i, j, 2] = s
+            w.l[i, j, 0] = gy
+            w.l[i, j, 1] = -e
+            w.q[i, j] = wz * along - w2 * gz + 2.0 * wx * gyd
+    c, J, N, F, t = w.c[i], w.J[i], w.N[i], w.F[i], w.t
+    c[0], c[1], c[2] = d.moment[i], cy, cz
+    for k in range(3):
+        for n in range(3):
+            J[k, n] = d.inertia[i, k, n]
+    J[0, 0] += yy + zz
+    J[1, 1] += zz
+    J[2, 2] += yy
+    J[0, 1] -= xy
+    J[1, 0] -= xy
+    J[0, 2] -= xz
+    J[2, 0] -= xz
+    J[1, 2] -= yz
+    J[2, 1] -= yz
+    # F = w x (w x c) + 2 w x c'
+    t[1, 0], t[1, 1], t[1, 2] = 0.0, 2.0 * cyd, 2.0 * czd
+    cross(om, c, t[0])
+    for k in range(3):
+        t[0, k] += t[1, k]
+    cross(om, t[0], F)
+    # N = w x (J w + x spin) + 2 int r x (w x r'); the rest of F's 2 w x c' is in the latter.
+    apply(J, om, t[0])
+    t[0, 0] += spin
+    cross(om, t[0], N)
+    rr = ryy + rzz
+    N[0] += 2.0 * wx * rr
+    N[1] += 2.0 * (wy * rr - (rxy * wx + ryy * wy + rzy * wz))
+    N[2] += 2.0 * (wz * rr - (rxz * wx + ryz * wy + rzz * wz))
+
+
+def body_at_nodes(d, w, i, delta, delta_d, om):
+    """Integrals of link i over its mass by quadrature, foreshortening included."""
+    K, G, first = d.count[i], d.nodes, d.first[i]
+    shorten(d, w, i, delta, delta_d)
+    c, J, N, F, t = w.c[i], w.J[i], w.N[i], w.F[i], w.t
+    point, rate, bias, part, other = t[0], t[1], t[2], t[3], t[4]
+    for k in range(3):
+        c[k] = 0.0
+        N[k] = 0.0
+        F[k] = 0.0
+        for n in range(3):
+            J[k, n] = d.inertia[i, k, n]
+    # The straight beam's share is integrated below with the rest.
+    straight = 0.0
+    for g in range(G):
+        straight += d.node_mass[i, g] * d.node_x[i, g] * d.node_x[i, g]
+    J[1, 1] -= straight
+    J[2, 2] -= straight
+    spin = 0.0
+    for j in range(K):
+        for k in range(3):
+            w.p[i, j, k] = 0.0
+            w.l[i, j, k] = 0.0
+        twist = d.direction[i, j] == TWIST
+        if twist:
+            w.l[i, j, 0] = d.s[i, j]
+            spin += d.s[i, j] * delta_d[first + j]
+        for k in range(K):
+            w.M[i, j, k] = d.gram[i, j, k] if twist and d.direction[i, k] == TWIST else 0.0
+        w.q[i, j] = 0.0
+    # So far J holds the hub and the sections' polar inertia: their share of N.
+    apply(J, om, t[6])
+    t[6, 0] += spin
+    cross(om, t[6], t[7])
+    for k in range(3):
+        N[k] += t[7, k]
+    for g in range(G):
+        mass = d.node_mass[i, g]
+        point[0], point[1], point[2] = d.node_x[i, g] - w.node[2, g], 0.0, 0.0
+        rate[0], rate[1], rate[2] = -w.node[4, g], 0.0, 0.0
+        for j in range(K):
+            kind = d.direction[i, j]
+            if kind != TWIST:
+                point[kind] += d.node_phi[i, g, j] * delta[first + j]
+                rate[kind] += d.node_phi[i, g, j] * delta_d[first + j]
+        cross(om, point, bias)
+        for k in range(3):
+            bias[k] += 2.0 * rate[k]
+        cross(om, bias, t[5])
+        bias[0], bias[1], bias[2] = t[5, 0] - w.node[3, g], t[5, 1], t[5, 2]
+        square = dot(point, point)
+        for k in range(3):
+            c[k] += mass * point[k]
+            F[k] += mass * bias[k]
+            J[k, k] += mass * square
+            for n in range(3):
+                J[k, n] -= mass * point[k] * point[n]
+        cross(point, bias, t[5])
+        for k in range(3):
+            N[k] += mass * t[5, k]
+        for j in range(K):
+            kind = d.direction[i, j]
+            if kind == TWIST:
+                continue
+            part[0], part[1], part[2] = -w.node_partial[1, g, j], 0.0, 0.0
+            part[kind] += d.node_phi[i, g, j]
+            cross(point, part, t[5])
+            for k in range(3):
+                w.p[i, j, k] += mass * part[k]
+                w.l[i, j, k] += mass * t[5, k]
+            w.q[i, j] += mass * dot(part, bias)
+            for k in range(K):
+                kind2 = d.direction[i, k]
+                if kind2 == TWIST:
+                    continue
+                other[0], other[1], other[2] = -w.node_partial[1, g, k], 0.0, 0.0
+                other[kind2] += d.node_phi[i, g, k]
+                w.M[i, j, k] += mass * dot(part, other)
+
+
+def elastic_force(d, w, i, delta):
+    """Gradient of link i's elastic energy with respect to its modal amplitudes."""
+    K, first = d.count[i], d.first[i]
+    for j in range(K):
+        acc = 0.0
+        for k in range(K):
+            if d.level != FINITE_SLOPE or d.direction[i, j] == TWIST:
+                acc += d.stiffness[i, j, k] * delta[first + k]
+        w.elastic[i, j] = acc
+    if d.level != FINITE_SLOPE:
+        return
+    for g in range(d.nodes):
+        sy, sz, by, bz = slopes_and_bends(d, i, g, delta)
+        # EI_y k_y^2 / 2 + EI_z k_z^2 / 2 with k_z = z''/sqrt(1 - z'^2), k_y = (y'' + y' z' z''/c)/root.
+        c = 1.0 - sz * sz
+        u = c - sy * sy
+        root = np.sqrt(u / c)
+        top = by + sy * sz * bz / c
+        ky = top / root
+        kz2 = bz / c  # k_z times its derivative with respect to z''
+        wy, wz = d.node_ei[i, g, 0], d.node_ei[i, g, 1]
+        # d root/d y' = -y'/(c root); d root/d z' = -y'^2 z'/(c^2 root)
+        ky_sy = sz * bz / (c * root) + ky * sy / (c * root * root)
+        ky_sz = sy * bz * (1.0 + sz * sz) / (c * c * root) + ky * sy * sy * sz / (
+            c * c * root * root
+        )
+        ky_by = 1.0 / root
+        ky_bz = sy * sz / (c * root)
+        for j in range(K):
+            phi1, phi2 = d.node_slope[i, g, j], d.node_bend[i, g, j]
+            if d.direction[i, j] == Y:
+                w.elastic[i, j] += wy * ky * (ky_sy * phi1 + ky_by * phi2)
+            elif d.direction[i, j] == Z:
+                w.elastic[i, j] += wy * ky * (ky_sz * phi1 + ky_bz * phi2) + wz * (
+                    kz2 * phi2 + kz2 * kz2 * sz * phi1
+                )
+
+
+def slopes_and_bends(d, i, g, delta):
+    """Slopes y', z' and second derivatives y'', z'' of link i at node g."""
+    sy, sz, by, bz = 0.0, 0.0, 0.0, 0.0
+    for j in range(d.count[i]):
+        x = delta[d.first[i] + j]
+        if d.direction[i, j] == Y:
+            sy += d.node_slope[i, g, j] * x
+            by += d.node_bend[i, g, j] * x
+        elif d.direction[i, j] == Z:
+            sz += d.node_slope[i, g, j] * x
+            bz += d.node_bend[i, g, j] * x
+    return sy, sz, by, bz
+
+
+def tip(d, w, i, delta, delta_d, om):
+    """Link i's tip and what hangs on it: frame, partial velocities and biases, into row i + 1 of the work space."""
+    K, first, n = d.count[i], d.first[i], i + 1
+    G = d.nodes
+    arm, frame, t, tm = w.arm[n], w.frame[n], w.t, w.tm
+    short, short_d, short_dd = 0.0, 0.0, 0.0
+    if d.level != FIRST_ORDER and K > 0:
+        # `body_at_nodes` has just filled them for this link.
+        short, short_dd, short_d = w.node[2, G], w.node[3, G], w.node[4, G]
+    arm[0], arm[1], arm[2] = d.length[i] - short, 0.0, 0.0
+    rate = t[0]
+    rate[0], rate[1], rate[2] = -short_d, 0.0, 0.0
+    sy, sz, syd, szd, twist, twist_d, twist_dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(K):
+        kind = d.direction[i, j]
+        x, v = delta[first + j], delta_d[first + j]
+        for k in range(3):
+            w.partial[n, j, k] = 0.0
+        if kind == TWIST:
+            twist += d.slope[i, j] * x
+            twist_d += d.slope[i, j] * v
+            continue
+        arm[kind] += d.tip[i, j] * x
+        rate[kind] += d.tip[i, j] * v
+        w.partial[n, j, kind] = d.tip[i, j]
+        if d.level != FIRST_ORDER:
+            w.partial[n, j, 0] = -w.node_partial[1, G, j]
+        if kind == Y:
+            sy += d.slope[i, j] * x
+            syd += d.slope[i, j] * v
+        else:
+            sz += d.slope[i, j] * x
+            szd += d.slope[i, j] * v
+    # Angles a about z, b about -y, with derivatives by the slopes (y', z').
+    a, b, ay, az, bz = sy, sz, 1.0, 0.0, 1.0
+    add, bdd = 0.0, 0.0
+    if d.level == FINITE_SLOPE:
+        cc = 1.0 - sz * sz
+        c = np.sqrt(cc)
+        rr = cc - sy * sy
+        r = np.sqrt(rr)
+        a, b = np.arcsin(sy / c), np.arcsin(sz)
+        ay, az, bz = 1.0 / r, sy * sz / (cc * r), 1.0 / c
+        ayy = sy / (rr * r)
+        ayz = sz / (rr * r)
+        azz = sy / (cc * r) * (1.0 + sz * sz / rr + 2.0 * sz * sz / cc)
+        add = ayy * syd * syd + 2.0 * ayz * syd * szd + azz * szd * szd
+        bdd = sz / (cc * c) * szd * szd
+    if d.level != FIRST_ORDER:
+        # A beam that does not twist turns about its axis by -int a' sin b dx, at second order -int y'' z'.
+        for j in range(K):
+            for k in range(K):
+                g = d.bishop[i, j, k]
+                twist -= g * delta[first + j] * delta[first + k]
+                twist_d -= g * (
+                    delta_d[first + j] * delta[first + k] + delta[first + j] * delta_d[first + k]
+                )
+                twist_dd -= 2.0 * g * delta_d[first + j] * delta_d[first + k]
+    ad, bd = ay * syd + az * szd, bz * szd
+    sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+    st, ct = np.sin(twist), np.cos(twist)
+    # Columns of Rz(a) Ry(-b) Rx(t): the tangent, and the section's axes.
+    across, along = t[1], t[2]
+    across[0], across[1], across[2] = sa, -ca, 0.0  # -y axis after Rz(a)
+    along[0], along[1], along[2] = ca * cb, sa * cb, sb
+    frame[0, 0], frame[1, 0], frame[2, 0] = along[0], along[1], along[2]
+    frame[0, 1], frame[1, 1], frame[2, 1] = (
+        -sa * ct - ca * sb * st,
+        ca * ct - sa * sb * st,
+        cb * st,
+    )
+    frame[0, 2], frame[1, 2], frame[2, 2] = (
+        sa * st - ca * sb * ct,
+        -ca * st - sa * sb * ct,
+        cb * ct,
+    )
+    for j in range(K):
+        kind, slope = d.direction[i, j], d.slope[i, j]
+        ga, gb, gt = 0.0, 0.0, 0.0
+        if kind == Y:
+            ga = ay * slope
+        elif kind == Z:
+            ga, gb = az * slope, bz * slope
+        else:
+            gt = slope
+        if d.level != FIRST_ORDER:
+            for k in range(K):
+                gt -= (d.bishop[i, j, k] + d.bishop[i, k, j]) * delta[first + k]
+        for k in range(3):
+            w.turning[n, j, k] = gb * across[k] + gt * along[k]
+        w.turning[n, j, 2] += ga
+    turn, spin = t[3], t[4]
+    for k in range(3):
+        turn[k] = bd * across[k]
+    turn[2] += ad
+    for k in range(3):
+        spin[k] = turn[k] + twist_d * along[k]
+    # al_bias = w x spin + (a'' z + b'' across + t'' along) + a' z x b' across + turn x t' along
+    bias_al, bias_a = w.bias_al[n], w.bias_a[n]
+    cross(om, spin, bias_al)
+    cross(turn, along, t[5])
+    for k in range(3):
+        bias_al[k] += bdd * across[k] + twist_dd * along[k] + twist_d * t[5, k]
+    bias_al[2] += add
+    bias_al[0] += ad * bd * ca
+    bias_al[1] += ad * bd * sa
+    # a_bias = w x (w x arm) + 2 w x rate + r_dd
+    cross(om, arm, t[5])
+    for k in range(3):
+        t[5, k] += 2.0 * rate[k]
+    cross(om, t[5], bias_a)
+    bias_a[0] -= short_dd
+    carried = t[6]
+    for k in range(3):
+        carried[k] = om[k] + spin[k]
+    if n == d.links:
+        apply_transposed(frame, carried, w.omega[n])
+        for k in range(3):
+            w.carrier[n, k] = carried[k]
+        return
+    # The joint sits off the tip by xyz and turns with it.
+    off = t[7]
+    apply(frame, d.xyz[n], off)
+    for j in range(K):
+        cross(w.turning[n, j], off, t[5])
+        for k in range(3):
+            w.partial[n, j, k] += t[5, k]
+    cross(bias_al, off, t[5])
+    cross(carried, off, t[8])
+    cross(carried, t[8], t[9])
+    for k in range(3):
+        arm[k] += off[k]
+        bias_a[k] += t[5, k] + t[9, k]
+    product(frame, d.turn[n], tm[0])
+    for k in range(3):
+        for m in range(3):
+            frame[k, m] = tm[0, k, m]
+    apply_transposed(frame, carried, w.carrier[n])
+
+
+def turn_joint(d, w, i, q, qd):
+    """Turn link i by its joint; `frame` and `carrier` of row i are those before the joint."""
+    about_axis(d.axis[i], q, w.tm[0])
+    product(w.frame[i], w.tm[0], w.tm[1])
+    apply_transposed(w.tm[0], w.carrier[i], w.t[0])
+    for k in range(3):
+        w.carrier[i, k] = w.t[0, k]
+        w.omega[i, k] = w.t[0, k] + d.axis[i, k] * qd
+        for m in range(3):
+            w.frame[i, k, m] = w.tm[1, k, m]
+
+
+def prepare(d, w, q, delta, qd, delta_d):
+    """Kinematics and inertia of all links at one state: what both recursions start from."""
+    N = d.links
+    for k in range(3):
+        w.arm[0, k] = d.xyz[0, k]
+        w.carrier[0, k] = 0.0
+        for m in range(3):
+            w.frame[0, k, m] = d.turn[0, k, m]
+    for i in range(N):
+        turn_joint(d, w, i, q[i], qd[i])
+        if d.level == FIRST_ORDER or d.count[i] == 0:
+            body_first_order(d, w, i, delta, delta_d, w.omega[i])
+        else:
+            body_at_nodes(d, w, i, delta, delta_d, w.omega[i])
+        elastic_force(d, w, i, delta)
+        tip(d, w, i, delta, delta_d, w.omega[i])
+
+
+def payload(d, w):
+    """Inertia and bias of the payload into row N, in the last link's coordinates, about its tip."""
+    N = d.links
+    X, Y, Z, zn, zf, s = w.X[N], w.Y[N], w.Z[N], w.zn[N], w.zf[N], w.t[6]
+    om, m = w.carrier[N], d.payload_mass[0]
+    symmetric_congruence(w.frame[N], d.payload_inertia, w.tm[0], X)
+    apply(w.frame[N], d.payload_moment, s)
+    for k in range(3):
+        for n in range(3):
+            Z[k, n] = 0.0
+        Z[k, k] = m
+    skew(s, Y)
+    cross(om, s, w.t[0])
+    cross(om, w.t[0], zf)
+    apply(X, om, w.t[0])
+    cross(om, w.t[0], zn)
+
+
+def skew(a, out):
+    """Out = a x as a matrix."""
+    out[0, 0], out[1, 1], out[2, 2] = 0.0, 0.0, 0.0
+    out[0, 1], out[0, 2], out[1, 2] = -a[2], a[1], -a[0]
+    out[1, 0], out[2, 0], out[2, 1] = a[2], -a[1], a[0]
+
+
+def start(w, gravity):
+    """Acceleration of the base: gravity is an upward acceleration of everything."""
+    apply_transposed(w.frame[0], gravity, w.a0[0])
+    for k in range(3):
+        w.a0[0, k] = -w.a0[0, k]
+
+
+def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
+    """Generalised forces that give the accelerations asked for (recursive Newton-Euler), after `prepare`.
+
+    Joint friction, modal stiffness and modal damping are not in them.
+    """
+    N = d.links
+    start(w, gravity)
+    for k in range(3):
+        w.al[0, k] = d.axis[0, k] * qdd[0]
+    for i in range(N):
+        n = i + 1
+        K, first = d.count[i], d.first[i]
+        al, a0 = w.t[0], w.t[1]
+        tip_acceleration(d, w, i, delta_dd, al, a0)
+        if n == N:
+            for k in range(3):
+                w.al[n, k], w.a0[n, k] = al[k], a0[k]
+        else:
+            apply_transposed(w.frame[n], al, w.al[n])
+            apply_transposed(w.frame[n], a0, w.a0[n])
+            cross(w.carrier[n], d.axis[n], w.t[2])
+            # Spin of the rotor as seen from the base: its rate needs the carrier's acceleration.
+            w.u[n] = d.rotor[n] * (dot(d.axis[n], w.al[n]) + d.gear[n] * qdd[n])
+            for k in range(3):
+                w.al[n, k] += w.t[2, k] * qd[n] + d.axis[n, k] * qdd[n]
+    w.u[0] = d.rotor[0] * d.gear[0] * qdd[0]
+    # Wrench on the payload, then link by link inwards; zn, zf hold it in link coordinates at the link's base.
+    payload(d, w)
+    add_inertial(w.X[N], w.Y[N], w.Z[N], w.al[N], w.a0[N], w.zn[N], w.zf[N])
+    for i in range(N - 1, -1, -1):
+        n = i + 1
+        K, first = d.count[i], d.first[i]
+        nj, fj = w.t[0], w.t[1]
+        if n == N:
+            for k in range(3):
+                nj[k], fj[k] = w.zn[n, k], w.zf[n, k]
+        else:
+            apply(w.frame[n], w.zn[n], nj)
+            apply(w.frame[n], w.zf[n], fj)
+        zn, zf, c, al, a0 = w.zn[i], w.zf[i], w.c[i], w.al[i], w.a0[i]
+        apply(w.J[i], al, zn)
+        cross(c, a0, w.t[2])
+        cross(al, c, w.t[3])
+        cross(w.arm[n], fj, w.t[4])
+        for k in range(3):
+            zn[k] += w.t[2, k] + w.N[i, k] + nj[k] + w.t[4, k]
+            zf[k] = d.mass[i] * a0[k] + w.t[3, k] + w.F[i, k] + fj[k]
+        for j in range(K):
+            acc = w.q[i, j] + dot(w.l[i, j], al) + dot(w.p[i, j], a0)
+            acc += dot(w.turning[n, j], nj) + dot(w.partial[n, j], fj)
+            x = delta_dd[first + j]
+            for k in range(K):
+                acc += w.M[i, j, k] * delta_dd[first + k]
+            for k in range(3):
+                zn[k] += w.l[i, j, k] * x
+                zf[k] += w.p[i, j, k] * x
+            modal[first + j] = acc
+        torque[i] = dot(d.axis[i], zn) + d.gear[i] * w.u[i]
+        add_rotor(d, w, i, qd[i], zn)
+
+
+def add_rotor(d, w, i, qd, zn):
+    """Add to the moment zn what the rotor of joint i, whose torque is u, asks of its carrier."""
+    spin = d.rotor[i] * (dot(d.axis[i], w.carrier[i]) + d.gear[i] * qd)
+    cross(w.carrier[i], d.axis[i], w.t[5])
+    for k in range(3):
+        zn[k] += d.axis[i, k] * w.u[i] + spin * w.t[5, k]
+
+
+def tip_acceleration(d, w, i, delta_dd, al, a0):
+    """Acceleration (al, a0) of what hangs on link i, in link i's coordinates."""
+    n, K, first = i + 1, d.count[i], d.first[i]
+    cross(w.al[i], w.arm[n], w.t[3])
+    for k in range(3):
+        al[k] = w.al[i, k] + w.bias_al[n, k]
+        a0[k] = w.a0[i, k] + w.t[3, k] + w.bias_a[n, k]
+    for j in range(K):
+        x = delta_dd[first + j]
+        for k in range(3):
+            al[k] += w.turning[n, j, k] * x
+            a0[k] += w.partial[n, j, k] * x
+
+
+def add_inertial(X, Y, Z, al, a0, zn, zf):
+    """Add [X Y; Y' Z] (al, a0) to (zn, zf)."""
+    for i in range(3):
+        zn[i] += dot(X[i], al) + dot(Y[i], a0)
+        zf[i] += Y[0, i] * al[0] + Y[1, i] * al[1] + Y[2, i] * al[2] + dot(Z[i], a0)
+
+
+def articulate_tip(d, w, i):
+    """Fold what hangs on link i (row i + 1) into link i's inertia, in link i's coordinates."""
+    n, K = i + 1, d.count[i]
+    tm, t = w.tm, w.t
+    C = w.frame[n]
+    X, Y, Z = tm[1], tm[2], tm[3]
+    zn, zf = t[0], t[1]
+    if n == d.links:
+        for k in range(3):
+            zn[k], zf[k] = w.zn[n, k], w.zf[n, k]
+            for m in range(3):
+                X[k, m], Y[k, m], Z[k, m] = w.X[n, k, m], w.Y[n, k, m], w.Z[n, k, m]
+    else:
+        symmetric_congruence(C, w.X[n], tm[0], X)
+        congruence(C, w.Y[n], tm[0], Y)
+        symmetric_congruence(C, w.Z[n], tm[0], Z)
+        apply(C, w.zn[n], zn)
+        apply(C, w.zf[n], zf)
+    add_inertial(X, Y, Z, w.bias_al[n], w.bias_a[n], zn, zf)
+    arm = w.arm[n]
+    # To the link's base: a_joint = a0 - arm x al.
+    S = tm[4]
+    skew(arm, S)
+    product(S, Z, tm[5])
+    Xi, Yi, Zi = w.X[i], w.Y[i], w.Z[i]
+    J, c = w.J[i], w.c[i]
+    skew(c, Yi)
+    for a in range(3):
+        for b in range(3):
+            Zi[a, b] = Z[a, b]
+            Yi[a, b] += Y[a, b] + tm[5, a, b]
+        for b in range(a + 1):
+            # [arm] Y' - Y [arm] - [arm] Z [arm]
+            acc = J[a, b] + X[a, b]
+            for k in range(3):
+                acc += S[a, k] * Y[b, k] - Y[a, k] * S[k, b] - tm[5, a, k] * S[k, b]
+            Xi[a, b] = acc
+            Xi[b, a] = acc
+        Zi[a, a] += d.mass[i]
+    for j in range(K):
+        W, P = w.turning[n, j], w.partial[n, j]
+        nk, fk = t[2], t[3]
+        for k in range(3):
+            nk[k], fk[k] = 0.0, 0.0
+        add_inertial(X, Y, Z, W, P, nk, fk)
+        for k in range(j + 1):
+            w.B[i, j, k] = w.M[i, j, k] + dot(w.turning[n, k], nk) + dot(w.partial[n, k], fk)
+        cross(arm, fk, t[4])
+        for k in range(3):
+            w.Ca[i, j, k] = w.l[i, j, k] + nk[k] + t[4, k]
+            w.Cf[i, j, k] = w.p[i, j, k] + fk[k]
+        w.rhs[i, j] = -(w.q[i, j] + dot(W, zn) + dot(P, zf))
+    cross(arm, zf, t[4])
+    for k in range(3):
+        w.zn[i, k] = w.N[i, k] + zn[k] + t[4, k]
+        w.zf[i, k] = w.F[i, k] + zf[k]
+
+
+def eliminate_modes(d, w, i, force, extra):
+    """Factorise link i's modal mass, its modal coordinates eliminated from X, Y, Z, zn, zf."""
+    K, first = d.count[i], d.first[i]
+    B = w.B[i]
+    # L D L', unit lower L; the diagonal holds the inverse of D.
+    for j in range(K):
+        for k in range(j + 1):
+            acc = B[j, k] + extra[i, j, k]
+            for m in range(k):
+                acc -= w.Bd[i, j, m] * B[k, m]
+            if k < j:
+                w.Bd[i, j, k] = acc
+                B[j, k] = acc * B[k, k]
+            else:
+                B[j, j] = 1.0 / acc
+        # Rows of L^-1 (rhs, Ca, Cf).
+        w.rhs[i, j] += force[first + j]
+        for m in range(j):
+            b = B[j, m]
+            w.rhs[i, j] -= b * w.rhs[i, m]
+            for k in range(3):
+                w.Ca[i, j, k] -= b * w.Ca[i, m, k]
+                w.Cf[i, j, k] -= b * w.Cf[i, m, k]
+    for j in range(K):
+        Ca, Cf, r, inverse = w.Ca[i, j], w.Cf[i, j], w.rhs[i, j], B[j, j]
+        for a in range(3):
+            ga, gf = Ca[a] * inverse, Cf[a] * inverse
+            for b in range(3):
+                w.Y[i, a, b] -= ga * Cf[b]
+            for b in range(a + 1):
+                w.X[i, a, b] -= ga * Ca[b]
+                w.Z[i, a, b] -= gf * Cf[b]
+                w.X[i, b, a] = w.X[i, a, b]
+                w.Z[i, b, a] = w.Z[i, a, b]
+            w.zn[i, a] += ga * r
+            w.zf[i, a] += gf * r
+
+
+def eliminate_joint(d, w, i, qd, force, extra, driven, qdd):
+    """Eliminate joint i from row i: its inertia as its carrier feels it, in link i's coordinates."""
+    a, t = d.axis[i], w.t
+    X, Y, Z, zn, zf = w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
+    bias = t[0]
+    cross(w.carrier[i], a, bias)
+    spin = d.rotor[i] * (dot(a, w.carrier[i]) + d.gear[i] * qd)
+    Ua, Uf = w.Ua[i], w.Uf[i]
+    for k in range(3):
+        Ua[k] = dot(X[k], a)
+        Uf[k] = Y[0, k] * a[0] + Y[1, k] * a[1] + Y[2, k] * a[2]
+    D = dot(a, Ua) + d.gear[i] * d.gear[i] * d.rotor[i] + extra
+    u = force - dot(a, zn) - qd * dot(Ua, bias)
+    for k in range(3):
+        zf[k] += qd * (Y[0, k] * bias[0] + Y[1, k] * bias[1] + Y[2, k] * bias[2])
+        t[1, k] = qd * dot(X[k], bias)
+    for k in range(3):
+        zn[k] += t[1, k] + spin * bias[k]
+        Ua[k] += d.gear[i] * d.rotor[i] * a[k]
+        for m in range(3):
+            X[k, m] += d.rotor[i] * a[k] * a[m]
+    if driven:
+        for k in range(3):
+            zn[k] += Ua[k] * qdd
+            zf[k] += Uf[k] * qdd
+        w.u[i] = qdd
+        return
+    inverse = 1.0 / D
+    w.D[i], w.u[i] = inverse, u
+    for k in range(3):
+        ga, gf = Ua[k] * inverse, Uf[k] * inverse
+        zn[k] += ga * u
+        zf[k] += gf * u
+        for m in range(3):
+            Y[k, m] -= ga * Uf[m]
+        for m in range(k + 1):
+            X[k, m] -= ga * Ua[m]
+            Z[k, m] -= gf * Uf[m]
+            X[m, k] = X[k, m]
+            Z[m, k] = Z[k, m]
+
+
+def forward_dynamics(
+    d, w, qd, joint_force, modal_force, joint_extra, modal_extra, driven, qdd, delta_dd
+):
+    """Accelerations under generalised forces (articulated-body recursion), after `prepare`.
+
+    Joints with `driven` are moved with the given qdd; of the others qdd is written. `joint_extra` (N,) and
+    `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix: the implicit integrator's.
+    """
+    N = d.links
+    payload(d, w)
+    for i in range(N - 1, -1, -1):
+        articulate_tip(d, w, i)
+        eliminate_modes(d, w, i, modal_force, modal_extra)
+        eliminate_joint(d, w, i, qd[i], joint_force[i], joint_extra[i], driven[i], qdd[i])
+    start(w, d.gravity)
+    for k in range(3):
+        w.al[0, k] = 0.0
+    for i in range(N):
+        n = i + 1
+        K, first = d.count[i], d.first[i]
+        al, a0 = w.al[i], w.a0[i]
+        if not driven[i]:
+            qdd[i] = w.D[i] * (w.u[i] - dot(w.Ua[i], al) - dot(w.Uf[i], a0))
+        cross(w.carrier[i], d.axis[i], w.t[0])
+        for k in range(3):
+            al[k] += d.axis[i, k] * qdd[i] + w.t[0, k] * qd[i]
+        for j in range(K - 1, -1, -1):
+            acc = w.rhs[i, j] - dot(w.Ca[i, j], al) - dot(w.Cf[i, j], a0)
+            acc *= w.B[i, j, j]
+            for k in range(j + 1, K):
+                acc -= w.B[i, k, j] * delta_dd[first + k]
+            delta_dd[first + j] = acc
+        if n < N:
+            tip_acceleration(d, w, i, delta_dd, w.t[1], w.t[2])
+            apply_transposed(w.frame[n], w.t[1], w.al[n])
+            apply_transposed(w.frame[n], w.t[2], w.a0[n])
+
+
+def modal_force(d, w, delta_d, force):
+    """Elastic and damping force of all modes, after `prepare`."""
+    for i in range(d.links):
+        for j in range(d.count[i]):
+            acc = -w.elastic[i, j]
+            for k in range(d.count[i]):
+                acc -= d.damping[i, j, k] * delta_d[d.first[i] + k]
+            force[d.first[i] + j] = acc
+
+
+def accelerations(d, w, q, delta, qd, delta_d, torque, force, none, driven, qdd, delta_dd):
+    """Joint and modal accelerations under joint torque (friction already taken off)."""
+    prepare(d, w, q, delta, qd, delta_d)
+    modal_force(d, w, delta_d, force)
+    forward_dynamics(d, w, qd, torque, force, none[0], none[1], driven, qdd, delta_dd)
+
+
+def slope(state, torque, data, out):
+    """Time derivative of the state (q, delta, qd, delta_d) under net joint torque; `data` as `Chain` packs it."""
+    constants, work, joint_extra, modal_extra, driven, force = data
+    d, w = constants[0], work[0]
+    n, m = torque.size, force.size
+    for i in range(n + m):
+        out[i] = state[n + m + i]
+    for i in range(n):
+        if driven[i]:  # what is called torque is then its acceleration
+            out[n + m + i] = torque[i]
+    q, delta = state[:n], state[n : n + m]
+    qd, delta_d = state[n + m : 2 * n + m], state[2 * n + m :]
+    prepare(d, w, q, delta, qd, delta_d)
+    modal_force(d, w, delta_d, force)
+    forward_dynamics(
+        d, w, qd, torque, force, joint_extra, modal_extra, driven,
+        out[n + m : 2 * n + m], out[2 * n + m :],
+    )  # fmt: skip
+
+
+def bias_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out):
+    """All generalised forces of (2) but the inertial ones and joint friction."""
+    d, w = data[0], work[0]
+    n = q.size
+    prepare(d, w, q, delta, qd, delta_d)
+    inverse_dynamics(d, w, qd, zero, modal_zero, d.gravity, out[:n], out[n:])
+    for i in range(n):
+        for j in range(d.count[i]):
+            row = d.first[i] + j
+            acc = out[n + row] + w.elastic[i, j]
+            for k in range(d.count[i]):
+                acc += d.damping[i, j, k] * delta_d[d.first[i] + k]
+            out[n + row] = acc
+
+
+def mass_matrix(data, work, q, delta, zero, modal_zero, no_gravity, M):
+    """Mass matrix, one column per unit acceleration."""
+    d, w = data[0], work[0]
+    n, m = q.size, delta.size
+    prepare(d, w, q, delta, zero, modal_zero)
+    unit = np.zeros(n + m)
+    for j in range(n + m):
+        unit[j] = 1.0
+        inverse_dynamics(d, w, zero, unit[:n], unit[n:], no_gravity, M[j, :n], M[j, n:])
+        unit[j] = 0.0
+
+
+def frames(data, work, q, delta, zero, modal_zero, R, p):
+    """Orientation and origin of each link's base frame, and last of the tip's, in the base frame."""
+    d, w = data[0], work[0]
+    prepare(d, w, q, delta, zero, modal_zero)
+    place_frames(d, w, R, p)
+
+
+def place_frames(d, w, R, p):
+    """As `frames`, after `prepare`."""
+    for k in range(3):
+        p[0, k] = w.arm[0, k]
+        for m in range(3):
+            R[0, k, m] = w.frame[0, k, m]
+    for n in range(1, d.links + 1):
+        product(R[n - 1], w.frame[n], R[n])
+        apply(R[n - 1], w.arm[n], w.t[0])
+        for k in range(3):
+            p[n, k] = p[n - 1, k] + w.t[0, k]
+
+
+def potential_energy(data, work, q, delta, zero, modal_zero):
+    """Elastic and gravitational energy."""
+    d, w = data[0], work[0]
+    N = d.links
+    R, p = np.zeros((N + 1, 3, 3)), np.zeros((N + 1, 3))
+    frames(data, work, q, delta, zero, modal_zero, R, p)
+    energy = 0.0
+    for i in range(N):
+        apply(R[i], w.c[i], w.t[0])
+        energy -= d.mass[i] * dot(d.gravity, p[i]) + dot(d.gravity, w.t[0])
+        for j in range(d.count[i]):
+            if d.level != FINITE_SLOPE or d.direction[i, j] == TWIST:
+                energy += 0.5 * w.elastic[i, j] * delta[d.first[i] + j]
+        if d.level == FINITE_SLOPE:
+            for g in range(d.nodes):
+                sy, sz, by, bz = slopes_and_bends(d, i, g, delta)
+                c = 1.0 - sz * sz
+                ky2 = (by + sy * sz * bz / c) ** 2 * c / (c - sy * sy)
+                energy += 0.5 * (d.node_ei[i, g, 0] * ky2 + d.node_ei[i, g, 1] * bz * bz / c)
+    apply(R[N], d.payload_moment, w.t[0])
+    return energy - d.payload_mass[0] * dot(d.gravity, p[N]) - dot(d.gravity, w.t[0])
+
+
+def momentum(data, work, q, delta, qd, delta_d, out):
+    """Linear momentum and angular momentum about the base's origin, in the base frame, rows of `out`."""
+    d, w = data[0], work[0]
+    N = d.links
+    R, p = np.zeros((N + 1, 3, 3)), np.zeros((N + 1, 3))
+    prepare(d, w, q, delta, qd, delta_d)
+    place_frames(d, w, R, p)
+    v, t = np.zeros((N + 1, 3)), w.t
+    out[:] = 0.0
+    for i in range(N + 1):
+        om, P, L = w.omega[i], t[0], t[1]
+        if i < N:
+            # In link coordinates, about the link's base: P = m v + w x c + p delta_d, L = c x v + J w + l delta_d.
+            cross(om, w.c[i], P)
+            cross(w.c[i], v[i], L)
+            apply(w.J[i], om, t[2])
+            for k in range(3):
+                P[k] += d.mass[i] * v[i, k]
+                L[k] += t[2, k]
+                for j in range(d.count[i]):
+                    P[k] += w.p[i, j, k] * delta_d[d.first[i] + j]
+                    L[k] += w.l[i, j, k] * delta_d[d.first[i] + j]
+            spin = d.rotor[i] * (dot(d.axis[i], w.carrier[i]) + d.gear[i] * qd[i])
+            for k in range(3):
+                L[k] += spin * d.axis[i, k]
+        else:
+            cross(om, d.payload_moment, P)
+            cross(d.payload_moment, v[i], L)
+            apply(d.payload_inertia, om, t[2])
+            for k in range(3):
+                P[k] += d.payload_mass[0] * v[i, k]
+                L[k] += t[2, k]
+        apply(R[i], P, t[3])
+        apply(R[i], L, t[4])
+        cross(p[i], t[3], t[5])
+        for k in range(3):
+            out[0, k] += t[3, k]
+            out[1, k] += t[4, k] + t[5, k]
+        if i < N:
+            # Velocity of the next frame's origin.
+            cross(om, w.arm[i + 1], t[6])
+            for k in range(3):
+                t[6, k] += v[i, k]
+                for j in range(d.count[i]):
+                    t[6, k] += w.partial[i + 1, j, k] * delta_d[d.first[i] + j]
+            apply_transposed(w.frame[i + 1], t[6], v[i + 1])
+
+
+def point(data, work, index, q, delta, zero, modal_zero, offset, place, jacobian):
+    """Position and Jacobian (linear, angular; base frame) of a point off the tip of link `index`, the last of `d`."""
+    d, w = data[0], work[0]
+    N, n = d.links, q.size
+    R, p = np.zeros((N + 1, 3, 3)), np.zeros((N + 1, 3))
+    prepare(d, w, q, delta, zero, modal_zero)
+    place_frames(d, w, R, p)
+    apply(R[index + 1], offset, w.t[0])
+    for k in range(3):
+        place[k] = p[index + 1, k] + w.t[0, k]
+    t = w.t
+    for i in range(index + 1):
+        apply(R[i], d.axis[i], t[1])
+        put_column(jacobian, i, t[1], place, p[i], t)
+        for j in range(d.count[i]):
+            column = n + d.first[i] + j
+            apply(R[i], w.turning[i + 1, j], t[1])
+            put_column(jacobian, column, t[1], place, p[i + 1], t)
+            apply(R[i], w.partial[i + 1, j], t[2])
+            for k in range(3):
+                jacobian[k, column] += t[2, k]
+
+
+def put_column(jacobian, column, axis, place, origin, t):
+    """Rotation about `axis` through `origin`."""
+    for k in range(3):
+        t[8, k] = place[k] - origin[k]
+    cross(axis, t[8], t[9])
+    for k in range(3):
+        jacobian[k, column] = t[9, k]
+        jacobian[3 + k, column] = axis[k]
+
+
+def implicit_step(state, torque, change, step, substeps, stages, net, extra, friction, data):
+    r"""Advance `state` in place by a linearly implicit method that damps stiff modes: stable at any step.
+
+    A W-method of order two (Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), ROS2, gamma = 1 - 1/sqrt 2,
+    L-stable in the terms taken implicitly: modal stiffness, modal damping and joint friction):
+
+    .. math::
+        (I - \gamma hA)k_1 = F(y_0), \quad (I - \gamma hA)k_2 = F(y_0 + hk_1) - 2k_1, \quad
+        y = y_0 + \tfrac32hk_1 + \tfrac12hk_2 .
+
+    In the velocities this is one articulated-body recursion a stage, with gamma h D + (gamma h)^2 K added to
+    the modal mass. Torque is that of the middle of each step.
+
+    Parameters
+    ----------
+    state, torque, change, step, substeps, friction
+        As for `runge_kutta`.
+    stages : ndarray, shape (4, 2 (n + m))
+        Work space.
+    net : ndarray, shape (2, n)
+        Work space.
+    extra : tuple of ndarray, shapes (N,) and (N, K, K)
+        Work space: what is added to the mass matrix.
+    data : tuple
+        As for `slope`.
+    """
+    constants, work, _, _, driven, force = data
+    d, w = constants[0], work[0]
+    n, m = torque.size, force.size
+    size = n + m
+    gamma = 1.0 - np.sqrt(0.5)
+    g = gamma * step
+    joint_extra, modal_extra = extra
+    for i in range(n):
+        for j in range(d.count[i]):
+            for k in range(d.count[i]):
+                modal_extra[i, j, k] = g * d.damping[i, j, k] + g * g * d.stiffness[i, j, k]
+    k1, k2, point = stages[0], stages[1], stages[2]
+    for number in range(substeps):
+        for v in range(2 * size):
+            point[v] = state[v]
+        for stage in range(2):
+            out = stages[stage]
+            q, delta = point[:n], point[n:size]
+            qd, delta_d = point[size : size + n], point[size + n :]
+            for i in range(n):
+                net[1, i] = torque[i] + (number + 0.5) / substeps * change[i]
+            take_friction(net[1], friction, qd, net[0])  # noqa: F821 - of kernels.integrators
+            prepare(d, w, q, delta, qd, delta_d)
+            modal_force(d, w, delta_d, force)
+            for i in range(n):
+                if stage == 0:
+                    slip = friction[i, 0]
+                    if friction[i, 1] != 0.0:
+                        c = 1.0 / np.cosh(min(abs(qd[i] / friction[i, 2]), 300.0))
+                        slip += friction[i, 1] / friction[i, 2] * c * c
+                    joint_extra[i] = g * slip
+                else:
+                    net[0, i] += 2.0 * joint_extra[i] * k1[size + i]
+                first = d.first[i]
+                for j in range(d.count[i]):
+                    acc = 0.0
+                    for k in range(d.count[i]):
+                        row = n + first + k
+                        if stage == 0:
+                            acc -= g * d.stiffness[i, j, k] * state[size + row]
+                        else:
+                            acc += 2.0 * modal_extra[i, j, k] * k1[size + row]
+                            acc -= g * d.stiffness[i, j, k] * (point[size + row] - 2.0 * k1[row])
+                    force[first + j] += acc
+            forward_dynamics(
+                d, w, qd, net[0], force, joint_extra, modal_extra, driven,
+                out[size : size + n], out[size + n :],
+            )  # fmt: skip
+            for v in range(size):
+                if stage == 0:
+                    k1[v] = state[size + v] + g * k1[size + v]
+                else:
+                    k2[size + v] -= 2.0 * k1[size + v]
+                    k2[v] = point[size + v] - 2.0 * k1[v] + g * k2[size + v]
+            if stage == 0:
+                for v in range(2 * size):
+                    point[v] = state[v] + step * k1[v]
+        for v in range(2 * size):
+            state[v] += step * (1.5 * k1[v] + 0.5 * k2[v])

@@ -1,0 +1,81 @@
+"""Joins source files of kernels into one module, compiled by numba or left as plain Python.
+
+A compiled module is a file of its own in the cache directory, named by a hash of its source: numba's cache
+beside it can't be stale, and right-hand side and integrator are one unit for its optimiser.
+"""
+
+import hashlib
+import importlib.util
+import inspect
+import os
+import sys
+import tempfile
+import types
+from pathlib import Path
+
+#: a*b + c in one rounding where the machine has it; nothing that would hide a NaN.
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+
+
+def cache_directory():
+    """Where joined and generated sources and what numba made of them are kept.
+
+    ``FLEXARM_CACHE``, else the user's cache directory, else a temporary one.
+    """
+    given = os.environ.get("FLEXARM_CACHE")
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    for place in (given, Path(base) / "flexarm") if given else (Path(base) / "flexarm",):
+        try:
+            Path(place).mkdir(parents=True, exist_ok=True)
+            if os.access(place, os.W_OK):
+                return Path(place)
+        except OSError:
+            continue
+    return Path(tempfile.mkdtemp(prefix="flexarm-"))
+
+
+def joined(name, sources, compiled=True):
+    """A module made of several sources.
+
+    Parameters
+    ----------
+    name : str
+        Start of the module's name.
+    sources : sequence of str
+        Python source; a later one may use the functions of an earlier one.
+    compiled : bool
+        Compile every function with numba, on first call.
+
+    Returns
+    -------
+    module
+    """
+    text = "\n\n".join(sources)
+    full = f"flexarm_{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    key = full if compiled else f"{full}_plain"
+    if key in sys.modules:
+        return sys.modules[key]
+    path = cache_directory() / f"{full}.py"
+    if not path.is_file():
+        # Whole or not at all, also when two processes start at once.
+        with tempfile.NamedTemporaryFile(
+            "w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(text)
+        os.replace(file.name, path)
+    spec = importlib.util.spec_from_file_location(key, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[key] = module
+    spec.loader.exec_module(module)
+    if compiled:
+        from numba import njit
+
+        for attribute, value in list(vars(module).items()):
+            if isinstance(value, types.FunctionType) and value.__module__ == key:
+                setattr(module, attribute, njit(**OPTIONS)(value))
+    return module
+
+
+def source(module):
+    """Source text of a module."""
+    return inspect.getsource(module)

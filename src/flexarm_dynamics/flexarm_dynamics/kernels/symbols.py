@@ -1,0 +1,227 @@
+"""Scalars that record what is done to them: running a kernel on them gives straight-line code for one structure.
+
+A constant stays a Python float, so that whatever depends on constants alone is computed while tracing, and
+what is exactly zero or one leaves no trace. Equal operations on equal operands are one node.
+"""
+
+import numpy as np
+
+#: Floats that are written into the code; all others go to a table, so that arms of one structure share code.
+LITERALS = (1.0, 2.0, 0.5)
+#: Nested expressions longer than this are split.
+LONGEST = 24
+
+
+class Graph:
+    """Operations recorded so far, in the order of evaluation."""
+
+    def __init__(self):
+        self.nodes = []
+        self._known = {}
+
+    def symbol(self, op, *operands):
+        """The node of an operation; the one there is if it has been recorded before."""
+        key = (op, *(o.index if isinstance(o, Symbol) else ("c", float(o)) for o in operands))
+        if key not in self._known:
+            self._known[key] = Symbol(self, len(self.nodes))
+            self.nodes.append((op, operands))
+        return self._known[key]
+
+    def inputs(self, name, count):
+        """Symbols ``name[0]``, ``name[1]`` ... as an array."""
+        out = np.empty(count, dtype=object)
+        for i in range(count):
+            out[i] = self.symbol(f"{name}[{i}]")
+        return out
+
+
+def _is(value, number):
+    return not isinstance(value, Symbol) and value == number
+
+
+class Symbol:
+    """A scalar of a `Graph`."""
+
+    __slots__ = ("graph", "index")
+
+    def __init__(self, graph, index):
+        self.graph, self.index = graph, index
+
+    def _pair(self, op, a, b):
+        # A sum or product has one node whatever the order of its operands.
+        if op in "+*" and isinstance(a, Symbol) and isinstance(b, Symbol) and a.index > b.index:
+            a, b = b, a
+        return self.graph.symbol(op, a, b)
+
+    def _factors(self):
+        """``(("np.sin", a), ("np.cos", b))`` if this is sin(a) cos(b), and so on; else nothing."""
+        op, operands = self.graph.nodes[self.index]
+        if op != "*" or not all(isinstance(o, Symbol) for o in operands):
+            return ()
+        pair = [self.graph.nodes[o.index] for o in operands]
+        if not all(name in ("np.sin", "np.cos") for name, _ in pair):
+            return ()
+        return tuple((name, inner[0]) for name, inner in pair)
+
+    def _angle_sum(self, op, other):
+        """cos a cos b - sin a sin b = cos(a + b), sin a cos b + cos a sin b = sin(a + b), and the differences."""
+        mine = self._factors()
+        its = other._factors() if mine and isinstance(other, Symbol) else ()
+        if not its:
+            return None
+        (f, a), (g, b) = mine
+        for (h, c), (k, d) in (its, its[::-1]):
+            if c is not a or d is not b:
+                continue
+            if op == "-" and (f, g, h, k) == ("np.cos", "np.cos", "np.sin", "np.sin"):
+                return (a + b).cos()
+            if op == "+" and (f, g, h, k) in (
+                ("np.sin", "np.cos", "np.cos", "np.sin"),
+                ("np.cos", "np.sin", "np.sin", "np.cos"),
+            ):
+                return (a + b).sin()
+        return None
+
+    def _negated(self):
+        """What this is the negative of, if it is one."""
+        op, operands = self.graph.nodes[self.index]
+        return operands[0] if op == "neg" else None
+
+    def _difference(self):
+        """Operands (a, b) if this is a - b."""
+        op, operands = self.graph.nodes[self.index]
+        return operands if op == "-" else (None, None)
+
+    def __neg__(self):
+        inner = self._negated()
+        return self.graph.symbol("neg", self) if inner is None else inner
+
+    def __add__(self, other):
+        if _is(other, 0.0):
+            return self
+        if isinstance(other, Symbol):
+            if (its := other._negated()) is not None:
+                return self - its
+            if (mine := self._negated()) is not None:
+                return other - mine
+            if other._difference()[1] is self:  # a + (b - a)
+                return other._difference()[0]
+            if self._difference()[1] is other:
+                return self._difference()[0]
+        return self._angle_sum("+", other) or self._pair("+", self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other):
+        if _is(other, 0.0):
+            return self
+        if other is self:
+            return 0.0
+        if isinstance(other, Symbol) and (its := other._negated()) is not None:
+            return self + its
+        if (mine := self._negated()) is not None:
+            return -(mine + other)
+        return self._angle_sum("-", other) or self._pair("-", self, other)
+
+    def __rsub__(self, other):
+        return -self if _is(other, 0.0) else self._pair("-", other, self)
+
+    def __mul__(self, other):
+        if _is(other, 0.0):
+            return 0.0
+        if _is(other, 1.0):
+            return self
+        if _is(other, -1.0):
+            return -self
+        # Signs go outwards, where they meet a sum.
+        if (mine := self._negated()) is not None:
+            return -(mine * other)
+        if isinstance(other, Symbol):
+            if (its := other._negated()) is not None:
+                return -(self * its)
+            if self._is_inverse_of(other) or other._is_inverse_of(self):
+                return 1.0
+        elif other < 0.0:
+            return -(self * -other)
+        return self._pair("*", self, other)
+
+    __rmul__ = __mul__
+
+    def _is_inverse_of(self, other):
+        op, operands = self.graph.nodes[self.index]
+        return op == "/" and operands[1] is other and _is(operands[0], 1.0)
+
+    def __truediv__(self, other):
+        if isinstance(other, Symbol):
+            return self._pair("/", self, other)
+        return self * (1.0 / other)
+
+    def __rtruediv__(self, other):
+        return 0.0 if _is(other, 0.0) else self._pair("/", other, self)
+
+    def sin(self):
+        return self.graph.symbol("np.sin", self)
+
+    def cos(self):
+        return self.graph.symbol("np.cos", self)
+
+    def sqrt(self):
+        return self.graph.symbol("np.sqrt", self)
+
+
+def emit(graph, outputs, target):
+    """Python statements that assign `outputs` to ``target[0]``, ``target[1]`` ...
+
+    Returns
+    -------
+    lines : list of str
+    constants : list of float
+        What ``c[0]``, ``c[1]`` ... stand for in them.
+    operations : int
+        Nodes that are evaluated.
+    """
+    uses = {}
+    stack = [o for o in outputs if isinstance(o, Symbol)]
+    for o in stack:
+        uses[o.index] = uses.get(o.index, 0) + 2  # a name of its own, so that it can be read twice
+    seen = set()
+    while stack:
+        index = stack.pop().index
+        if index in seen:
+            continue
+        seen.add(index)
+        for o in graph.nodes[index][1]:
+            if isinstance(o, Symbol):
+                uses[o.index] = uses.get(o.index, 0) + 1
+                stack.append(o)
+    constants, places, text, size, lines = [], {}, {}, {}, []
+
+    def word(o):
+        if isinstance(o, Symbol):
+            return text[o.index]
+        value = float(o)
+        if value in LITERALS:
+            return repr(value)
+        if value not in places:
+            places[value] = len(constants)
+            constants.append(value)
+        return f"c[{places[value]}]"
+
+    for index in sorted(seen):
+        op, operands = graph.nodes[index]
+        words = [word(o) for o in operands]
+        length = 1 + sum(size[o.index] for o in operands if isinstance(o, Symbol))
+        if not operands:
+            expression = op
+        elif op == "neg":
+            expression = f"(-{words[0]})"
+        elif len(op) == 1:
+            expression = f"({words[0]} {op} {words[1]})"
+        else:
+            expression = f"{op}({words[0]})"
+        if uses[index] > 1 or length > LONGEST:
+            lines.append(f"t{index} = {expression}")
+            expression, length = f"t{index}", 1
+        text[index], size[index] = expression, length
+    lines += [f"{target}[{i}] = {word(o)}" for i, o in enumerate(outputs)]
+    return lines, constants, len(seen)
