@@ -25,11 +25,14 @@ from . import beam
 from .errors import ModelError, ShapeError
 from .kernels import chain as plain
 from .kernels import generated, integrators, load
-from .model import ArmModel, Terms, damping_matrix, explicit_stepper
+from .model import ArmModel, Stepper, Terms, damping_matrix, explicit_stepper
 
 _KIND = {"y": plain.Y, "z": plain.Z, "twist": plain.TWIST}
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
+
+#: Short enough to be written out in the integrators' loops.
+INLINE = ("slope", "net_torque", "low_storage")
 
 #: Imaginary step of the complex-step derivatives: no difference is taken, so that it costs no digits.
 STEP = 1e-30
@@ -60,8 +63,17 @@ class Chain(ArmModel):
         """The kernels: compiled on first use, or plain."""
         return load.joined("chain", CHAIN_SOURCES, self._compiled)
 
-    def _packed(self, values):
-        return packed(values) if self._compiled else (values,)
+    @cached_property
+    def _room(self):
+        return _roomy(self.data)
+
+    def _packed(self, data):
+        return packed(data, plain.DATA, self._room) if self._compiled else (data,)
+
+    def _new_work(self, dtype=float):
+        if not self._compiled:
+            return (work_space(self.data, dtype),)
+        return packed(work_space(self.data, dtype, self._room), plain.WORK, self._room)
 
     @cached_property
     def _data(self):
@@ -69,11 +81,11 @@ class Chain(ArmModel):
 
     @cached_property
     def _work(self):
-        return self._packed(work_space(self.data))
+        return self._new_work()
 
     @cached_property
     def _complex_work(self):
-        return self._packed(work_space(self.data, complex))
+        return self._new_work(complex)
 
     def mode_shapes(self, link, direction):
         try:
@@ -325,32 +337,29 @@ class Chain(ArmModel):
         )
         if operations > generated.MOST_OPERATIONS:
             return None
-        return load.joined("generated", (source, load.source(integrators))), constants
+        sources = (source, load.source(integrators))
+        return load.joined("generated", sources, inline=INLINE), constants
 
     def stepper(self, method, straight_line=True):
+        """As `ArmModel.stepper`; ``straight_line=False`` asks for the recursion in loops."""
         if method is not None and straight_line and self.straight_line is not None:
             module, constants = self.straight_line
             return explicit_stepper(module, method, constants, self)
         none = tuple(np.zeros_like(part) for part in self._none)
-        data = (self._data, self._packed(work_space(self.data)), *none)
+        data = (self._data, self._new_work(), *none)
         if method is not None:
             return explicit_stepper(self.kernel, method, data, self)
         n, size = self.n_joints, 2 * (self.n_joints + self.n_modes)
-        stages, net, steady = np.zeros((4, size)), np.zeros((2, n)), np.zeros(n)
         extra = (np.zeros_like(none[0]), np.zeros_like(none[1]))
-
-        def advance(state, torque, step, substeps, friction, change=steady):
-            self.kernel.implicit_step(
-                state, torque, change, step, substeps, stages, net, extra, friction, data
-            )
-
-        return advance
+        arguments = (np.zeros((4, size)), np.zeros(n), extra)
+        step, trajectory = self.kernel.implicit_step, self.kernel.implicit_trajectory
+        return Stepper(self, step, trajectory, arguments, data)
 
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion."""
         none = list(np.zeros_like(part) for part in self._none)
         none[2][:] = 1
-        data = (self._data, self._packed(work_space(self.data)), *none)
+        data = (self._data, self._new_work(), *none)
         return explicit_stepper(self.kernel, method, data, self)
 
     def _joint(self, value, name):
@@ -382,29 +391,43 @@ def _shape(spec, sizes):
     return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
 
 
-def _sizes(data):
-    sizes = {"N": data.links, "K": data.s.shape[1], "G": data.nodes}
-    return sizes | {"N+1": data.links + 1, "G+1": data.nodes + 1}
+def _sizes(links, modes, nodes):
+    return {"N": links, "K": modes, "G": nodes, "N+1": links + 1, "G+1": nodes + 1}
 
 
-def work_space(data, dtype=float):
+def _capacity(value, steps):
+    return next(step for step in (*steps, value) if step >= value)
+
+
+def _roomy(data):
+    """Sizes that many arms share, so that one compilation serves them all."""
+    return _sizes(
+        _capacity(data.links, (8, 16, 32)),
+        _capacity(data.s.shape[1], (4, 8, 16, 60)),
+        _capacity(data.nodes, (1, 28, 44, 92)),
+    )
+
+
+def work_space(data, dtype=float, sizes=None):
     """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
-    sizes = _sizes(data)
+    sizes = sizes or _sizes(data.links, data.s.shape[1], data.nodes)
     return plain.Work(
         **{name: np.zeros(_shape(spec, sizes), dtype) for name, spec in plain.WORK.items()}
     )
 
 
-def packed(values):
+def packed(values, specs, sizes):
     """A namedtuple of arrays as an array of one record, which compiled code takes by reference.
 
-    Shapes are part of a record's type: with them fixed the compiler unrolls, and no array is passed or counted.
+    Shapes are part of a record's type: with them fixed no array is passed or counted. Arrays are padded with
+    zeros to the sizes given.
     """
     fields = {name: np.asarray(value) for name, value in values._asdict().items()}
-    kind = np.dtype([(name, v.dtype, v.shape) for name, v in fields.items()], align=True)
-    record = np.zeros(1, kind).view(np.recarray)
-    for name, v in fields.items():
-        record[name][0] = v
+    shapes = {name: _shape(specs[name], sizes) for name in fields}
+    kind = [(name, field.dtype, shapes[name]) for name, field in fields.items()]
+    record = np.zeros(1, np.dtype(kind, align=True)).view(np.recarray)
+    for name, field in fields.items():
+        record[name][(0, *(slice(n) for n in field.shape))] = field
     return record
 
 

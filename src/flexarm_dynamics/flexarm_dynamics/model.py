@@ -130,10 +130,7 @@ class ArmModel(ABC):
 
         Returns
         -------
-        callable
-            ``advance(state, torque, step, substeps, friction, change=0)``, which overwrites the state; torque
-            (n,) goes to torque + change over the substeps, friction (n, 3) is as in `friction_table`. It
-            releases the interpreter's lock; each thread wants a stepper of its own.
+        Stepper
         """
 
     def friction(self, qd):
@@ -201,19 +198,92 @@ class Tableau:
     nodes: np.ndarray
 
 
+class Stepper:
+    """A compiled fixed-step integrator of one arm; see `ArmModel.stepper`.
+
+    It releases the interpreter's lock while it runs; each thread wants a stepper of its own.
+
+    Parameters
+    ----------
+    model : ArmModel
+    step, trajectory : callable
+        Compiled functions of `kernels`.
+    arguments : tuple
+        What they take after the number of substeps, but for friction and data.
+    data : object
+        What the right-hand side needs.
+    """
+
+    def __init__(self, model, step, trajectory, arguments, data):
+        self._step, self._trajectory = step, trajectory
+        self._arguments, self._data = arguments, data
+        self._none = np.zeros(model.n_joints)
+        self._friction = model.friction_table()
+
+    def __call__(self, state, torque, step, substeps=1, friction=None, change=None):
+        """Advance a state in place.
+
+        Parameters
+        ----------
+        state : ndarray, shape (2 (n + m),)
+            (q, delta, qd, delta_d); overwritten.
+        torque : ndarray, shape (n,)
+            At the start [N m].
+        step : float
+            Length of a substep [s].
+        substeps : int
+            How many.
+        friction : ndarray, shape (n, 3), optional
+            As `ArmModel.friction_table`, which is the default.
+        change : ndarray, shape (n,), optional
+            What the torque changes by until the end, linearly; nothing if not given [N m].
+        """
+        self._step(
+            state,
+            torque,
+            self._none if change is None else change,
+            step,
+            substeps,
+            *self._arguments,
+            self._friction if friction is None else friction,
+            self._data,
+        )
+
+    def trajectory(self, states, starts, ends, step, substeps=1, friction=None):
+        """Fill ``states[1:]`` from ``states[0]`` in one compiled loop.
+
+        Parameters
+        ----------
+        states : ndarray, shape (s + 1, 2 (n + m))
+            Row k + 1 is `substeps` steps after row k.
+        starts, ends : ndarray, shape (s, n)
+            Torque at both ends of each interval; linear between [N m].
+        step, substeps, friction
+            As for a call.
+        """
+        self._trajectory(
+            states,
+            starts,
+            ends,
+            step,
+            substeps,
+            *self._arguments,
+            self._friction if friction is None else friction,
+            self._data,
+        )
+
+
 def explicit_stepper(module, method, data, model):
     """`ArmModel.stepper` of a compiled module that has ``slope`` and the integrators."""
     n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
-    stages = np.zeros((method.weights.size + 1, size))
-    net, none = np.zeros((2, n)), np.zeros(n)
-
-    def advance(state, torque, step, substeps, friction, change=none):
-        module.runge_kutta(
-            state, torque, change, step, substeps, method.A, method.weights, method.nodes, stages,
-            net, friction, data,
-        )  # fmt: skip
-
-    return advance
+    net, coefficients = np.zeros(n), (method.weights, method.nodes)
+    if not np.tril(method.A, -2).any():
+        below = np.concatenate([[0.0], np.diag(method.A, -1)])
+        work = tuple(np.zeros(size) for _ in range(3))
+        arguments = (below, *coefficients, work, net)
+        return Stepper(model, module.low_storage, module.low_storage_trajectory, arguments, data)
+    arguments = (method.A, *coefficients, np.zeros((method.weights.size + 1, size)), net)
+    return Stepper(model, module.runge_kutta, module.runge_kutta_trajectory, arguments, data)
 
 
 def build(arm):

@@ -178,7 +178,8 @@ class OneLinkEquations(ArmModel):
         inverse = np.linalg.inv(c.M22)
         inverse = 0.5 * (inverse + inverse.T)
         data = (scalars, c.h, inverse, inverse @ c.h, c.G, c.K, c.D, c.s)
-        module = load.joined("one_link", (load.source(kernel), load.source(integrators)))
+        sources = (load.source(kernel), load.source(integrators))
+        module = load.joined("one_link", sources, inline=("slope", "net_torque", "low_storage"))
         return explicit_stepper(module, method, tuple(map(np.ascontiguousarray, data)), self)
 
 

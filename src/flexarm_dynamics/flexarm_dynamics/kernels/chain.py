@@ -1134,7 +1134,7 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
         As for `runge_kutta`.
     stages : ndarray, shape (4, 2 (n + m))
         Work space.
-    net : ndarray, shape (2, n)
+    net : ndarray, shape (n,)
         Work space.
     extra : tuple of ndarray, shapes (N,) and (N, K, K)
         Work space: what is added to the mass matrix.
@@ -1160,9 +1160,8 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
             out = stages[stage]
             q, delta = point[:n], point[n:size]
             qd, delta_d = point[size : size + n], point[size + n :]
-            for i in range(n):
-                net[1, i] = torque[i] + (number + 0.5) / substeps * change[i]
-            take_friction(net[1], friction, qd, net[0])  # noqa: F821 - of kernels.integrators
+            fraction = (number + 0.5) / substeps
+            net_torque(torque, change, fraction, friction, point, net)  # noqa: F821 - of kernels.integrators
             prepare(d, w, q, delta, qd, delta_d)
             modal_force(d, w, delta_d, force)
             for i in range(n):
@@ -1173,7 +1172,7 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                         slip += friction[i, 1] / friction[i, 2] * c * c
                     joint_extra[i] = g * slip
                 else:
-                    net[0, i] += 2.0 * joint_extra[i] * k1[size + i]
+                    net[i] += 2.0 * joint_extra[i] * k1[size + i]
                 first = d.first[i]
                 for j in range(d.count[i]):
                     acc = 0.0
@@ -1186,7 +1185,7 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                             acc -= g * d.stiffness[i, j, k] * (point[size + row] - 2.0 * k1[row])
                     force[first + j] += acc
             forward_dynamics(
-                d, w, qd, net[0], force, joint_extra, modal_extra, driven,
+                d, w, qd, net, force, joint_extra, modal_extra, driven,
                 out[size : size + n], out[size + n :],
             )  # fmt: skip
             for v in range(size):
@@ -1200,3 +1199,16 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                     point[v] = state[v] + step * k1[v]
         for v in range(2 * size):
             state[v] += step * (1.5 * k1[v] + 0.5 * k2[v])
+
+
+def implicit_trajectory(states, starts, ends, step, substeps, stages, net, extra, friction, data):
+    """As `runge_kutta_trajectory`, by `implicit_step`."""
+    change = np.empty(net.size)
+    for k in range(starts.shape[0]):
+        for v in range(states.shape[1]):
+            states[k + 1, v] = states[k, v]
+        for i in range(change.size):
+            change[i] = ends[k, i] - starts[k, i]
+        implicit_step(
+            states[k + 1], starts[k], change, step, substeps, stages, net, extra, friction, data
+        )

@@ -7,19 +7,15 @@ joint friction is taken off it at each stage.
 import numpy as np
 
 
-def take_friction(torque, friction, rates, net):
-    """Net = torque less viscous and smoothed Coulomb friction; rows of `friction`: viscous, Coulomb, smoothing."""
+def net_torque(torque, change, fraction, friction, point, net):
+    """Net torque at a stage with the state `point`, when `fraction` of the interval has passed."""
+    half = point.size // 2
     for i in range(net.size):
-        net[i] = torque[i] - friction[i, 0] * rates[i]
+        rate = point[half + i]
+        value = torque[i] + fraction * change[i] - friction[i, 0] * rate
         if friction[i, 1] != 0.0:
-            net[i] -= friction[i, 1] * np.tanh(rates[i] / friction[i, 2])
-
-
-def stage_torque(torque, change, fraction, friction, state, net, held):
-    """Net torque at a stage: `fraction` of the interval has passed."""
-    for i in range(net.size):
-        held[i] = torque[i] + fraction * change[i]
-    take_friction(held, friction, state[state.size // 2 :], net)
+            value -= friction[i, 1] * np.tanh(rate / friction[i, 2])
+        net[i] = value
 
 
 def runge_kutta(
@@ -41,14 +37,14 @@ def runge_kutta(
         Butcher coefficients.
     stages : ndarray, shape (p + 1, 2 (n + m))
         Work space; the last row holds the state of a stage.
-    net : ndarray, shape (2, n)
+    net : ndarray, shape (n,)
         Work space.
     friction : ndarray, shape (n, 3)
         Viscous, Coulomb, smoothing.
     data : tuple
         What the right-hand side needs.
     """
-    p, size = weights.size, state.size
+    p, size, share = weights.size, state.size, 1.0 / substeps
     point = stages[p]
     for k in range(substeps):
         for i in range(p):
@@ -59,10 +55,104 @@ def runge_kutta(
                 if gain != 0.0:
                     for v in range(size):
                         point[v] += gain * stages[j, v]
-            stage_torque(torque, change, (k + nodes[i]) / substeps, friction, point, net[0], net[1])
+            stage_torque(torque, change, (k + nodes[i]) * share, friction, point, net[0], net[1])
             slope(point, net[0], data, stages[i])  # noqa: F821 - of the file that this one is joined to
         for j in range(p):
             gain = step * weights[j]
             if gain != 0.0:
                 for v in range(size):
                     state[v] += gain * stages[j, v]
+
+
+def runge_kutta_trajectory(
+    states, starts, ends, step, substeps, tableau, weights, nodes, stages, net, friction, data
+):
+    """Fill ``states[1:]`` from ``states[0]``: row k + 1 is `substeps` steps after row k.
+
+    Parameters
+    ----------
+    states : ndarray, shape (s + 1, 2 (n + m))
+        Row 0 is given.
+    starts, ends : ndarray, shape (s, n)
+        Torque at the start and at the end of each interval; linear between [N m].
+    step, substeps, tableau, weights, nodes, stages, net, friction, data
+        As for `runge_kutta`.
+    """
+    change = np.empty(net.size)
+    for k in range(starts.shape[0]):
+        for v in range(states.shape[1]):
+            states[k + 1, v] = states[k, v]
+        for i in range(change.size):
+            change[i] = ends[k, i] - starts[k, i]
+        runge_kutta(
+            states[k + 1],
+            starts[k],
+            change,
+            step,
+            substeps,
+            tableau,
+            weights,
+            nodes,
+            stages,
+            net,
+            friction,
+            data,
+        )
+
+
+def low_storage(
+    state, torque, change, step, substeps, below, weights, nodes, work, net, friction, data
+):
+    """As `runge_kutta` for methods whose stages need the previous one alone, as the classical one of order four.
+
+    Parameters
+    ----------
+    below : ndarray, shape (p,)
+        Butcher coefficient of stage i - 1 in stage i; the first is not used.
+    work : tuple of three ndarray, shape (2 (n + m),)
+        Work space.
+    """
+    point, total, rate = work
+    size, p, share = state.size, weights.size, 1.0 / substeps
+    for k in range(substeps):
+        for v in range(size):
+            point[v] = state[v]
+            total[v] = state[v]
+        for i in range(p):
+            net_torque(torque, change, (k + nodes[i]) * share, friction, point, net)
+            slope(point, net, data, rate)  # noqa: F821
+            gain = step * weights[i]
+            if i + 1 < p:
+                ahead = step * below[i + 1]
+                for v in range(size):
+                    total[v] += gain * rate[v]
+                    point[v] = state[v] + ahead * rate[v]
+            else:
+                for v in range(size):
+                    state[v] = total[v] + gain * rate[v]
+
+
+def low_storage_trajectory(
+    states, starts, ends, step, substeps, below, weights, nodes, work, net, friction, data
+):
+    """As `runge_kutta_trajectory`, by `low_storage`."""
+    change = np.empty(net.size)
+    for k in range(starts.shape[0]):
+        for v in range(states.shape[1]):
+            states[k + 1, v] = states[k, v]
+        for i in range(change.size):
+            change[i] = ends[k, i] - starts[k, i]
+        low_storage(
+            states[k + 1],
+            starts[k],
+            change,
+            step,
+            substeps,
+            below,
+            weights,
+            nodes,
+            work,
+            net,
+            friction,
+            data,
+        )

@@ -34,7 +34,7 @@ def cache_directory():
     return Path(tempfile.mkdtemp(prefix="flexarm-"))
 
 
-def joined(name, sources, compiled=True):
+def joined(name, sources, compiled=True, inline=()):
     """A module made of several sources.
 
     Parameters
@@ -45,12 +45,16 @@ def joined(name, sources, compiled=True):
         Python source; a later one may use the functions of an earlier one.
     compiled : bool
         Compile every function with numba, on first call.
+    inline : sequence of str
+        Functions to be written out where they are called.
 
     Returns
     -------
     module
     """
     text = "\n\n".join(sources)
+    # How it is compiled is part of what numba's cache must not mix up.
+    text += f"\n\n# inline: {', '.join(inline)}\n"
     full = f"flexarm_{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     key = full if compiled else f"{full}_plain"
     if key in sys.modules:
@@ -72,7 +76,8 @@ def joined(name, sources, compiled=True):
 
         for attribute, value in list(vars(module).items()):
             if isinstance(value, types.FunctionType) and value.__module__ == key:
-                setattr(module, attribute, njit(**OPTIONS)(value))
+                always = "always" if attribute in inline else "never"
+                setattr(module, attribute, njit(inline=always, **OPTIONS)(value))
     return module
 
 
