@@ -55,8 +55,8 @@ def runge_kutta(
                 if gain != 0.0:
                     for v in range(size):
                         point[v] += gain * stages[j, v]
-            stage_torque(torque, change, (k + nodes[i]) * share, friction, point, net[0], net[1])
-            slope(point, net[0], data, stages[i])  # noqa: F821 - of the file that this one is joined to
+            net_torque(torque, change, (k + nodes[i]) * share, friction, point, net)
+            slope(point, net, data, stages[i])  # noqa: F821 - of the file that this one is joined to
         for j in range(p):
             gain = step * weights[j]
             if gain != 0.0:
