@@ -25,7 +25,7 @@ from . import beam
 from .errors import ModelError, ShapeError
 from .kernels import chain as plain
 from .kernels import generated, integrators, load
-from .model import ArmModel, Stepper, Terms, damping_matrix, explicit_stepper
+from .model import ArmModel, Stepper, Terms, damping_matrix, explicit_stepper, rotation
 
 _KIND = {"y": plain.Y, "z": plain.Z, "twist": plain.TWIST}
 
@@ -145,24 +145,18 @@ class Chain(ArmModel):
             :math:`\partial/\partial\delta` and :math:`\partial/\partial\dot\delta`.
         """
         n, m = self.n_joints, self.n_modes
-        q, qd = self._joint(q, "q").astype(complex), self._joint(qd, "qd").astype(complex)
-        delta = self._modal(delta, "delta").astype(complex)
-        delta_d = self._modal(delta_d, "delta_d").astype(complex)
-        out = np.zeros(n + m, complex)
-        result = []
-        for variable in (delta, delta_d):
-            matrix = np.zeros((n + m, m))
-            for j in range(m):
-                kept = variable[j]
-                variable[j] = kept + 1j * STEP
-                self.kernel.bias_forces(
-                    self._data, self._complex_work, q, delta, qd, delta_d,
-                    np.zeros(n, complex), np.zeros(m, complex), out,
-                )  # fmt: skip
-                matrix[:, j] = out.imag / STEP
-                variable[j] = kept
-            result.append(matrix)
-        return tuple(result)
+        K, C = np.zeros((n + m, m)), np.zeros((n + m, m))
+        arrays = (
+            self._joint(q, "q"),
+            self._modal(delta, "delta"),
+            self._joint(qd, "qd"),
+            self._modal(delta_d, "delta_d"),
+        )
+        zeros = (np.zeros(n, complex), np.zeros(m, complex), np.zeros(n + m, complex))
+        self.kernel.linearise(
+            self._data, self._complex_work, *(a.astype(complex) for a in arrays), STEP, *zeros, K, C
+        )
+        return K, C
 
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
@@ -200,6 +194,14 @@ class Chain(ArmModel):
         """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
         n, K = self.data.links, self.data.s.shape[1]
         return np.zeros(n), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
+
+    def stiffness_matrix(self):
+        m = self.n_modes
+        out = np.zeros((m, m))
+        for i in range(self.data.links):
+            a, k = self.data.first[i], self.data.count[i]
+            out[a : a + k, a : a + k] = self.data.stiffness[i, :k, :k]
+        return out
 
     def kinetic_energy(self, q, qd, delta, delta_d):
         v = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
@@ -373,18 +375,6 @@ class Chain(ArmModel):
         if value.shape != (self.n_modes,):
             raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_modes,)}")
         return value
-
-
-def rotation(rpy):
-    """Fixed-axis roll, pitch, yaw, as in URDF; shape (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
 
 
 def _shape(spec, sizes):

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from . import registry
 from .errors import ModelError, ShapeError
@@ -108,8 +109,8 @@ class ArmModel(ABC):
         """Velocity of the last link's tip in the base frame, shape (3,) [m/s]."""
 
     @abstractmethod
-    def tip_deflection(self, delta):
-        """Deflection of the last link's tip in its own base frame, shape (2,): along y and z [m]."""
+    def tip_deflection(self, delta, link=None):
+        """Deflection of a link's tip (the last one's) in its base frame, shape (2,): along y and z [m]."""
 
     @abstractmethod
     def mode_shapes(self, link, direction):
@@ -169,24 +170,64 @@ class ArmModel(ABC):
         q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
         return self.kinetic_energy(q, qd, delta, delta_d) + self.potential_energy(q, delta)
 
-    def frequencies(self, q=None, locked=False):
-        """Undamped natural frequencies at rest, ascending [rad/s].
+    def stiffness_matrix(self):
+        """Elastic stiffness of the modes for small deflections, shape (m, m)."""
+        n = self.n_joints
+        return self.terms(np.zeros(n), np.zeros(n)).K2
+
+    def normal_modes(self, q=None, locked=False):
+        """Undamped natural modes of the straight arm at rest; gravity is left out.
 
         Parameters
         ----------
         q : ndarray, shape (n,), optional
             Where; zero if not given.
         locked : bool
-            Joints locked, or free (rigid-body zeros are left out).
+            Joints locked, or free (rigid-body motions, of frequency zero, are left out).
+
+        Returns
+        -------
+        omega : ndarray, shape (m,)
+            Ascending [rad/s].
+        shapes : ndarray, shape (n + m, m)
+            (q, delta) of each, of unit modal mass.
         """
-        n = self.n_joints
-        t = self.terms(np.zeros(n) if q is None else np.asarray(q, float), np.zeros(n))
-        mass = t.M[n:, n:]
+        n, m = self.n_joints, self.n_modes
+        q = np.zeros(n) if q is None else np.asarray(q, float)
+        M, K = self.terms(q, np.zeros(n)).M, self.stiffness_matrix()
+        give = np.zeros((n, m))  # how the joints follow the modes
         if not locked:
-            # Joints free: what is left of the modal inertia once the joints give way.
-            mass = mass - t.M[n:, :n] @ np.linalg.solve(t.M[:n, :n], t.M[:n, n:])
-        squares = np.linalg.eigvals(np.linalg.solve(mass, t.K2)).real
-        return np.sqrt(np.sort(squares))
+            give = -np.linalg.solve(M[:n, :n], M[:n, n:])
+        # Joints free: what is left of the modal inertia once the joints give way.
+        mass = M[n:, n:] + M[n:, :n] @ give
+        squares, vectors = eigh(K, 0.5 * (mass + mass.T)) if m else (np.zeros(0), np.zeros((0, 0)))
+        return np.sqrt(np.maximum(squares, 0.0)), np.vstack([give @ vectors, vectors])
+
+    def frequencies(self, q=None, locked=False):
+        """Natural frequencies of `normal_modes` [rad/s]."""
+        return self.normal_modes(q, locked)[0]
+
+    def static_deflection(self, q):
+        """Deflections at which the arm rests under gravity with its joints held, shape (m,).
+
+        Raises
+        ------
+        ModelError
+            When there is none near the straight arm: it buckles or folds under its own weight.
+        """
+        n, m = self.n_joints, self.n_modes
+        delta, rest = np.zeros(m), np.zeros(n)
+        if not m or not any(self.arm.gravity):
+            return delta
+        for _ in range(50):
+            t = self.terms(q, rest, delta, np.zeros(m))
+            change = np.linalg.solve(t.K2, -(t.f2 + t.K2 @ delta))
+            delta = delta + change
+            if np.abs(change).max() <= 1e-12 * max(np.abs(delta).max(), 1e-12):
+                return delta
+        raise ModelError(
+            f"{self.arm.name}: no rest under gravity near the straight arm at q = {list(q)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -307,6 +348,18 @@ def build(arm):
     return registry.find("flexarm.models", arm.model)(arm)
 
 
+def rotation(rpy):
+    """Fixed-axis roll, pitch, yaw, as in URDF; shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
 def damping_matrix(M22, K, ratios):
     r"""Modal damping :math:`D = M_{22}\Psi\,\mathrm{diag}(2\zeta_i\omega_i)\,\Psi^T M_{22}` of the clamped modes.
 
@@ -321,8 +374,6 @@ def damping_matrix(M22, K, ratios):
     -------
     ndarray, shape (m, m)
     """
-    from scipy.linalg import eigh
-
     m = K.shape[0]
     if not len(ratios):
         return np.zeros((m, m))

@@ -31,7 +31,7 @@ from . import beam
 from .errors import ModelError
 from .kernels import integrators, load
 from .kernels import one_link as kernel
-from .model import ArmModel, Terms, damping_matrix, explicit_stepper
+from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class OneLinkEquations(ArmModel):
         self.phi_tip = self.shapes(1.0)  # [-]
         self.slope_tip = self.shapes(1.0, 1) / self.link.length  # [1/m]
         self.coefficients = self.derive()
-        self._rotation = _rotation(self.joint.origin_rpy)
+        self._rotation = rotation(self.joint.origin_rpy)
         self._gravity = self._rotation.T @ np.asarray(arm.gravity)  # in the joint's frame
         self._terms_at_rest = self._constant_terms()
 
@@ -138,7 +138,7 @@ class OneLinkEquations(ArmModel):
         gravity = -c.moment * (gx * cos + gy * sin) - (c.s @ delta) * (-gx * sin + gy * cos)
         return 0.5 * delta @ c.K @ delta + gravity
 
-    def tip_deflection(self, delta):
+    def tip_deflection(self, delta, link=None):
         return np.array([self.phi_tip @ delta, 0.0])
 
     def tip_position(self, q, delta):
@@ -250,15 +250,3 @@ def _check_planar(arm):
         raise ModelError(
             f"model {arm.model}: payload.offset {list(arm.payload.offset)} must lie along x"
         )
-
-
-def _rotation(rpy):
-    """Fixed-axis roll, pitch, yaw, as in URDF."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )

@@ -1212,3 +1212,23 @@ def implicit_trajectory(states, starts, ends, step, substeps, stages, net, extra
         implicit_step(
             states[k + 1], starts[k], change, step, substeps, stages, net, extra, friction, data
         )
+
+
+def linearise(data, work, q, delta, qd, delta_d, step, zero, modal_zero, out, K, C):
+    """Derivatives of `bias_forces` by delta (K) and delta_d (C), by imaginary steps: all arrays complex."""
+    for variable in range(2):
+        for j in range(delta.size):
+            if variable == 0:
+                delta[j] += 1j * step
+            else:
+                delta_d[j] += 1j * step
+            bias_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out)
+            for i in range(out.size):
+                if variable == 0:
+                    K[i, j] = out[i].imag / step
+                else:
+                    C[i, j] = out[i].imag / step
+            if variable == 0:
+                delta[j] -= 1j * step
+            else:
+                delta_d[j] -= 1j * step
