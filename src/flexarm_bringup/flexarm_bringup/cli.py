@@ -29,6 +29,24 @@ def _run(options):
     os.execv(path, [path, *options.arguments])
 
 
+def _simulate(options):
+    from .simulate import simulate
+
+    simulate(options)
+
+
+def _frequencies(options):
+    from .inspect_arm import frequencies
+
+    frequencies(options)
+
+
+def _show(options):
+    from .inspect_arm import show
+
+    show(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -58,6 +76,8 @@ def parser():
         help="the same objects in one process, no DDS, no bags",
     )
     demo.set_defaults(function=_demo)
+
+    _add_arm_commands(commands)
 
     from .publish_trajectory import add_arguments
 
@@ -90,6 +110,36 @@ def parser():
     parameters.add_argument("--write", metavar="FILE", help="rewrite the tables of this file")
     parameters.set_defaults(function=_parameters)
     return top
+
+
+def _add_arm_commands(commands):
+    """What needs an arm file and no ROS."""
+    from . import inspect_arm, simulate
+
+    command = commands.add_parser(
+        "simulate",
+        help="simulate an arm under given torques, or moved as prescribed; a CSV table",
+        description="Simulates an arm from rest, under torques over time or with its joints moved as prescribed.",
+        epilog="example: flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv",
+    )
+    simulate.add_arguments(command)
+    command.set_defaults(function=_simulate)
+    command = commands.add_parser(
+        "frequencies",
+        help="natural frequencies of an arm, joints locked or free",
+        description="Undamped natural frequencies of the straight arm at given joint angles, gravity left out.",
+        epilog="example: flexarm frequencies two_link --at 0,1.57 --locked",
+    )
+    inspect_arm.add_frequency_arguments(command)
+    command.set_defaults(function=_frequencies)
+    command = commands.add_parser(
+        "show",
+        help="masses, inertias, modes, frequencies, gauges and warnings of an arm file",
+        description="Says what an arm file describes, and what to mind.",
+        epilog="example: flexarm show long_reach --at 0,0.5,0,0 --plot",
+    )
+    inspect_arm.add_show_arguments(command)
+    command.set_defaults(function=_show)
 
 
 def main(argv=None):

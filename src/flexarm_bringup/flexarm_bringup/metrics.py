@@ -40,23 +40,28 @@ class Record:
         return Record(*(getattr(self, f.name)[::every] for f in fields(self)))
 
     def tip_deflection(self, model):
-        """Deflection of the tip, y = phi_e delta, shape (k,) [m]."""
-        return self.amplitude @ model.phi_tip
+        """Deflection of the tip, y = phi_e delta, of an arm of one link, shape (k,) [m]."""
+        return self.amplitude @ _phi_tip(model)
 
     def tip_x(self, model):
         """End point along X0, (A9), actual and of the rigid arm on the reference, each (k,) [m]."""
-        length, y = model.link.length, self.tip_deflection(model)
+        length, y = model.arm.links[0].length, self.tip_deflection(model)
         q = self.position[:, 0]
         return length * np.cos(q) - y * np.sin(q), length * np.cos(self.reference[:, 0])
 
     def tip_x_rate(self, model):
         """Its rate, (A10), actual and of the rigid arm on the reference, each (k,) [m/s]."""
-        length, y = model.link.length, self.tip_deflection(model)
+        length, y = model.arm.links[0].length, self.tip_deflection(model)
         q, qd = self.position[:, 0], self.velocity[:, 0]
         actual = (-length * np.sin(q) - y * np.cos(q)) * qd
-        actual -= (self.rate @ model.phi_tip) * np.sin(q)
+        actual -= (self.rate @ _phi_tip(model)) * np.sin(q)
         wanted = -length * np.sin(self.reference[:, 0]) * self.reference_velocity[:, 0]
         return actual, wanted
+
+
+def _phi_tip(model):
+    """Shapes along y of the one link at its tip, shape (m,)."""
+    return model.mode_shapes(model.arm.links[0].name, "y")(1.0)
 
 
 def case_study_metrics(record, model, settle=3.0, until=8.0):
@@ -65,7 +70,8 @@ def case_study_metrics(record, model, settle=3.0, until=8.0):
     Parameters
     ----------
     record : Record
-    model : OneLinkEquations
+    model : ArmModel
+        Of one link.
     settle, until : float
         Window of the residual: from the trajectory's start [s].
 
@@ -96,7 +102,8 @@ def linear_metrics(model, law, q):
 
     Parameters
     ----------
-    model : OneLinkEquations
+    model : ArmModel
+        Of one link.
     law : CompositeControl
     q : ndarray, shape (n,)
 

@@ -25,7 +25,15 @@ from . import beam
 from .errors import ModelError, ShapeError
 from .kernels import chain as plain
 from .kernels import generated, integrators, load
-from .model import ArmModel, Stepper, Terms, damping_matrix, explicit_stepper, rotation
+from .model import (
+    ArmModel,
+    Stepper,
+    Terms,
+    about_axis,
+    damping_matrix,
+    explicit_stepper,
+    rotation,
+)
 
 _KIND = {"y": plain.Y, "z": plain.Z, "twist": plain.TWIST}
 
@@ -326,6 +334,45 @@ class Chain(ArmModel):
             if d.direction[i, j] != plain.TWIST:
                 out[d.direction[i, j] - 1] += d.tip[i, j] * delta[d.first[i] + j]
         return out
+
+    def link_ends(self, q, delta=None):
+        """Positions of all links' tips in the base frame, shape (n, 3) [m]."""
+        R, p = self.frames(q, delta)
+        ends = p[1:].copy()
+        for i in range(self.n_joints - 1):
+            # The next joint sits off the tip by its origin, in the tip's frame: undo that joint's turn.
+            joint = self.arm.joints[i + 1]
+            turn = rotation(joint.origin_rpy) @ about_axis(joint.axis, q[i + 1])
+            ends[i] -= R[i + 1] @ turn.T @ np.asarray(joint.origin_xyz)
+        return ends
+
+    @cached_property
+    def planar_axis(self):
+        """Axis of an arm whose joints all turn about parallel axes, in the base frame; None for others."""
+        R, _ = self.frames(np.zeros(self.n_joints))
+        axes = np.einsum("ijk,ik->ij", R[:-1], self.data.axis)
+        return axes[0] if np.allclose(np.cross(axes, axes[0]), 0.0, atol=1e-9) else None
+
+    def base_angles(self, q, delta=None):
+        """Absolute rotation of each link's base about the axis of a planar arm, shape (n,) [rad].
+
+        From the base frame's orientation, fixed turns of the joints' origins left out; counted on beyond a
+        turn. For a straight planar arm the sum of the joint angles.
+        """
+        q = self._joint(q, "q")
+        R, _ = self.frames(q, delta)
+        rest, _ = self.frames(np.zeros(self.n_joints))
+        axis = self.planar_axis
+        signs = np.sign(np.einsum("ijk,ik->ij", rest[:-1], self.data.axis) @ axis)
+        about = np.cumsum(signs * q)
+        angles = np.empty(self.n_joints)
+        for i in range(self.n_joints):
+            turn = R[i] @ rest[i].T
+            sine = 0.5 * axis @ (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])
+            cosine = 0.5 * (np.trace(turn) - 1.0)
+            error = np.arctan2(sine, cosine) - about[i]
+            angles[i] = about[i] + (error + np.pi) % (2.0 * np.pi) - np.pi
+        return angles * signs
 
     # Integration -------------------------------------------------------------------------------
 

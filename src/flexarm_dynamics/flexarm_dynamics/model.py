@@ -16,6 +16,7 @@ from scipy.linalg import eigh
 
 from . import registry
 from .errors import ModelError, ShapeError
+from .kernels import chain as kernel
 
 
 @dataclass(frozen=True)
@@ -358,6 +359,13 @@ def rotation(rpy):
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def about_axis(axis, angle):
+    """Rotation about a unit vector, shape (3, 3)."""
+    out = np.zeros((3, 3))
+    kernel.about_axis(np.asarray(axis, float), angle, out)
+    return out
 
 
 def damping_matrix(M22, K, ratios):

@@ -29,20 +29,22 @@ METHODS = {
     "implicit": None,
 }
 
-#: Highest angular frequency times substep.
-PHASE_PER_STEP = 0.5
+#: Highest angular frequency times substep of the explicit methods.
+PHASE_PER_STEP = {"dop853": 0.5, "rk4": 0.1}
 #: More substeps than this per sample is no simulation any more.
 MOST_SUBSTEPS = 10_000
 
 
-def substeps(model, period):
-    """Substeps per sample that keep the highest free mode's phase below `PHASE_PER_STEP`.
+def substeps(model, period, method="dop853"):
+    """Substeps per sample that keep the highest free mode's phase below `PHASE_PER_STEP`; implicit: one.
 
     Parameters
     ----------
     model : ArmModel
     period : float
         Sample period [s].
+    method : str
+        One of `METHODS`.
 
     Returns
     -------
@@ -53,12 +55,14 @@ def substeps(model, period):
     ModelError
         When the highest mode would need more than `MOST_SUBSTEPS`.
     """
+    if method not in PHASE_PER_STEP:
+        return 1
     highest = float(model.frequencies()[-1]) if model.n_modes else 0.0
-    count = max(1, int(np.ceil(highest * period / PHASE_PER_STEP)))
+    count = max(1, int(np.ceil(highest * period / PHASE_PER_STEP[method])))
     if count > MOST_SUBSTEPS:
         raise ModelError(
             f"{model.arm.name}: its highest mode, {highest:.3g} rad/s, needs {count} substeps per sample"
-            f" of {period:g} s (at most {MOST_SUBSTEPS}): fewer plant_modes or a higher rate"
+            f" of {period:g} s (at most {MOST_SUBSTEPS}): fewer modes, or integrator implicit"
         )
     return count
 

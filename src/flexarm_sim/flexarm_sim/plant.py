@@ -21,6 +21,8 @@ class Plant:
         The plant's own model; may have more modes than the controller's.
     period : float
         Interval over which torque is constant [s].
+    integrator : str
+        One of `integrators.METHODS`.
 
     Attributes
     ----------
@@ -28,28 +30,27 @@ class Plant:
         (q, delta, qd, delta_d) [rad, m, rad/s, m/s].
     """
 
-    def __init__(self, model, period):
+    def __init__(self, model, period, integrator="dop853"):
         n, m = model.n_joints, model.n_modes
         self.model, self.period = model, period
         self.state = np.zeros(2 * (n + m))
         self.q, self.delta, self.qd, self.delta_d = np.split(self.state, [n, n + m, 2 * n + m])
-        self.substeps = integrators.substeps(model, period)
-        self._advance = model.stepper(integrators.METHODS["dop853"])
+        self.substeps = integrators.substeps(model, period, integrator)
+        self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
         self._safe = self._friction + self._safe_friction()
         self._safe[:, 2] = self._brake_smoothing()
         self._no_torque = np.zeros(n)
 
     def reset(self, position=None, delta=None):
-        """At rest, straight (or bent by `delta`), at `position` [rad]."""
+        """At rest at `position` [rad], bent by `delta`; not given: as its own weight bends it, joints held."""
         n = self.model.n_joints
         position = np.zeros(n) if position is None else np.asarray(position, float)
         if position.shape != (n,):
             raise ShapeError(f"initial position has shape {position.shape}, wanted {(n,)}")
         self.state[:] = 0.0
         self.q[:] = position
-        if delta is not None:
-            self.delta[:] = delta
+        self.delta[:] = self.model.static_deflection(position) if delta is None else delta
 
     def advance(self, torque):
         """One period under constant torque, shape (n,) [N m]."""

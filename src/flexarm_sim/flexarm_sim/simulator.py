@@ -9,6 +9,7 @@ from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.strain_map import StrainMap
 
+from . import integrators
 from .plant import Plant
 from .sensors import Sensors
 
@@ -44,6 +45,15 @@ PARAMETERS = (
         unit="Hz",
         low=1.0,
         high=20000.0,
+        read_only=True,
+    ),
+    Parameter(
+        "integrator",
+        "string",
+        "dop853",
+        "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode; implicit damps modes"
+        " too fast for the period, in one step.",
+        choices=tuple(integrators.METHODS),
         read_only=True,
     ),
     Parameter(
@@ -114,7 +124,7 @@ class Simulator:
         plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
         self.plant_model = model.build(plant_arm)
         self.period_ns = round(1e9 / settings["rate"])
-        self.plant = Plant(self.plant_model, 1e-9 * self.period_ns)
+        self.plant = Plant(self.plant_model, 1e-9 * self.period_ns, settings["integrator"])
         self.sensors = Sensors(self.plant_model, settings["noise"], settings["seed"])
         self.strain_map = StrainMap(self.nominal) if arm.gauges else None
         n, m = len(arm.joints), len(arm.observed_modes)
