@@ -67,7 +67,7 @@ def draw(arm_model, q, path):
             ax.plot(line[:, a], line[:, b], color="0.75", lw=2.0)
         if not k:
             for gauge in arm.gauges:
-                p = chain.point(gauge.link, gauge.position, q)
+                p = chain.point(gauge.link, gauge.position, q, arm_model.static_deflection(q))
                 ax.plot(p[a], p[b], "s", color="tab:orange", ms=4)
         for line in lines:
             ax.plot(line[:, a], line[:, b], color="tab:blue", lw=1.5)

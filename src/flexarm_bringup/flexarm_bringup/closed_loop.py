@@ -7,6 +7,7 @@ from flexarm_control.arm_controller import ArmController
 from flexarm_control.arm_observer import ArmObserver, design_observer
 from flexarm_control.composite import design, typed
 from flexarm_control.samples import ArmSample
+from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.integrators import integrate
@@ -33,7 +34,7 @@ class ClosedLoop:
     """
 
     def __init__(self, arm, slow, fast, observer, simulator=None, controller=None):
-        sizes = {"joints": 1}
+        sizes = {"joints": len(arm_file.load(arm).joints)}
         settings = check_all(SIMULATOR_PARAMETERS, {"arm": str(arm), **(simulator or {})}, sizes)
         self.simulator = Simulator(settings)
         model = self.model = self.simulator.nominal

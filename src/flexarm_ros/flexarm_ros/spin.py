@@ -28,11 +28,17 @@ class Line:
         A callback in real time is wanted every so many seconds (steady clock).
     on_period : callable, optional
         That callback. A period that was missed is not made up for.
+
+    Attributes
+    ----------
+    lost : float
+        Periods that passed without a callback.
     """
 
     def __init__(self, subscription, period=None, on_period=None):
         self.subscription = subscription
         self.period, self.on_period = period, on_period
+        self.lost = 0.0
 
 
 def spin(node, stopped):
@@ -73,7 +79,11 @@ def _spin_line(node, line, executor, stopped):
             others = now + HOUSEKEEPING
         if due is not None and now >= due:
             line.on_period()
-            due = max(due + line.period, clock())
+            due += line.period
+            behind = clock() - due
+            if behind > 0.0:
+                line.lost += behind / line.period
+                due += behind
         until = others if due is None else min(others, due)
         waiting.clear_entities()
         with handle:

@@ -289,6 +289,8 @@ class SimulatorNode(ArmNode):
             "torques refused": self._refused,
             "controllers seen": len(self._controllers),
         }
+        if self.line is not None and not self._lockstep:
+            values["periods lost"] = f"{self.line.lost:.1f}"
         if self._fault:
             return ERROR, self._fault, values
         several, self._several = self._several, set()

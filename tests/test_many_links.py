@@ -1,0 +1,97 @@
+"""Arms of several links as a user runs them: the simulator node, the composite controller, over DDS."""
+
+import numpy as np
+import pytest
+from harness import Bench
+
+from flexarm_bringup import closed_loop, lockstep, parameter_files, recorder
+from flexarm_bringup.parameter_files import under
+from flexarm_bringup.processes import Processes, own_domain
+from flexarm_bringup.recorder import keep_for_recording
+from flexarm_control import profiles, trajectory
+from flexarm_dynamics import arm_file, model
+from flexarm_msgs.msg import ArmState
+
+FILE, GOAL, DURATION = "two_link_composite", (0.8, 0.8), 6.0
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with Bench(tmp_path) as made:
+        yield made
+
+
+@pytest.mark.parametrize("name", ["two_link", "long_reach", "rigid"])
+def test_the_simulator_runs_each_shipped_arm(bench, name):
+    arm = arm_file.load(name)
+    bench.start("simulator", {"arm": name})
+    tap = bench.tap(ArmState, "arm_state")
+    bench.wait_for("100 states", lambda: len(tap.messages) > 100)
+    state = tap.newest
+    assert tuple(state.joint_names) == arm.joint_names
+    assert tuple(state.mode_names) == (arm.observed_modes if arm.gauges else ())
+    assert tuple(state.gauge_names) == arm.gauge_names
+    assert np.isfinite(state.joint_position).all() and np.isfinite(state.strain).all()
+    # Nobody sends torque: the brakes hold what has them, at rest under its own weight.
+    if arm.gravity != (0.0, 0.0, 0.0):
+        assert np.abs(state.joint_position).max() < 2e-2
+    if arm.gauges:
+        sag = model.build(arm).static_deflection(np.zeros(len(arm.joints)))
+        assert np.abs(np.array(state.modal_amplitude) - sag).max() < 2e-2
+
+
+def quintic():
+    """The motion of both joints."""
+    return profiles.quintic([0.0, 0.0], GOAL, 4.0)
+
+
+def without_ros():
+    """The same run in one process."""
+    values = parameter_files.load(FILE)
+    loop = closed_loop.ClosedLoop(
+        "two_link",
+        under(values["controller"], "slow"),
+        under(values["controller"], "fast"),
+        under(values["observer"], "observer"),
+        {"initial_position": [0.0, 0.0]},
+    )
+    s = profiles.sample(quintic(), 41)
+    rows = zip(s.times, s.positions, s.velocities, s.accelerations, strict=True)
+    joints = loop.model.joint_names
+    return loop.run(
+        trajectory.validate(
+            joints,
+            joints,
+            closed_loop.TRAJECTORY_START_NS,
+            [(round(t * 1e9), p, v, a, ()) for t, p, v, a in rows],
+        ),
+        DURATION,
+    )
+
+
+def test_the_composite_controller_moves_the_two_link_arm_and_damps_it(tmp_path):
+    with own_domain() as domain, Processes(domain, tmp_path) as processes:
+        file = parameter_files.find(FILE)
+        for name, own in (("simulator", {"lockstep": True}), ("observer", {}), ("controller", {})):
+            own |= {"arm": "two_link"} | keep_for_recording(name)
+            if name == "controller":
+                own["state_timeout"] = 60.0
+            processes.start_node(name, own, file)
+        with lockstep.LockstepRun(processes) as line:
+            start = closed_loop.TRAJECTORY_START_NS
+            message = lockstep.trajectory_message(("joint1", "joint2"), quintic(), 41, start)
+            samples, _ = line.run(message, DURATION)
+        assert set(processes.stop().values()) == {0}
+    nodes = recorder.to_record(recorder.decode(samples), start)
+    alone = without_ros()
+    assert nodes.time.size == alone.time.size
+    for name in ("position", "amplitude", "torque", "fast_torque"):
+        np.testing.assert_allclose(
+            getattr(nodes, name), getattr(alone, name), atol=1e-9, err_msg=name
+        )
+    error = np.abs(nodes.reference - nodes.position)
+    assert error.max() < 0.06  # [rad] on a motion of 0.8 rad; untuned
+    assert error[-1].max() < 0.02
+    assert np.abs(nodes.fast_torque).max() > 1e-3  # the fast control takes part
+    late = nodes.time > 5.5
+    assert np.abs(nodes.amplitude[late]).max() < 0.1 * np.abs(nodes.amplitude).max()
