@@ -13,6 +13,8 @@ from .errors import ModelError
 
 DIRECTIONS = ("y", "z", "twist")
 SAFE_ACTIONS = ("brake", "damp", "zero")
+#: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
+MOST_MODES = 20
 SHAPES = ("clamped_free", "loaded", "from_frequencies")
 
 
@@ -181,6 +183,8 @@ class Arm:
         Gauges and observed modes stay as they are: what a plant with more modes than its controller knows
         does to the gauges is spill-over.
         """
+        if not 1 <= count <= MOST_MODES:
+            raise ModelError(f"{self.name}: {count} modes; from 1 to {MOST_MODES} are possible")
         for link in self.links:
             for direction, f in link.flexible.items():
                 if f.shape == "from_frequencies" and len(f.frequencies) < count:

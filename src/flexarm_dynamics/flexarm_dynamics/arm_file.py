@@ -14,6 +14,7 @@ import yaml
 
 from .arm import (
     DIRECTIONS,
+    MOST_MODES,
     SAFE_ACTIONS,
     SHAPES,
     Arm,
@@ -27,10 +28,6 @@ from .arm import (
 )
 from .errors import ArmFileError
 from .units import SI_UNIT, to_si
-
-#: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
-MOST_MODES = 20
-
 
 #: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
 LARGEST = 1e30

@@ -65,11 +65,17 @@ class Chain(ArmModel):
             for direction, flexibility in link.flexible.items():
                 self._shapes[link.name, direction] = _shapes(link, direction, flexibility, body)
         self.data = _assemble(arm, self._shapes, loads)
+        self._check_inertia()
 
     @cached_property
     def kernel(self):
         """The kernels: compiled on first use, or plain."""
         return load.joined("chain", CHAIN_SOURCES, self._compiled)
+
+    @cached_property
+    def complex_kernel(self):
+        """The same for complex numbers: a module of its own, so that both can be compiled at once."""
+        return load.joined("chain_complex", CHAIN_SOURCES, self._compiled)
 
     @cached_property
     def _room(self):
@@ -94,6 +100,22 @@ class Chain(ArmModel):
     @cached_property
     def _complex_work(self):
         return self._new_work(complex)
+
+    def _check_inertia(self):
+        """Refuse an arm with a motion that moves no mass: a roll joint on a line of mass, say."""
+        n = self.n_joints
+        for q in (np.zeros(n), 0.7 + np.arange(n)):
+            M = self.mass_matrix(q)
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+            values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
+            weightless = np.flatnonzero(np.diag(M)[:n] <= 1e-14 * np.diag(M)[:n].max())
+            if weightless.size or values[0] <= 1e-13:
+                worst = np.abs(vectors[:, 0])
+                i = int(weightless[0] if weightless.size else np.argmax(worst[:n]))
+                raise ModelError(
+                    f"joints[{i}]: {self.joint_names[i]} can turn without moving any mass; give it a hub_inertia,"
+                    " or its link a polar_inertia_per_length"
+                )
 
     def mode_shapes(self, link, direction):
         try:
@@ -161,7 +183,7 @@ class Chain(ArmModel):
             self._modal(delta_d, "delta_d"),
         )
         zeros = (np.zeros(n, complex), np.zeros(m, complex), np.zeros(n + m, complex))
-        self.kernel.linearise(
+        self.complex_kernel.linearise(
             self._data, self._complex_work, *(a.astype(complex) for a in arrays), STEP, *zeros, K, C
         )
         return K, C
@@ -441,7 +463,7 @@ def _roomy(data):
     return _sizes(
         _capacity(data.links, (8, 16, 32)),
         _capacity(data.s.shape[1], (4, 8, 16, 60)),
-        _capacity(data.nodes, (1, 28, 44, 92)),
+        _capacity(data.nodes, (28, 44, 92)),
     )
 
 

@@ -11,9 +11,10 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.arm import Arm
-from flexarm_dynamics.errors import ArmFileError
+from flexarm_dynamics.beam import natural_frequencies
+from flexarm_dynamics.errors import ArmFileError, ModelError
 from flexarm_dynamics.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 
 FULL = """
@@ -324,7 +325,7 @@ def test_shipped_one_link_arm_has_the_data_of_R_in_si():
 
 
 def test_an_unknown_name_lists_the_shipped_arms():
-    with pytest.raises(ArmFileError, match=r"^arm: 'Q' is neither a file .*P3, R, one_link"):
+    with pytest.raises(ArmFileError, match=r"^arm: 'Q' is neither a file .*P3, R, .*one_link"):
         arm_file.load("Q")
 
 
@@ -784,3 +785,96 @@ def test_a_file_with_damaged_characters_gives_an_arm_or_an_arm_file_error(data):
 def test_any_text_is_an_arm_file_error(text):
     with pytest.raises(ArmFileError):
         arm_file.parse(text)
+
+
+# --- arms of several links ------------------------------------------------------------------------
+
+
+def two_links():
+    """The shipped two-link arm as plain data, to be spoilt."""
+    return yaml.safe_load(arm_file.find("two_link").read_text())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda d: d["links"][0].update(mass_per_length=0),
+            r"^links\[0\]\.mass_per_length: 0\.0 must",
+        ),
+        (
+            lambda d: d["links"][0].update(EI_y=-1),
+            r"^links\[0\]\.EI_y: -1\.0 must be greater than 0",
+        ),
+        (lambda d: d["links"][1].update(EI_y=0), r"^links\[1\]\.EI_y: 0\.0 must be greater than 0"),
+        (lambda d: d["links"][1].update(length=-1), r"^links\[1\]\.length: -1\.0 must be greater"),
+        (
+            lambda d: d["joints"][1].update(axis=[0, 0, 0]),
+            r"^joints\[1\]\.axis: its length is zero",
+        ),
+        (
+            lambda d: d["gauges"][3].update(position=0.6),
+            r"^gauges\[3\]\.position: 0\.6 m is outside",
+        ),
+        (lambda d: d["gauges"].pop(), r"^gauges: 1 on link2 in direction y for 2 observed modes"),
+        (lambda d: d["joints"][1].update(parent="link2"), r"^joints\[1\]\.parent: no such field"),
+        (
+            lambda d: d["links"][1].update(name="link1"),
+            r"^links\[1\]\.name: 'link1' is links\[0\]'s",
+        ),
+        (lambda d: d["joints"].append({"name": "joint3"}), r"^joints: 3 joints for 2 links"),
+        (
+            lambda d: d["links"][1].update(GJ=3.0, flexible={"twist": {"modes": 1}}),
+            r"^links\[1\]\.polar_inertia_per_length: missing",
+        ),
+        (
+            lambda d: d.update(foreshortening="yes please"),
+            r"^foreshortening: 'yes please' is neither",
+        ),
+        (lambda d: d.update(finite_slope=1), r"^finite_slope: 1 is neither true nor false"),
+    ],
+)
+def test_a_malformed_arm_of_two_links_is_refused_by_path(spoil, message):
+    data = two_links()
+    spoil(data)
+    with pytest.raises(ArmFileError, match=message):
+        arm_file.parse(yaml.safe_dump(data))
+
+
+@pytest.mark.parametrize("text", ["joints: &a [*a]", "joints: &a [{name: j, origin: *a}]"])
+def test_a_file_that_contains_itself_is_refused_by_path(text):
+    with pytest.raises(ArmFileError, match=r"^joints\[0\].*a mapping is wanted, not a list"):
+        arm_file.parse(f"name: loop\n{text}\nlinks: [{{name: l, length: 1, mass_per_length: 1}}]")
+
+
+def test_a_joint_that_turns_without_moving_mass_is_refused_by_path():
+    data = two_links()
+    data["joints"][1] |= {"axis": [1, 0, 0], "hub_inertia": 0.0}
+    data["payload"] = {}
+    with pytest.raises(ModelError, match=r"^joints\[1\]: joint2 can turn without moving any mass"):
+        model.build(arm_file.parse(yaml.safe_dump(data)))
+
+
+def test_model_levels_and_the_default_model_are_read():
+    data = two_links() | {"foreshortening": True, "finite_slope": True}
+    arm = arm_file.parse(yaml.safe_dump(data))
+    assert (arm.foreshortening, arm.finite_slope, arm.model) == (True, True, "chain")
+    assert not arm_file.load("two_link").foreshortening
+
+
+@pytest.mark.parametrize("count", [0, -1, 21])
+def test_a_number_of_modes_out_of_range_is_refused(count):
+    with pytest.raises(ModelError, match=rf"two_link: {count} modes; from 1 to 20"):
+        arm_file.load("two_link").with_modes(count)
+
+
+def test_the_published_frequencies_of_the_two_link_arm():
+    """De Luca and Siciliano (1991): 0.48, 1.80 Hz and 2.18, 15.91 Hz, each link with its load."""
+    arm = arm_file.load("two_link")
+    chain = model.build(arm)
+    found = []
+    for link in arm.links:
+        beta = chain.mode_shapes(link.name, "y").beta
+        omega = natural_frequencies(beta, link.length, link.mass_per_length, link.stiffness["y"])
+        found += list(omega / (2.0 * np.pi))
+    np.testing.assert_allclose(found, [0.48, 1.80, 2.18, 15.91], atol=0.005)

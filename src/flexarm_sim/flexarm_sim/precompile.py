@@ -1,16 +1,57 @@
 """Compiles the numba kernels into their cache, so that no node waits for it: ``python -m flexarm_sim.precompile``."""
 
+from concurrent.futures import ProcessPoolExecutor
+
 import numpy as np
 
 from flexarm_dynamics import arm_file, model
 
+from .integrators import METHODS
 from .plant import Plant
+
+#: One arm of each structure that is shipped.
+ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
 
 
 def main():
-    """Advance a plant by one period; numba keeps what it compiled for that."""
-    plant = Plant(model.build(arm_file.load("R")), 1e-3)
-    plant.advance(np.zeros(1))
+    """Use everything once, on two cores; numba keeps what it compiled for that."""
+    with ProcessPoolExecutor(2) as pool:
+        for job in [pool.submit(linearise), pool.submit(loops), pool.submit(arms)]:
+            job.result()
+
+
+def linearise():
+    """The recursion on complex numbers."""
+    chain = model.build(arm_file.load("two_link"))
+    chain.linearisation(np.zeros(2), np.zeros(2))
+
+
+def loops():
+    """The recursion on real numbers, and the integrators around it."""
+    chain = model.build(arm_file.load("two_link"))
+    state = np.zeros(2 * (chain.n_joints + chain.n_modes))
+    evaluate(chain)
+    for method in METHODS.values():
+        chain.stepper(method, straight_line=False)(state, np.zeros(2), 1e-3)
+    chain.driven_stepper(METHODS["dop853"])(state, np.zeros(2), 1e-3)
+
+
+def arms():
+    """The straight-line code of the shipped arms."""
+    for name in ARMS:
+        plant = Plant(model.build(arm_file.load(name)), 1e-3)
+        plant.advance(np.zeros(plant.model.n_joints))
+
+
+def evaluate(arm_model):
+    """Equations of motion, energy and kinematics at rest."""
+    n, m = arm_model.n_joints, arm_model.n_modes
+    q, delta = np.zeros(n), np.zeros(m)
+    arm_model.mass_matrix(q)
+    arm_model.derivative(np.zeros(2 * (n + m)), q)
+    arm_model.energy(np.zeros(2 * (n + m)))
+    arm_model.tip_position(q, delta)
+    arm_model.tip_velocity(q, q, delta, delta)
 
 
 if __name__ == "__main__":
