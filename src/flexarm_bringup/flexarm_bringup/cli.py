@@ -1,6 +1,7 @@
 """The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
 
 import argparse
+import re
 import signal
 import sys
 
@@ -142,9 +143,24 @@ def _add_arm_commands(commands):
     command.set_defaults(function=_show)
 
 
+#: Options whose value may begin with a minus.
+ANGLES = ("--at", "--initial", "--to", "--from")
+
+
+def bind_angles(words):
+    """Join ``--at -1,2`` to ``--at=-1,2``: argparse would take the angles for an option."""
+    out = []
+    for word in words:
+        if out and out[-1] in ANGLES and re.match(r"-[\d.]", word):
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
 def main(argv=None):
     """Entry point; exit code 0, 1 for an error that has been said, 2 for wrong usage."""
-    options = parser().parse_args(argv)
+    options = parser().parse_args(bind_angles(sys.argv[1:] if argv is None else argv))
     # As Ctrl-C: what was started is stopped on the way out.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:

@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -140,12 +141,12 @@ class Motion:
 
 
 def write(columns, rows, path=None):
-    """Write rows as CSV to a file, whole or not at all, or to standard output."""
+    """Write rows as CSV to a file, its directory made, or to standard output."""
     out = io.StringIO()
     out.write(",".join(columns) + "\n")
     np.savetxt(out, rows, fmt="%.12g", delimiter=",")
     if path is None:
         sys.stdout.write(out.getvalue())
         return
-    with open(path, "w", encoding="utf-8") as file:
-        file.write(out.getvalue())
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(out.getvalue(), encoding="utf-8")

@@ -563,7 +563,7 @@ def load(name):
     Parameters
     ----------
     name : str or Path
-        ``R``, ``P3``, ``one_link`` or a path to a YAML file.
+        ``R``, ``two_link`` or another of ``config/arms``, or a path to a YAML file.
 
     Returns
     -------

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
-from scipy.integrate import DOP853
+from scipy.integrate import DOP853, solve_ivp
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from flexarm_dynamics.arm import Arm, Flexibility, Friction, Joint, Link, Payload
-from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.chain import Chain, work_space
 from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.kernels import generated
 from flexarm_dynamics.model import Tableau, rotation
@@ -223,7 +223,9 @@ class Jet:
         return self._map(np.sqrt, lambda x: 0.5 / np.sqrt(x), lambda x: -0.25 * x**-1.5)
 
     def arcsin(self):
-        return self._map(np.arcsin, lambda x: (1 - x * x) ** -0.5, lambda x: x * (1 - x * x) ** -1.5)
+        return self._map(
+            np.arcsin, lambda x: (1 - x * x) ** -0.5, lambda x: x * (1 - x * x) ** -1.5
+        )
 
 
 def rows(*entries):
@@ -379,27 +381,27 @@ class Reference:
             sums["linear"] += m @ v
             sums["angular"] += m @ np.cross(x.c[0, -1], v)
 
-        def inertia(I, R):  # noqa: E741
+        def inertia(body, R):
             """A body's rotation; R (b, 3, 3)."""
             W, dW = spin(R)
             w, al = W[-1], dW[-1]
-            moment = I @ al + np.cross(w, I @ w)
+            moment = body @ al + np.cross(w, body @ w)
             sums["force"] += W[:-1] @ moment
-            sums["kinetic"] += 0.5 * w @ I @ w
+            sums["kinetic"] += 0.5 * w @ body @ w
             sums["power"] += w @ moment
-            sums["angular"] += R.c[0, -1] @ I @ w
+            sums["angular"] += R.c[0, -1] @ body @ w
 
-        def wheels(I, R, axis, rate, acceleration):
-            """Wheels of inertia I (k,) that turn by a rate (b, k) about an axis fixed in R."""
+        def wheels(inertias, R, axis, rate, acceleration):
+            """Wheels (k,) that turn by a rate (b, k) about an axis fixed in R."""
             W, dW = spin(R)
             w, axis = W[-1], np.array(axis)
             own = W @ axis
             total = own[:, None] + rate
             change = dW[-1] @ axis + acceleration
-            spins = I @ total[-1]
-            sums["force"] += total[:-1] @ (I * change) + W[:-1] @ np.cross(w, axis) * spins
-            sums["kinetic"] += 0.5 * I @ total[-1] ** 2
-            sums["power"] += I @ (total[-1] * change)
+            spins = inertias @ total[-1]
+            sums["force"] += total[:-1] @ (inertias * change) + W[:-1] @ np.cross(w, axis) * spins
+            sums["kinetic"] += 0.5 * inertias @ total[-1] ** 2
+            sums["power"] += inertias @ (total[-1] * change)
             sums["angular"] += R.c[0, -1] @ axis * spins
 
         frames = self.frames(q, delta)
@@ -448,6 +450,868 @@ class Reference:
 
 
 def coordinates(state):
-    """Z = (q, delta) and its rate."""
+    """(q, delta) and its rate."""
     q, delta, qd, delta_d = state
     return np.concatenate([q, delta]), np.concatenate([qd, delta_d])
+
+
+def close(ours, theirs, tolerance, what="", scale=None):
+    """Assert agreement relative to the largest entry, or to a scale given."""
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    scale = np.abs(theirs).max(initial=0.0) if scale is None else scale
+    error = np.abs(ours - theirs).max(initial=0.0)
+    assert error <= tolerance * scale, f"{what}: {error / scale:.2e} of {scale:.2e}"
+
+
+arms = {"seed": seeds, "layout": layouts(), "level": st.sampled_from(LEVELS)}
+
+
+@examples
+@given(**arms)
+def test_forces_are_those_of_a_second_derivation(seed, layout, level):
+    arm = random_arm(seed, layout, level)
+    chain, rng = Chain(arm), np.random.default_rng(seed)
+    n, reference = chain.n_joints, Reference(chain)
+    state = q, delta, qd, delta_d = random_state(seed, arm)
+    z, zd = coordinates(state)
+    damping = np.append(np.zeros(n), reference.damping() @ delta_d)
+    friction = np.append(chain.friction(qd), np.zeros(delta.size))
+    elastic = reference.elastic(z, zd)[1]
+    # Everything, and each part of it with the larger ones left out.
+    for speed, acceleration, deflected in ((1, 1, 1), (1, 0, 1), (0, 0, 1), (1, 0, 0), (0, 1, 0)):
+        zdd = acceleration * 10.0 * rng.standard_normal(z.size)
+        at = np.append(q, deflected * delta)
+        sums = reference.motion(at, speed * zd, zdd)
+        theirs = sums["force"] + sums["gravity"] + deflected * elastic
+        theirs = theirs + speed * (damping + friction)
+        ours = chain.inverse_dynamics(
+            q, speed * qd, zdd[:n], deflected * delta, speed * delta_d, zdd[n:]
+        )
+        close(ours, theirs, 1e-11, f"{speed, acceleration, deflected}")
+
+
+@examples
+@given(**arms)
+def test_energies_and_momenta_are_sums_over_all_that_has_mass(seed, layout, level):
+    arm = random_arm(seed, layout, level)
+    chain = Chain(arm)
+    reference, state = Reference(chain), random_state(seed, arm)
+    q, delta, qd, delta_d = state
+    z, zd = coordinates(state)
+    sums, elastic = reference.motion(z, zd, 0.0 * z), reference.elastic(z, zd)[0]
+    assert chain.kinetic_energy(q, qd, delta, delta_d) == pytest.approx(sums["kinetic"], rel=1e-12)
+    potential = chain.potential_energy(q, delta)
+    assert abs(potential - sums["weight"] - elastic) < 1e-12 * (elastic + abs(sums["weight"]) + 10)
+    linear, angular = chain.momentum(q, qd, delta, delta_d)
+    close(linear, sums["linear"], 1e-12, "linear momentum")
+    close(angular, sums["angular"], 1e-12, "angular momentum")
+
+
+@examples
+@given(**arms)
+def test_energy_changes_by_the_work_of_torque_damping_and_friction(seed, layout, level):
+    """The rate of energy is exact: no difference of energies is taken."""
+    arm = random_arm(seed, layout, level)
+    chain = Chain(arm)
+    n, reference = chain.n_joints, Reference(chain)
+    state = random_state(seed, arm)
+    (z, zd), qd, delta_d = coordinates(state), *state[2:]
+    torque = 5.0 * np.random.default_rng(seed).standard_normal(n)
+    rates = chain.derivative(np.concatenate([z, zd]), torque)
+    np.testing.assert_array_equal(rates[: z.size], zd)
+    sums = reference.motion(z, zd, rates[z.size :])
+    stored = (sums["power"], zd @ sums["gravity"], reference.elastic(z, zd)[2])
+    damped = delta_d @ reference.damping() @ delta_d
+    lost = sum(
+        v * (j.friction.viscous * v + j.friction.coulomb * np.tanh(v / j.friction.smoothing))
+        for j, v in zip(arm.joints, qd, strict=True)
+    )
+    assert damped >= 0.0 and lost > 0.0
+    scale = sum(map(abs, stored)) + abs(torque @ qd) + damped + lost
+    assert abs(sum(stored) - (torque @ qd - damped - lost)) < 1e-11 * scale
+
+
+@examples
+@given(**arms)
+def test_forward_dynamics_solve_what_the_terms_say(seed, layout, level):
+    arm = random_arm(seed, layout, level)
+    chain = Chain(arm)
+    n = chain.n_joints
+    q, delta, qd, delta_d = random_state(seed, arm)
+    torque = np.append(np.random.default_rng(seed).standard_normal(n), np.zeros(delta.size))
+    t = chain.terms(q, qd, delta, delta_d)
+    scale = np.sqrt(np.diag(t.M))
+    close(t.M, t.M.T, 1e-13, "M symmetric")
+    assert np.linalg.eigvalsh(t.M / np.outer(scale, scale)).min() > 1e-9
+    close((t.H @ t.M) * np.outer(scale, 1.0 / scale), np.eye(scale.size), 1e-9, "H M")
+    f, C, K = (np.concatenate(pair) for pair in ((t.f1, t.f2), (t.C1, t.C2), (t.K1, t.K2)))
+    whole = chain.forces(q, qd, delta, delta_d)
+    friction = np.append(chain.friction(qd), np.zeros(delta.size))
+    close(f + C @ delta_d + K @ delta, whole + friction, 1e-12, "f + C delta_d + K delta")
+    state = np.concatenate([q, delta, qd, delta_d])
+    accelerations = chain.derivative(state, torque[:n])[n + delta.size :]
+    left, right = t.M @ accelerations, torque - whole - friction
+    size = np.abs(t.M) @ np.abs(accelerations) + np.abs(right)
+    assert (np.abs(left - right) <= 1e-10 * size).all()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_terms_are_the_derivatives_of_the_forces_at_the_straight_arm(level):
+    """C and K against differences of eighth order."""
+    arm = random_arm(11, [FULL, {}, FULL], level)
+    chain = Chain(arm)
+    q, delta, qd, delta_d = random_state(12, arm)
+    t, zero, unit_steps = chain.terms(q, qd), np.zeros(chain.n_modes), np.eye(chain.n_modes)
+    K = derivative(lambda x: chain.forces(q, qd, x, zero), zero, 2e-3 * unit_steps)
+    C = derivative(lambda x: chain.forces(q, qd, zero, x), zero, unit_steps)
+    close(np.vstack([t.K1, t.K2]), K / 2e-3, 1e-9, "K")
+    close(np.vstack([t.C1, t.C2]), C, 1e-11, "C")
+    assert np.abs(t.C1).max() > 0.1 and np.abs(t.K1).max() > 0.1
+    bent = chain.terms(q, qd, delta, delta_d)
+    for name in ("C1", "C2", "K1", "K2"):
+        np.testing.assert_array_equal(getattr(bent, name), getattr(t, name), err_msg=name)
+    K, C = chain.linearisation(q, qd, delta, delta_d)
+    there = derivative(lambda x: chain.forces(q, qd, x, delta_d), delta, 1e-3 * unit_steps)
+    close(K, there / 1e-3, 1e-9, "K of the bent arm")
+    there = derivative(lambda x: chain.forces(q, qd, delta, x), delta_d, unit_steps)
+    close(C, there, 1e-11, "C of the bent arm")
+
+
+def derivative(function, at, steps):
+    """Changes of a function along each of `steps`, by central differences of eighth order; last axis: step."""
+    weights = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+    return np.stack(
+        [
+            sum(w * (function(at + k * s) - function(at - k * s)) for k, w in enumerate(weights, 1))
+            for s in steps
+        ],
+        axis=-1,
+    )
+
+
+# --- momentum ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("torque", [0.0, 1.7])
+def test_angular_momentum_about_the_first_joint_changes_by_its_torque_alone(level, torque):
+    """Along the flow, by differences of eighth order.
+
+    The first rotor turns faster than its joint: the torque that spins it up and the joint's differ by what
+    the gear's housing takes.
+    """
+    arm = random_arm(21, [FULL, FULL], level, friction=False, gravity=False)
+    first = replace(arm.joints[0], origin_xyz=(0.0, 0.0, 0.0))
+    arm = replace(arm, joints=(first, *arm.joints[1:]))
+    chain = Chain(arm)
+    n, m = chain.n_joints, chain.n_modes
+    axis = rotation(first.origin_rpy) @ first.axis
+    advance = chain.stepper(METHOD)
+    start = np.concatenate(random_state(22, arm))
+    start = np.concatenate([start[: n + m], start[n + m :]])
+    torques = np.array([torque, -0.8])
+    spare = first.rotor_inertia * (first.gear_ratio**2 - first.gear_ratio)
+
+    def momentum(t):
+        state = start.copy()
+        if t[0]:
+            advance(state, torques, t[0] / 10, 10)
+        q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
+        return axis @ chain.momentum(q, qd, delta, delta_d)[1] + spare * qd[0]
+
+    step = 1e-3
+    rate = derivative(momentum, np.zeros(1), [np.array([step])])[0] / step
+    about_others = np.abs(chain.forces(*np.split(start, [n, n + m, 2 * n + m])[::2], start[n:n + m],
+                                       start[2 * n + m:])).max()  # fmt: skip
+    assert about_others > 1.0  # forces are at work
+    assert rate == pytest.approx(torque, abs=1e-9 * about_others)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_momentum_by_hand(level):
+    """Masses times the velocities that `velocity` gives of points of beams, motors and payload."""
+    arm = random_arm(31, [FULL, {}, FULL], level)
+    chain = Chain(arm)
+    q, delta, qd, delta_d = random_state(32, arm)
+    xi, weights = leggauss(30)
+    xi, weights = 0.5 * (xi + 1.0), 0.5 * weights
+    linear, angular = np.zeros(3), np.zeros(3)
+
+    def add(mass, link, position, offset=(0.0, 0.0, 0.0)):
+        v = mass * chain.velocity(link, position, q, qd, delta, delta_d, offset)[:3]
+        linear[:] += v
+        angular[:] += np.cross(chain.point(link, position, q, delta, offset), v)
+
+    R, _ = chain.frames(q, delta)
+    for i, (joint, link) in enumerate(zip(arm.joints, arm.links, strict=True)):
+        add(joint.motor_mass, link.name, 0.0)
+        for x, w in zip(xi, weights, strict=True):
+            add(w * link.mass, link.name, x * link.length)
+        turning = chain.velocity(link.name, 0.0, q, qd, delta, delta_d)[3:]
+        axis, along = R[i] @ joint.axis, R[i][:, 0]
+        angular += joint.hub_inertia * (turning @ axis) * axis
+        rotor = turning @ axis + (joint.gear_ratio - 1.0) * qd[i]
+        angular += joint.rotor_inertia * rotor * axis
+        twisting = 0.0
+        if "twist" in link.flexible:
+            which = [k for k, mode in enumerate(arm.modes)
+                     if (mode.link, mode.direction) == (link.name, "twist")]  # fmt: skip
+            twisting = weights @ chain.mode_shapes(link.name, "twist")(xi) @ delta_d[which]
+        polar = link.polar_inertia_per_length * link.length
+        angular += polar * (turning @ along + twisting) * along
+    last, body = arm.links[-1], arm.payload
+    add(body.mass, last.name, last.length, body.offset)
+    turning = chain.velocity(last.name, last.length, q, qd, delta, delta_d)[3:]
+    angular += R[-1] @ np.array(body.inertia) @ R[-1].T @ turning
+    ours = chain.momentum(q, qd, delta, delta_d)
+    close(ours[0], linear, 1e-12, "linear")
+    close(ours[1], angular, 1e-12, "angular")
+
+
+# --- kinematics --------------------------------------------------------------------------------
+
+
+@examples
+@given(**arms, link=st.integers(0, 4), where=st.floats(0.0, 1.0))
+def test_points_turn_and_move_as_in_the_second_derivation(seed, layout, level, link, where):
+    arm = random_arm(seed, layout, level)
+    chain, i = Chain(arm), link % len(layout)
+    name, position = arm.links[i].name, where * arm.links[i].length
+    offset = np.random.default_rng(seed).uniform(-0.2, 0.2, 3)
+    state = q, delta, qd, delta_d = random_state(seed, arm)
+    z, zd = coordinates(state)
+    reference = Reference(chain)
+    jets = reference._motion(z, zd, 0.0 * z)
+    frames = reference.frames(*jets)
+    _, R, p = frames[i]
+    place, turn = reference.section(i, jets[1], where)
+    # Between the ends the model interpolates its quadrature of the foreshortening.
+    point, turn = p + turned(R, place) + turned(R @ turn, offset), R @ turn
+    close(chain.point(name, position, q, delta, offset), point.c[0, -1], 1e-12, "point")
+    angular = np.einsum("bij,bj->bi", turn.c[0], spin(turn)[0])
+    theirs = np.concatenate([point.c[1], angular], axis=1)
+    close(chain.jacobian(name, position, q, delta, offset), theirs[:-1].T, 1e-9, "jacobian")
+    ours = chain.velocity(name, position, q, qd, delta, delta_d, offset)
+    close(ours, theirs[-1], 1e-9, "velocity")
+    R, p = chain.frames(q, delta)
+    for k, (_, Rk, pk) in enumerate(frames):
+        close(R[k], Rk.c[0, -1], 1e-12, f"R[{k}]")
+        close(p[k], pk.c[0, -1], 1e-12, f"p[{k}]", scale=1.0)
+    ends = [
+        pk.c[0, -1] + Rk.c[0, -1] @ reference.section(k, jets[1], 1.0)[0].c[0, -1]
+        for k, (_, Rk, pk) in enumerate(frames[:-1])
+    ]
+    close(chain.link_ends(q, delta), ends, 1e-12, "ends")
+    close(chain.tip_position(q, delta), ends[-1], 1e-12, "tip")
+    close(
+        chain.tip_velocity(q, qd, delta, delta_d), frames[-1][2].c[1, -1], 1e-11, "tip's velocity"
+    )
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_jacobians_are_the_derivatives_of_points_and_frames(level):
+    """By differences of the model's own points and frames."""
+    arm = random_arm(41, [FULL, {}, FULL], level)
+    chain, rng = Chain(arm), np.random.default_rng(42)
+    n, m = chain.n_joints, chain.n_modes
+    steps = 1e-2 * np.eye(n + m) * np.append(np.ones(n), np.full(m, 0.1))[:, None]
+    scale = steps.sum(axis=0)
+    for i, link in enumerate(arm.links):
+        q, delta, qd, delta_d = random_state(43 + i, arm)
+        z, zd = np.append(q, delta), np.append(qd, delta_d)
+        for position in (0.0, rng.uniform() * link.length, link.length):
+            offset = rng.uniform(-0.2, 0.2, 3)
+            J = chain.jacobian(link.name, position, q, delta, offset)
+            moved = derivative(
+                lambda z, link=link, x=position, o=offset: chain.point(link.name, x, z[:n], z[n:], o),
+                z, steps,
+            )  # fmt: skip
+            close(J[:3], moved / scale, 1e-9, "point")
+            np.testing.assert_allclose(
+                chain.velocity(link.name, position, q, qd, delta, delta_d, offset),
+                J @ zd,
+                rtol=1e-15,
+            )
+    R = chain.frames(z[:n], z[n:])[0]
+    turns = derivative(lambda z: chain.frames(z[:n], z[n:])[0], z, steps) / scale
+    for i, link in enumerate(arm.links):
+        at_base = chain.jacobian(link.name, 0.0, z[:n], z[n:])[3:]
+        at_tip = chain.jacobian(link.name, link.length, z[:n], z[n:])[3:]
+        close(at_base, vee(np.moveaxis(turns[i], -1, 0) @ R[i].T).T, 1e-9, "base")
+        if i == n - 1:
+            close(at_tip, vee(np.moveaxis(turns[n], -1, 0) @ R[n].T).T, 1e-9, "tip")
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_straight_arm_stands_where_its_joints_put_it(level):
+    arm = random_arm(51, [FULL, FULL, {}], level)
+    chain = Chain(arm)
+    R, p = chain.frames(np.zeros(3))
+    turn, place = np.eye(3), np.zeros(3)
+    for i, (joint, link) in enumerate(zip(arm.joints, arm.links, strict=True)):
+        place, turn = place + turn @ joint.origin_xyz, turn @ rotation(joint.origin_rpy)
+        close(R[i], turn, 1e-15, "R")
+        close(p[i], place, 1e-14, "p", scale=1.0)
+        place = place + turn @ [link.length, 0.0, 0.0]
+        close(chain.link_ends(np.zeros(3))[i], place, 1e-14, "end", scale=1.0)
+    close(R[3], turn, 1e-15, "R of the tip")
+    close(p[3], place, 1e-14, "tip", scale=1.0)
+
+
+def test_tip_deflection_is_across_the_links_own_base():
+    arm = random_arm(61, [FULL, {}, {"z": (2, "loaded")}], "foreshortening")
+    chain = Chain(arm)
+    q, delta, _, _ = random_state(62, arm)
+    R, p = chain.frames(q, delta)
+    ends = chain.link_ends(q, delta)
+    for i, name in enumerate(("link1", "link2", "link3")):
+        across = (R[i].T @ (ends[i] - p[i]))[1:]
+        np.testing.assert_allclose(chain.tip_deflection(delta, name), across, atol=1e-14)
+    np.testing.assert_array_equal(chain.tip_deflection(delta), chain.tip_deflection(delta, "link3"))
+    assert np.abs(chain.tip_deflection(delta, "link1")).min() > 1e-4
+    assert not chain.tip_deflection(delta, "link2").any()
+
+
+def test_base_angles_of_a_planar_arm_add_up_joints_and_tip_slopes():
+    """Axes that look either way; the angles count beyond a turn."""
+    joints = (
+        Joint("joint1", axis=(0.0, 0.0, 1.0), origin_rpy=(0.4, 0.1, -0.3)),
+        Joint("joint2", axis=(0.0, 0.0, -1.0), origin_rpy=(0.0, 0.0, 0.5)),
+        Joint("joint3", axis=(0.0, 0.0, 1.0)),
+    )
+    link = Link("link1", 0.8, 0.3, {"y": 4.0}, {"y": Flexibility(2)})
+    links = (link, replace(link, name="link2"), replace(link, name="link3"))
+    chain = Chain(Arm("planar", joints, links))
+    q, delta = np.array([7.0, -0.4, 2.9]), 0.03 * np.array([1.0, -0.3, 0.8, 0.2, 0.5, 0.1])
+    slope = chain.mode_shapes("link1", "y")(1.0, 1) / 0.8
+    first, second = slope @ delta[:2], slope @ delta[2:4]
+    turned_by = [7.0, 7.0 + first + 0.4, 7.0 + first + 0.4 + second + 2.9]
+    np.testing.assert_allclose(
+        chain.base_angles(q, delta) * [1.0, -1.0, 1.0], turned_by, atol=1e-12
+    )
+    assert Chain(random_arm(1, [{}, {}])).planar_axis is None
+
+
+# --- one source, run three ways ----------------------------------------------------------------
+
+MIXED = [{"y": (2, "loaded"), "twist": (1, "loaded")}, {"z": (2, "clamped_free")}]
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_compiled_and_plain_kernels_agree(level):
+    arm = random_arm(71, MIXED, level)
+    compiled, plain = Chain(arm), Chain(arm, compiled=False)
+    assert plain.straight_line is None
+    q, delta, qd, delta_d = random_state(72, arm)
+    state, torque = np.concatenate([q, delta, qd, delta_d]), np.array([1.2, -0.7])
+
+    def everything(chain):
+        yield "derivative", chain.derivative(state, torque)
+        yield "mass matrix", chain.mass_matrix(q, delta)
+        yield "forces", chain.forces(q, qd, delta, delta_d)
+        yield "K", chain.linearisation(q, qd, delta, delta_d)[0]
+        yield "C", chain.linearisation(q, qd, delta, delta_d)[1]
+        yield "potential energy", chain.potential_energy(q, delta)
+        yield "linear momentum", chain.momentum(q, qd, delta, delta_d)[0]
+        yield "angular momentum", chain.momentum(q, qd, delta, delta_d)[1]
+        yield "R", chain.frames(q, delta)[0]
+        yield "p", chain.frames(q, delta)[1]
+        yield "point", chain.point("link1", 0.2, q, delta, (0.01, 0.02, 0.03))
+        yield "jacobian", chain.jacobian("link2", 0.2, q, delta, (0.01, 0.02, 0.03))
+        for name, method in (("euler", EULER), ("dop853", METHOD), ("implicit", None)):
+            moved = state.copy()
+            chain.stepper(method, straight_line=False)(moved, torque, 1e-4, 3, change=0.1 * torque)
+            yield name, moved
+
+    for (name, one), (_, other) in zip(everything(compiled), everything(plain), strict=True):
+        close(one, other, 1e-12, name)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_recursion_in_loops_gives_the_accelerations_of_the_model(level):
+    """One step of Euler's method with a step of one second adds the accelerations to the state."""
+    arm = random_arm(73, MIXED, level)
+    chain = Chain(arm)
+    advance, rng = chain.stepper(EULER, straight_line=False), np.random.default_rng(74)
+    for seed in range(10):
+        state, torque = np.concatenate(random_state(seed, arm)), rng.standard_normal(2)
+        expected, after = chain.derivative(state, torque), state.copy()
+        advance(after, torque, 1.0)
+        close(after - state, expected, 1e-12)
+
+
+SIMPLE = Arm(
+    "simple",
+    (Joint("joint1"), Joint("joint2", hub_inertia=1.0, motor_mass=1.0, rotor_inertia=1.0)),
+    (
+        Link("link1", 1.0, 1.0, {"y": 1.0}, {"y": Flexibility(1)}),
+        Link("link2", 1.0, 2.0, {"y": 1.0}, {"y": Flexibility(1, "loaded")}),
+    ),
+)
+#: Constants that happen to be zero or one leave no trace in straight-line code.
+STRUCTURES = {
+    "mixed": random_arm(75, MIXED),
+    "simple": SIMPLE,
+    "simple with payload": replace(
+        SIMPLE, payload=Payload(1.0, tuple(map(tuple, np.eye(3)))), gravity=(0.0, -1.0, 0.0)
+    ),
+    "turned axes": replace(
+        SIMPLE,
+        joints=(
+            Joint("joint1", axis=(1.0, 0.0, 0.0), hub_inertia=1.0),
+            Joint("joint2", axis=(0.0, -1.0, 0.0), origin_xyz=(0.0, 1.0, 0.0), gear_ratio=-1.0),
+        ),
+        payload=Payload(1.0),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_straight_line_code_gives_the_accelerations_of_the_model(name):
+    arm = STRUCTURES[name]
+    chain = Chain(arm)
+    module, _ = chain.straight_line
+    assert module.__name__.startswith("flexarm_generated_")
+    advance, rng = chain.stepper(EULER), np.random.default_rng(76)
+    for seed in range(10):
+        state, torque = np.concatenate(random_state(seed, arm)), rng.standard_normal(2)
+        expected, after = chain.derivative(state, torque), state.copy()
+        advance(after, torque, 1.0)
+        close(after - state, expected, 1e-12)
+
+
+@settings(examples, max_examples=15)
+@given(
+    seeds, layouts(most=2), st.lists(st.sampled_from(["gravity", "axis", "origin", "rotor", "hub"]))
+)
+def test_straight_line_code_of_any_structure(seed, layout, plain):
+    """Before it is compiled: it is Python. `plain`: what is left at nought or along an axis."""
+    arm = random_arm(seed, layout, friction=False, gravity="gravity" not in plain)
+    changes = {}
+    if "axis" in plain:
+        changes["axis"] = (0.0, 0.0, 1.0)
+    if "origin" in plain:
+        changes.update(origin_xyz=(0.0, 0.0, 0.0), origin_rpy=(0.0, 0.0, 0.0))
+    if "rotor" in plain:
+        changes.update(rotor_inertia=0.0, gear_ratio=1.0, motor_mass=0.0)
+    if "hub" in plain:
+        changes["hub_inertia"] = 1.0
+    arm = replace(arm, joints=tuple(replace(joint, **changes) for joint in arm.joints))
+    chain = Chain(arm)
+    source, constants, _ = generated.right_hand_side(chain.data, work_space(chain.data, object))
+    names = {}
+    exec(source, names)
+    state = np.concatenate(random_state(seed, arm))
+    torque = np.random.default_rng(seed).standard_normal(chain.n_joints)
+    out, expected = np.zeros(state.size), chain.derivative(state, torque)
+    names["slope"](state, torque, constants, out)
+    # A joint about a light link's own axis makes the equations ill-conditioned.
+    M = chain.mass_matrix(*np.split(state, [chain.n_joints, state.size // 2])[:2])
+    scale = np.sqrt(np.diag(M))
+    close(out, expected, 1e-14 * np.linalg.cond(M / np.outer(scale, scale)) + 1e-12)
+
+
+def heavier_payload(arm):
+    return replace(arm, payload=replace(arm.payload, mass=1.3 * arm.payload.mass))
+
+
+def other_gravity(arm):
+    return replace(arm, gravity=tuple(1.3 * g for g in arm.gravity))
+
+
+def longer_link(arm):
+    first, *rest = arm.links
+    return replace(arm, links=(replace(first, length=1.1 * first.length), *rest))
+
+
+UNSHARED = pytest.mark.xfail(
+    reason="code depends on signs of constants and on which happen to be equal", strict=True
+)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        other_gravity,
+        pytest.param(heavier_payload, marks=UNSHARED),
+        pytest.param(longer_link, marks=UNSHARED),
+    ],
+)
+def test_arms_of_one_structure_share_their_code(change):
+    arm = STRUCTURES["mixed"]
+
+    def code(arm):
+        chain = Chain(arm)
+        source, constants, _ = generated.right_hand_side(chain.data, work_space(chain.data, object))
+        return source, constants
+
+    (source, ones), (same, others) = code(arm), code(change(arm))
+    assert source == same
+    assert ones.shape == others.shape and not np.array_equal(ones, others)
+
+
+def test_arms_that_share_code_keep_their_own_constants():
+    arm = STRUCTURES["mixed"]
+    one, other = Chain(arm), Chain(other_gravity(arm))
+    different = Chain(replace(arm, gravity=(0.0, *arm.gravity[1:])))
+    assert one.straight_line[0] is other.straight_line[0]
+    assert one.straight_line[0].__name__ == other.straight_line[0].__name__
+    assert one.straight_line[0].__name__ != different.straight_line[0].__name__
+    state, torque = np.concatenate(random_state(77, arm)), np.array([1.0, 2.0])
+    steppers = [(chain, chain.stepper(EULER)) for chain in (one, other)]
+    for chain, advance in (*steppers, steppers[0]):
+        after = state.copy()
+        advance(after, torque, 1.0)
+        close(after - state, chain.derivative(state, torque), 1e-12)
+
+
+def test_long_equations_and_finite_deflections_stay_in_loops():
+    assert Chain(random_arm(78, [FULL] * 5)).straight_line is None
+    for level in LEVELS[1:]:
+        assert Chain(at_level(SIMPLE, level)).straight_line is None
+
+
+# --- foreshortening and finite slopes ----------------------------------------------------------
+
+
+def one_beam(level, flexible, axis=(0.0, 0.0, 1.0), payload=None, hub=0.1, length=0.9):
+    """One link of unit-like data on one joint."""
+    stiffness = {"y": 6.5, "z": 4.5, "twist": 2.0}
+    link = Link("link1", length, 0.31, stiffness, flexible, polar_inertia_per_length=2e-3)
+    arm = Arm("beam", (Joint("joint1", axis, hub_inertia=hub),), (link,), payload or Payload())
+    return Chain(at_level(arm, level))
+
+
+BENT = np.array([0.05, -0.01, 0.004, 0.04, 0.012, -0.003])  # y and z, three modes each
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_how_far_the_axis_keeps_its_length(level):
+    """|dr/dx| - 1 with slope squared u: u/2 at first order, u^2/8 with foreshortening, nothing beyond."""
+    bending = Flexibility(3)
+    chain = one_beam(level, {"y": bending, "z": bending})
+    q, L = np.zeros(1), 0.9
+    worst = 0.0
+    for xi in (0.1, 0.33, 0.5, 0.77, 0.95):
+        slopes = [chain.mode_shapes("link1", d)(xi, 1) / L @ BENT[k : k + 3]
+                  for d, k in (("y", 0), ("z", 3))]  # fmt: skip
+        u = slopes[0] ** 2 + slopes[1] ** 2
+        step = 2e-3
+        tangent = derivative(
+            lambda x: chain.point("link1", x[0], q, BENT), np.array([xi * L]), [np.array([step])]
+        )[:, 0] / step  # fmt: skip
+        stretch = np.linalg.norm(tangent) - 1.0
+        exact = {"first order": np.sqrt(1.0 + u), "foreshortening": np.sqrt(1.0 + u * u / 4.0)}
+        assert stretch == pytest.approx(exact.get(level, 1.0) - 1.0, abs=1e-9)
+        worst = max(worst, u)
+    assert worst > 0.05
+
+
+def test_arc_length_of_a_bent_link_is_its_length():
+    """Of finite slopes to rounding, with foreshortening to order four: half the deflection, a sixteenth."""
+    bending = Flexibility(3)
+    excess = {}
+    for level in LEVELS:
+        chain = one_beam(level, {"y": bending, "z": bending})
+
+        def chords(count, delta, chain=chain):
+            points = [
+                chain.point("link1", 0.9 * k / count, np.zeros(1), delta) for k in range(count + 1)
+            ]
+            return np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+
+        for size in (1.0, 0.5):
+            a, b, c = (chords(count, size * BENT) for count in (20, 40, 80))
+            once, twice = b + (b - a) / 3.0, c + (c - b) / 3.0
+            excess[level, size] = twice + (twice - once) / 15.0 - 0.9
+    assert abs(excess["finite slope", 1.0]) < 1e-8
+    assert excess["foreshortening", 1.0] < 4e-4 < 0.015 < excess["first order", 1.0]
+    assert 15.0 < excess["foreshortening", 1.0] / excess["foreshortening", 0.5] < 17.0
+    assert 3.8 < excess["first order", 1.0] / excess["first order", 0.5] < 4.2
+
+
+def test_tip_angle_and_bending_energy_of_finite_slopes():
+    chain = one_beam("finite slope", {"y": Flexibility(2, "loaded")})
+    shapes, L, EI = chain.mode_shapes("link1", "y"), 0.9, 6.5
+    xi, weights = leggauss(80)
+    xi, weights = 0.5 * (xi + 1.0), 0.5 * weights
+    for delta in ([0.08, 0.01], [-0.1, 0.02], [0.2, -0.01]):
+        R = chain.frames(np.array([0.3]), np.array(delta))[0][-1]
+        slope = shapes(1.0, 1) @ delta / L
+        assert np.arctan2(R[1, 0], R[0, 0]) - 0.3 == pytest.approx(np.arcsin(slope), abs=1e-13)
+        first, second = shapes(xi, 1) @ delta / L, shapes(xi, 2) @ delta / L**2
+        energy = 0.5 * EI * L * weights @ (second**2 / (1.0 - first**2))
+        ours = chain.potential_energy(np.zeros(1), np.array(delta))
+        assert ours == pytest.approx(energy, rel=1e-8)
+        assert ours > 1.001 * 0.5 * np.array(delta) @ chain.stiffness_matrix() @ delta
+
+
+def test_a_beam_that_bends_both_ways_does_not_twist():
+    """Its tip against a frame carried along the axis without turning about it, by its differential equation.
+
+    The rotation that two slopes make is of second order; the model takes it to that: halving the deflection
+    divides the error by 16, and not by four.
+    """
+    bending = Flexibility(3)
+    L, errors, without = 0.9, [], []
+    chain = one_beam("finite slope", {"y": bending, "z": bending})
+    y, z = (chain.mode_shapes("link1", d) for d in "yz")
+    for size in (1.0, 0.5):
+        delta = size * np.array([0.05, -0.01, 0.004, 0.04, 0.02, 0.006])
+
+        def rate(x, frame, delta=delta):
+            sy, sz = y(x / L, 1) @ delta[:3] / L, z(x / L, 1) @ delta[3:] / L
+            by, bz = y(x / L, 2) @ delta[:3] / L**2, z(x / L, 2) @ delta[3:] / L**2
+            along = np.sqrt(1.0 - sy**2 - sz**2)
+            tangent = np.array([along, sy, sz])
+            change = np.array([-(sy * by + sz * bz) / along, by, bz])
+            return -(frame @ change) * tangent
+
+        carried = solve_ivp(rate, (0.0, L), [0.0, 1.0, 0.0], rtol=1e-11, atol=1e-13).y[:, -1]
+        R = chain.frames(np.zeros(1), delta)[0][-1]
+        errors.append(np.arctan2(carried @ R[:, 2], carried @ R[:, 1]))
+        # y after Rz(a) Ry(-b), with no turn about the tangent
+        a = np.arctan2(R[1, 0], R[0, 0])
+        without.append(np.arcsin(carried @ np.cross(R[:, 0], [-np.sin(a), np.cos(a), 0.0])))
+    assert abs(without[0]) > 20.0 * abs(errors[0]) > 1e-5
+    assert 14.0 < errors[0] / errors[1] < 18.0
+    assert 3.5 < without[0] / without[1] < 4.5
+
+
+#: First flapping frequency of a uniform cantilever on a hub of no radius, Wright, Smith, Thresher and Wang
+#: (1982), J. Applied Mechanics 49, table 1: angular speed and frequency in units of sqrt(EI/(rho A L^4)).
+FLAPPING = {0: 3.5160, 1: 3.6816, 2: 4.1373, 3: 4.7973, 6: 7.3604, 10: 11.2023}
+
+
+def spun_finite_elements(speed, elements=40):
+    """First flapping frequency by Hermite elements with the tension (1 - x^2) speed^2 / 2; all dimensionless."""
+    h, xi = 1.0 / elements, 0.5 * (leggauss(6)[0] + 1.0)
+    w = 0.5 * leggauss(6)[1]
+    N = np.array([1 - 3 * xi**2 + 2 * xi**3, h * (xi - 2 * xi**2 + xi**3),
+                  3 * xi**2 - 2 * xi**3, h * (xi**3 - xi**2)])  # fmt: skip
+    N1 = np.array([6 * xi**2 - 6 * xi, h * (1 - 4 * xi + 3 * xi**2), 6 * xi - 6 * xi**2,
+                   h * (3 * xi**2 - 2 * xi)]) / h  # fmt: skip
+    N2 = np.array([12 * xi - 6, h * (6 * xi - 4), 6 - 12 * xi, h * (6 * xi - 2)]) / h**2
+    M, K = np.zeros((2, 2 * elements + 2, 2 * elements + 2))
+    for e in range(elements):
+        block = np.s_[2 * e : 2 * e + 4, 2 * e : 2 * e + 4]
+        tension = 0.5 * speed**2 * (1.0 - (h * (e + xi)) ** 2)
+        M[block] += h * (N * w) @ N.T
+        K[block] += h * ((N2 * w) @ N2.T + (N1 * w * tension) @ N1.T)
+    return np.sqrt(eigh(K[2:, 2:], M[2:, 2:], eigvals_only=True)[0])
+
+
+@pytest.mark.parametrize("speed", FLAPPING)
+@pytest.mark.parametrize("level", LEVELS)
+def test_a_spinning_beam_stiffens_as_published(level, speed):
+    """Southwell: flapping (z, along the axis) and lagging (y, where the square of the speed comes off)."""
+    chain = one_beam(level, {"y": Flexibility(4), "z": Flexibility(4)})
+    assert spun_finite_elements(speed) == pytest.approx(FLAPPING[speed], abs=6e-5)
+    link, found = chain.arm.links[0], {}
+    M = chain.mass_matrix(np.zeros(1))[1:, 1:]
+    for d, block in (("y", np.s_[:4]), ("z", np.s_[4:])):
+        unit_speed = np.sqrt(link.stiffness[d] / link.mass_per_length) / link.length**2
+        K = chain.terms(np.zeros(1), np.array([speed * unit_speed])).K2
+        square = eigh(K[block, block], M[block, block], eigvals_only=True)[0] / unit_speed**2
+        found[d] = np.sign(square) * np.sqrt(abs(square))
+    if level == "first order":
+        slack = 3.516015**2 - speed**2
+        assert found["z"] == pytest.approx(3.516015, abs=1e-6)  # knows nothing of the speed
+        assert found["y"] == pytest.approx(np.sign(slack) * np.sqrt(abs(slack)), abs=1e-6)
+        return
+    assert found["z"] == pytest.approx(spun_finite_elements(speed), rel=1e-5 * (1 + speed**2))
+    assert found["z"] > spun_finite_elements(speed) - 1e-6  # Rayleigh-Ritz
+    assert found["y"] == pytest.approx(np.sqrt(found["z"] ** 2 - speed**2), rel=1e-9)
+
+
+def test_a_tip_mass_stiffens_a_spinning_beam_in_rayleighs_quotient():
+    """Tension of payload and beam on one mode: k + W^2 int int T y'^2, and less W^2 m in the plane of spin."""
+    payload = Payload(0.2)
+    for level in LEVELS[1:]:
+        chain = one_beam(level, {"y": Flexibility(1), "z": Flexibility(1)}, payload=payload)
+        W, link = 4.0, chain.arm.links[0]
+        xi, weights = leggauss(60)
+        xi, weights = 0.5 * (xi + 1.0), 0.5 * weights
+        L, rho = link.length, link.mass_per_length
+        tension = W**2 * (0.5 * rho * L**2 * (1.0 - xi**2) + payload.mass * L)
+        for k, d in enumerate("yz"):
+            shape = chain.mode_shapes("link1", d)
+            stiff = weights @ (tension * shape(xi, 1)[:, 0] ** 2) / L
+            mass = rho * L + payload.mass * shape(1.0)[0] ** 2
+            elastic = link.stiffness[d] / L**3 * shape.gram(2)[0, 0]
+            expected = elastic + stiff - (W**2 * mass if d == "y" else 0.0)
+            found = chain.terms(np.zeros(1), np.array([W])).K2[k, k]
+            assert found == pytest.approx(expected, rel=1e-10)
+            assert stiff > 0.05 * elastic
+
+
+# --- twist -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["clamped_free", "loaded"])
+def test_torsional_frequencies_of_a_held_bar(shape):
+    chain = one_beam("first order", {"twist": Flexibility(4, shape)}, (1.0, 0.0, 0.0))
+    exact = (np.arange(4) + 0.5) * np.pi / 0.9 * np.sqrt(2.0 / 2e-3)
+    np.testing.assert_allclose(chain.frequencies(locked=True), exact, rtol=1e-12)
+
+
+TIP = Payload(0.0, ((3e-3, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+def test_torsional_frequencies_of_a_held_bar_with_a_load():
+    bar = 2e-3 * 0.9
+    ratio = 3e-3 / bar
+    beta = [brentq(lambda b: np.cos(b) - ratio * b * np.sin(b), lo, lo + 0.5 * np.pi)
+            for lo in np.pi * np.arange(3)]  # fmt: skip
+    exact = np.array(beta) / 0.9 * np.sqrt(2.0 / 2e-3)
+    chain = one_beam("first order", {"twist": Flexibility(3, "loaded")}, (1, 0, 0), TIP)
+    np.testing.assert_allclose(chain.frequencies(locked=True), exact, rtol=1e-12)
+    errors = []
+    for modes in (1, 2, 4, 8):
+        free = one_beam("first order", {"twist": Flexibility(modes)}, (1, 0, 0), TIP)
+        errors.append(free.frequencies(locked=True)[0] / exact[0] - 1.0)
+    assert errors[-1] > 0.0 and np.all(np.diff(errors) < 0.0) and errors[-1] < 0.02
+
+
+def test_torsional_frequencies_of_a_bar_between_hub_and_load():
+    """tan b (1 - r s b^2) = -b (r + s) with hub and load in units of the bar's inertia."""
+    r, s = 0.1 / (2e-3 * 0.9), 3e-3 / (2e-3 * 0.9)
+    beta = [brentq(lambda b: np.sin(b) * (1 - r * s * b * b) + b * (r + s) * np.cos(b), *ends)
+            for ends in ((0.1, 2.0), (2.2, 4.5))]  # fmt: skip
+    exact = np.array(beta) / 0.9 * np.sqrt(2.0 / 2e-3)
+    errors = []
+    for modes in (2, 4, 8):
+        chain = one_beam("first order", {"twist": Flexibility(modes, "loaded")}, (1, 0, 0), TIP)
+        errors.append(chain.frequencies()[:2] / exact - 1.0)
+    errors = np.array(errors)
+    assert (errors > -1e-12).all() and (np.diff(errors, axis=0) < 0.0).all()
+    assert (errors[-1] < 1e-3).all()
+
+
+# --- frequencies and damping -------------------------------------------------------------------
+
+
+def reference_arm(parameters, modes, shape="loaded"):
+    """The two-link arm of the reference data."""
+    p = parameters["two_link_torque"]
+    bending = {"y": Flexibility(modes, shape)}
+    return Arm(
+        "reference",
+        (
+            Joint("joint1", hub_inertia=p["Jh1"]),
+            Joint("joint2", hub_inertia=p["Jh2"], motor_mass=p["Mm"]),
+        ),
+        tuple(Link(f"link{i}", p["L"], p["rhoA"], {"y": p["EI"]}, bending) for i in (1, 2)),
+        Payload(p["Mp"], tuple(map(tuple, p["Jp"] * np.eye(3)))),
+    )
+
+
+CASES = [f"q2={angle} {how}" for angle in (0, 60, -60, 90) for how in ("locked", "free")]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_two_link_frequencies_converge_to_the_exact_ones_from_above(frequencies, parameters, case):
+    exact = np.array(frequencies["two_link"][case]["rad_s"])
+    q = np.array([0.4, np.radians(float(case.split()[0][3:]))])
+    errors = {}
+    for modes in (2, 4, 8):
+        chain = Chain(reference_arm(parameters, modes))
+        found = chain.frequencies(q, locked=case.endswith("locked"))
+        assert np.all(np.diff(found) > 0.0)
+        errors[modes] = found[:4] / exact - 1.0
+    assert (errors[2][:2] < 1e-3).all()
+    assert (errors[4] < 1e-4).all()
+    assert (errors[8] < 1e-6).all()
+    assert (np.array(list(errors.values())) > -1e-10).all()  # Rayleigh-Ritz
+    for few, more in ((2, 4), (4, 8)):
+        assert (errors[more] < np.maximum(0.3 * errors[few], 1e-10)).all()
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_what_hangs_on_an_inner_link_shapes_its_modes(frequencies, parameters, level):
+    """Its modes without what is beyond the elbow miss by per cents what two loaded ones have in a thousand."""
+    for angle in (0, 60, 90):
+        q = np.array([0.0, np.radians(angle)])
+        exact = np.array(frequencies["two_link"][f"q2={angle} locked"]["rad_s"][:2])
+        loaded = Chain(at_level(reference_arm(parameters, 2), level)).frequencies(q, locked=True)
+        bare = Chain(at_level(reference_arm(parameters, 2, "clamped_free"), level))
+        assert (loaded[:2] / exact - 1.0 < 1e-3).all()
+        assert (bare.frequencies(q, locked=True)[:2] / exact - 1.0).max() > 0.01
+
+
+@pytest.mark.parametrize("direction, shape", [("y", "loaded"), ("z", "clamped_free"), ("twist", "loaded"),
+                                              ("y", "from_frequencies"), ("twist", "from_frequencies")])  # fmt: skip
+def test_damping_ratios_are_those_of_a_links_own_modes_with_its_load(direction, shape):
+    """Of one link those of the locked arm; of inner links, with what hangs on them stretched out."""
+    ratios = (0.01, 0.03, 0.002)
+    rng = np.random.default_rng(81)
+    arm = random_arm(82, [{direction: (3, shape)}], friction=False, gravity=False)
+    flexible = {direction: replace(arm.links[0].flexible[direction], damping=ratios)}
+    offset = (0.05, 0.0, 0.0) if direction != "twist" else (0.05, 0.02, -0.03)
+    payload = Payload(0.3, tuple(map(tuple, np.diag(rng.uniform(1e-3, 5e-3, 3)))), offset)
+    chain = Chain(replace(arm, links=(replace(arm.links[0], flexible=flexible),), payload=payload))
+    t = chain.terms(np.zeros(1), np.zeros(1))
+    M = t.M[1:, 1:]
+    state = np.block([[np.zeros((3, 3)), np.eye(3)],
+                      [-np.linalg.solve(M, t.K2), -np.linalg.solve(M, t.C2)]])  # fmt: skip
+    poles = np.linalg.eigvals(state)
+    poles = sorted(poles[poles.imag > 0.0], key=abs)
+    np.testing.assert_allclose([-p.real / abs(p) for p in poles], ratios, rtol=1e-8)
+    np.testing.assert_allclose(np.abs(poles), chain.frequencies(locked=True), rtol=1e-9)
+
+
+# --- what it refuses ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("call", ["terms", "forces", "momentum"])
+def test_vectors_of_the_wrong_shape_are_refused_by_name(call):
+    chain = Chain(random_arm(91, MIXED))
+    n, m = chain.n_joints, chain.n_modes
+    good = {"q": np.zeros(n), "qd": np.zeros(n), "delta": np.zeros(m), "delta_d": np.zeros(m)}
+    getattr(chain, call)(**good)
+    for name, value in good.items():
+        message = rf"{name} has shape \({value.size + 1},\), wanted \({value.size},\)"
+        with pytest.raises(ShapeError, match="^" + message):
+            getattr(chain, call)(**{**good, name: np.zeros(value.size + 1)})
+        with pytest.raises(ShapeError, match=f"^{name} has shape"):
+            getattr(chain, call)(**{**good, name: np.zeros((value.size, 1))})
+
+
+def test_states_and_accelerations_of_the_wrong_shape_are_refused():
+    chain = Chain(random_arm(91, MIXED))
+    with pytest.raises(ShapeError, match=r"state has shape \(13,\), wanted \(14,\)"):
+        chain.derivative(np.zeros(13), np.zeros(2))
+    with pytest.raises(ShapeError, match=r"qdd has shape \(3,\), wanted \(2,\)"):
+        chain.inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(3))
+    with pytest.raises(ShapeError, match=r"delta_dd has shape \(4,\), wanted \(5,\)"):
+        chain.inverse_dynamics(*np.zeros((3, 2)), np.zeros(5), np.zeros(5), np.zeros(4))
+    for call in (chain.frames, chain.potential_energy, chain.tip_position, chain.mass_matrix):
+        with pytest.raises(ShapeError, match=r"q has shape \(1,\), wanted \(2,\)"):
+            call(np.zeros(1), np.zeros(5))
+        with pytest.raises(ShapeError, match=r"delta has shape \(1,\), wanted \(5,\)"):
+            call(np.zeros(2), np.zeros(1))
+
+
+@pytest.mark.parametrize("position", [-1e-9, 0.9 * (1 + 1e-9), np.nan])
+def test_a_point_beyond_the_link_is_refused(position):
+    chain = one_beam("foreshortening", {"y": Flexibility(1)})
+    with pytest.raises(ModelError, match=r"^link1: .* m is not on a link of 0\.9 m"):
+        chain.point("link1", position, np.zeros(1))
+    np.testing.assert_allclose(chain.point("link1", 0.9, np.zeros(1)), [0.9, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("where", [("link3", "y"), ("link1", "z"), ("link2", "twist")])
+def test_mode_shapes_of_an_unknown_link_or_direction_are_refused(where):
+    chain = Chain(random_arm(91, MIXED))
+    with pytest.raises(ModelError, match=f"{where[0]} has no modes in direction {where[1]}"):
+        chain.mode_shapes(*where)
+    assert chain.mode_shapes("link1", "twist").count == 1
+
+
+def test_a_load_too_heavy_for_loaded_modes_is_refused():
+    heavy = Payload(0.31 * 0.9 * 2e10)
+    with pytest.raises(
+        ModelError, match=re.escape("loaded beam: its load is 2e+10 times its mass")
+    ):
+        one_beam("first order", {"y": Flexibility(1, "loaded")}, payload=heavy)
+    one_beam("first order", {"y": Flexibility(1)}, payload=heavy)

@@ -29,7 +29,7 @@ ARM = Parameter(
     "arm",
     "string",
     "",
-    "Arm file: a shipped name (R, P3, one_link) or a path.",
+    "Arm file: a shipped name, such as R or two_link, or a path.",
     read_only=True,
 )
 AUTOSTART = Parameter(

@@ -18,7 +18,7 @@ PARAMETERS = (
         "arm",
         "string",
         "",
-        "Arm file: a shipped name (R, P3, one_link) or a path. Names and the strain map are this file's.",
+        "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map are this file's.",
         read_only=True,
     ),
     Parameter(
