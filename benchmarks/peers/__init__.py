@@ -37,8 +37,39 @@ class Peer:
         self.two_links = case.startswith("two_link")
         self.torque = Torque(case, parameters)
 
+    def integrate(self, duration):
+        """Simulate from rest: torques and integration, the part whose time is compared.
+
+        Parameters
+        ----------
+        duration : float
+            How long [s].
+
+        Returns
+        -------
+        object
+            The code's own result, for `report`.
+        """
+        raise NotImplementedError
+
+    def report(self, result):
+        """Kinematics of what `integrate` returned.
+
+        Parameters
+        ----------
+        result : object
+            From `integrate`.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n,)
+            theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m], `RATE` a
+            second, start and end included.
+        """
+        raise NotImplementedError
+
     def run(self, duration):
-        """Simulate from rest.
+        """Simulate from rest and report.
 
         Parameters
         ----------
@@ -48,11 +79,11 @@ class Peer:
         Returns
         -------
         t : ndarray, shape (n,)
-            Times, `RATE` a second, 0 and `duration` included [s].
+            Times [s].
         columns : dict of str to ndarray, shape (n,)
-            theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m].
+            As `report` gives them.
         """
-        raise NotImplementedError
+        return times(duration), self.report(self.integrate(duration))
 
 
 class Torque:

@@ -65,7 +65,7 @@ class ControlResponse(_Numpy):
             states=2 * self.arm.size,
         )
 
-    def run(self, duration):
+    def integrate(self, duration):
         t = times(duration)
         state = np.zeros(2 * self.arm.size)
         states = np.empty((t.size, state.size))
@@ -91,4 +91,4 @@ class ControlResponse(_Numpy):
             )
             states[first : last + 1] = response.states.T
             state, first = response.states[:, -1], last
-        return t, self.arm.columns(states)
+        return states

@@ -204,19 +204,21 @@ class ExudynCable(Peer):
         integration.newton.absoluteTolerance = atol
         return options
 
-    def run(self, duration):
-        t = times(duration)
+    def integrate(self, duration):
         integration = self.options.timeIntegration
-        integration.endTime = float(t[-1])
-        integration.numberOfSteps = round(t[-1] / self.step)
+        integration.endTime = float(duration)
+        integration.numberOfSteps = round(duration / self.step)
         if not self.system.SolveDynamic(self.options):
             raise RuntimeError("Exudyn's solver failed")
-        data = [self.system.GetSensorStoredData(s)[: t.size, 1:] for s in self.sensors]
+        return times(duration).size
+
+    def report(self, result):
+        data = [self.system.GetSensorStoredData(s)[:result, 1:] for s in self.sensors]
         length = self.parameters["L"]
         columns = {"theta1": np.arctan2(data[0][:, 3], 1.0 + data[0][:, 2])}
         if not self.two_links:
-            return t, columns | {"tip_x": length + data[1][:, 0], "tip_y": data[1][:, 1]}
-        return t, columns | {
+            return columns | {"tip_x": length + data[1][:, 0], "tip_y": data[1][:, 1]}
+        return columns | {
             "tip_x": 2.0 * length + data[3][:, 0],
             "tip_y": data[3][:, 1],
             "elbow_x": length + data[1][:, 0],

@@ -17,7 +17,7 @@ from math import cos, sin
 import numpy as np
 from numba import njit
 
-from . import Peer, steps_per_sample, times
+from . import RATE, Peer, steps_per_sample
 from .numpy_equations import equations, links
 
 #: A last link whose shapes are not orthogonal to this, relative to the diagonal, is refused.
@@ -370,7 +370,7 @@ class HandLoops(Peer):
         arm = links(parameters, tip_mass, tip_inertia)
         self.constants = (two_links_constants if self.two_links else one_link_constants)(*arm)
         self.step, self.every = step, steps_per_sample(step)
-        self.run(1.0 / 100)  # compiles
+        self.integrate(1.0 / RATE)  # compiles
 
     def simulate(self, start, torque):
         """States from a given one under given torques.
@@ -417,8 +417,9 @@ class HandLoops(Peer):
         second = acc[3] - acc[0] - slope @ np.array(acc[1:3])
         return np.array([acc[0], second, acc[1], acc[2], acc[4], acc[5]])
 
-    def run(self, duration):
-        t = times(duration)
-        torque = self.torque.stages((t.size - 1) * self.every, self.step)
-        states = self.simulate(np.zeros(2 * self.arm.size), torque)
-        return t, self.arm.columns(states)
+    def integrate(self, duration):
+        torque = self.torque.stages(round(duration * RATE) * self.every, self.step)
+        return self.simulate(np.zeros(2 * self.arm.size), torque)
+
+    def report(self, result):
+        return self.arm.columns(result)

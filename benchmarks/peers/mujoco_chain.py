@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from . import Peer, steps_per_sample, times
+from . import RATE, Peer, steps_per_sample
 
 #: Versions tried: mujoco 3.17.0 (wheels for CPython 3.10 to 3.14; 4.0.0 has none for 3.10).
 PINNED = "mujoco==3.17.0"
@@ -186,15 +186,17 @@ class MujocoChain(Peer):
         mujoco.mj_getState(self.model, self.data, self.start, kind)
         self.rollout = rollout.Rollout(nthread=0)
 
-    def run(self, duration):
-        t = times(duration)
-        steps = (t.size - 1) * self.every
+    def integrate(self, duration):
+        steps = round(duration * RATE) * self.every
         torque = self.torque.sample(self.step * (np.arange(steps) + 0.5))
         states, _ = self.rollout.rollout(self.model, self.data, self.start, torque)
-        angles = np.empty((t.size, self.model.nq))
+        return states[0, self.every - 1 :: self.every]
+
+    def report(self, result):
+        angles = np.empty((len(result) + 1, self.model.nq))
         angles[0] = self.start[1 : 1 + self.model.nq]
-        angles[1:] = states[0, self.every - 1 :: self.every, 1 : 1 + self.model.nq]
-        return t, self.columns(angles)
+        angles[1:] = result[:, 1 : 1 + self.model.nq]
+        return self.columns(angles)
 
     def columns(self, angles):
         """Report columns from joint angles, shape (n, joints)."""

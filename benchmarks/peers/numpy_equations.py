@@ -282,6 +282,9 @@ class _Numpy(Peer):
         n = self.arm.size
         return np.concatenate([state[n:], self.arm.accelerations(state, torque)])
 
+    def report(self, result):
+        return self.arm.columns(result)
+
 
 class NumpyDop853(_Numpy):
     """`scipy.integrate.solve_ivp` with DOP853, restarted at a pulse's edges.
@@ -298,7 +301,7 @@ class NumpyDop853(_Numpy):
         super().__init__(case, parameters, **settings)
         self.rtol, self.atol = rtol, atol
 
-    def run(self, duration):
+    def integrate(self, duration):
         t = times(duration)
         state = np.zeros(2 * self.arm.size)
         states = np.empty((t.size, state.size))
@@ -323,7 +326,7 @@ class NumpyDop853(_Numpy):
             )
             states[here] = piece.y.T
             state, start = piece.y[:, -1], end
-        return t, self.arm.columns(states)
+        return states
 
 
 class NumpyRk4(_Numpy):
@@ -342,7 +345,7 @@ class NumpyRk4(_Numpy):
         self.step = step
         self.every = steps_per_sample(step)
 
-    def run(self, duration):
+    def integrate(self, duration):
         t, h = times(duration), self.step
         steps = (t.size - 1) * self.every
         torque = self.torque.stages(steps, h)
@@ -358,4 +361,4 @@ class NumpyRk4(_Numpy):
             x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
             if (i + 1) % self.every == 0:
                 states[(i + 1) // self.every] = x
-        return t, self.arm.columns(states)
+        return states

@@ -1,0 +1,1 @@
+"""Speed and accuracy of flexarm beside other codes: ``python -m benchmarks`` in the project's root."""

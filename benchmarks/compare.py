@@ -1,0 +1,134 @@
+"""The reference cases in all codes, and the generated code beside hand-written loops."""
+
+import importlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_sim.integrators import METHODS
+
+from . import cases, own
+from .peers import RATE, Torque, errors, steps_per_sample
+from .timing import least, paired, round_robin
+
+#: Package of this folder that holds a code, its class, and what it is: this project, a peer, or the
+#: loops that were written by hand for these arms alone.
+CODES = (
+    (".own", "Flexarm", "own"),
+    (".own", "FlexarmLoops", "own"),
+    (".peers.hand_loops", "HandLoops", "hand"),
+    (".peers.mujoco_chain", "MujocoChain", "peer"),
+    (".peers.mujoco_chain", "MujocoChainEuler", "peer"),
+    (".peers.exudyn_cable", "ExudynCable", "peer"),
+    (".peers.numpy_equations", "NumpyRk4", "peer"),
+    (".peers.numpy_equations", "NumpyDop853", "peer"),
+    (".peers.control_ior", "ControlResponse", "peer"),
+)
+
+#: The project's entry in the results.
+OWN = own.Flexarm.name
+
+#: Steps of the comparison with the hand-written loops [s].
+SAME_STEPS = (1e-3, 1e-2)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to measure.
+
+    Attributes
+    ----------
+    rounds : int
+        Turns of each task.
+    turn : float
+        Shortest turn [s].
+    """
+
+    rounds: int
+    turn: float
+
+
+def all_codes(case, effort):
+    """One case in all codes, each with its own best settings.
+
+    The time is that of `Peer.integrate`: torques and integration, no kinematics. Codes that miss
+    the case's target are not timed.
+
+    Parameters
+    ----------
+    case : str
+        Name of the case.
+    effort : Effort
+
+    Returns
+    -------
+    dict
+        ``target`` [m] and ``codes``: name to kind, settings, errors, and, where the target is kept,
+        ms per simulated second (best and all turns) and its ratio to this project's (median over
+        the turns, each beside its own).
+    """
+    parameters, found, tasks = cases.parameters(case), {}, {}
+    for module, name, kind in CODES:
+        module = importlib.import_module(module, __package__)
+        settings = module.BEST[name].get(case)
+        if settings is None:
+            continue
+        code = getattr(module, name)(case, parameters, **settings)
+        result = {"kind": kind, "settings": settings}
+        found[code.name] = result | {
+            f"{what}_error": value
+            for what, value in errors(code.run(cases.DURATION)[1], cases.reference(case)).items()
+        }
+        if found[code.name]["tip_error"] <= cases.TARGETS[case]:
+            tasks[code.name] = lambda code=code: code.integrate(cases.DURATION)
+    times = round_robin(tasks, effort.rounds, effort.turn)
+    for name, turns in times.items():
+        per_second = 1e3 * turns / cases.DURATION
+        found[name]["ms_per_s"] = least(per_second)
+        found[name]["turns"] = per_second.tolist()
+        if OWN in times:
+            found[name]["ratio"] = paired(turns, times[OWN])
+    return {"target": cases.TARGETS[case], "codes": found}
+
+
+def same_step(case, effort, steps=4000):
+    """The compiled loops alone, RK4 with the same steps, torques ready.
+
+    Parameters
+    ----------
+    case : str
+        Name of the case.
+    effort : Effort
+    steps : int
+        In one call.
+
+    Returns
+    -------
+    list of dict
+        For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second]
+        and their ``ratio``, by the best turns.
+    """
+    from .peers import hand_loops
+    from .peers.numpy_equations import equations, links
+
+    parameters = cases.parameters(case)
+    torque, arm, result = Torque(case, parameters), equations(parameters), []
+    if case.startswith("two_link"):
+        run, constants = hand_loops.run_two, hand_loops.two_links_constants(*links(parameters))
+    else:
+        run, constants = hand_loops.run_one, hand_loops.one_link_constants(*links(parameters))
+    stepper = cases.chain(parameters).stepper(METHODS["rk4"])
+    for step in SAME_STEPS:
+        every = steps_per_sample(step)
+        rows = steps // every
+        stages = torque.stages(steps, step)
+        starts, ends = own.linear_torque(torque, rows, 1.0 / RATE)
+        states = np.zeros((2, rows + 1, 2 * arm.size))
+        tasks = {
+            "generated": lambda a=(states[0], starts, ends, step, every): stepper.trajectory(*a),
+            "hand": lambda a=(constants, step, every, stages, states[1]): run(*a),
+        }
+        times = round_robin(tasks, effort.rounds, effort.turn)
+        entry = {name: 1e3 * least(t) / (steps * step) for name, t in times.items()}
+        result.append({"step": step, **entry, "ratio": entry["generated"] / entry["hand"]})
+    return result

@@ -1,0 +1,51 @@
+"""Times of several tasks that take turns, so that what slows the computer slows all of them."""
+
+import math
+import time
+
+import numpy as np
+
+
+def round_robin(tasks, rounds, turn):
+    """Measure tasks in turns.
+
+    Parameters
+    ----------
+    tasks : dict of str to callable
+        What to measure.
+    rounds : int
+        Turns of each task.
+    turn : float
+        Shortest turn: a task is called as often as that takes [s].
+
+    Returns
+    -------
+    dict of str to ndarray, shape (rounds,)
+        Time per call in each turn [s].
+    """
+    calls = {}
+    for name, task in tasks.items():
+        task()
+        calls[name] = max(1, math.ceil(turn / max(_elapsed(task, 1), 1e-7)))
+    times = {name: np.empty(rounds) for name in tasks}
+    for i in range(rounds):
+        for name, task in tasks.items():
+            times[name][i] = _elapsed(task, calls[name]) / calls[name]
+    return times
+
+
+def _elapsed(task, calls):
+    start = time.perf_counter()
+    for _ in range(calls):
+        task()
+    return time.perf_counter() - start
+
+
+def paired(times, over):
+    """Median of the ratios ``times / over`` of turns next to each other."""
+    return float(np.median(times / over))
+
+
+def least(times):
+    """Time of the best turn: the work is always the same, so the others were disturbed."""
+    return float(np.min(times))
