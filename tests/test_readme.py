@@ -106,7 +106,7 @@ def started(commands, directory):
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     """The paper's arm."""
-    commands = [c for c in starting("./flexarm", "run") if "--params-file" in c]
+    commands = [c for c in starting("./flexarm", "run") if "paper_composite" in c]
     with started(commands, tmp_path_factory.mktemp("log")) as line:
         yield line
 
@@ -188,6 +188,40 @@ def test_publish_command_reaches_the_controller_even_while_the_arm_moves(arm):
     command = starting("./flexarm", "publish")[0]
     publish(arm, command)
     publish(arm, command.replace("1.57", "0.3"))
+
+
+def test_commands_of_the_two_link_arm_move_it(tmp_path):
+    commands = [c for c in starting("./flexarm", "run") if "two_link" in c]
+    with started(commands, tmp_path) as line:
+        publish(line, starting("./flexarm", "publish")[2])
+
+        def there():
+            state = reference(line)
+            return (
+                abs(state.reference_position[1] - 0.8) < 1e-9
+                and max(abs(e) for e in state.position_error) < 0.03
+            )
+
+        line.wait_for("both joints to get there", there)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [c for what in ("show", "frequencies", "simulate") for c in starting("./flexarm", what)],
+)
+def test_commands_without_ros_do_what_they_say(tmp_path, command):
+    words = words_of(command)[1:]
+    done = subprocess.run(
+        [sys.executable, "-m", "flexarm_bringup.cli", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    for word in words:
+        if word.startswith("results/"):
+            assert (tmp_path / word).stat().st_size > 1000
 
 
 def test_commands_of_your_own_arm_move_it(tmp_path):

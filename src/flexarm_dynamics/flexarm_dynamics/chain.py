@@ -403,12 +403,11 @@ class Chain(ArmModel):
         """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
         if self.data.level != plain.FIRST_ORDER or not self._compiled:
             return None
-        source, constants, operations = generated.right_hand_side(
+        sources, constants, operations = generated.right_hand_side(
             self.data, work_space(self.data, object)
         )
         if operations > generated.MOST_OPERATIONS:
             return None
-        sources = (source, load.source(integrators))
         return load.joined("generated", sources, inline=INLINE), constants
 
     def stepper(self, method, straight_line=True):

@@ -2,22 +2,42 @@
 
 import numpy as np
 
-from . import chain, symbols
+from . import chain, integrators, load, symbols
 
 #: Longer code than this compiles too long; the recursion in loops serves as well then.
 MOST_OPERATIONS = 6000
 
-HEADER = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
+SLOPE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
 
 import numpy as np
 
 
 def slope(x, u, c, out):
+{body}
 '''
+
+#: `integrators.low_storage` with the state in local variables and the right-hand side written out in its loop.
+LOW_STORAGE = """
+def low_storage(
+    state, torque, change, step, substeps, below, weights, nodes, work, net, friction, c
+):
+    p, share = weights.size, 1.0 / substeps
+{read}
+    for k in range(substeps):
+{begin}
+        for i in range(p):
+            now, gain = (k + nodes[i]) * share, step * weights[i]
+            ahead = step * below[i + 1] if i + 1 < p else 0.0
+{torque}
+{body}
+{move}
+{end}
+{write}
+"""
 
 
 def right_hand_side(data, work):
-    """Source of ``slope(state, net torque, constants, out)`` for arms of this structure.
+    """Sources of ``slope(state, net torque, constants, out)`` and its integrators for arms of this structure.
 
     Parameters
     ----------
@@ -27,8 +47,8 @@ def right_hand_side(data, work):
 
     Returns
     -------
-    source : str
-        Depends on which constants are zero or one, not on their values.
+    sources : tuple of str
+        What `load.joined` makes a module of. They depend on which constants are zero or one, not on their values.
     constants : ndarray
     operations : int
     """
@@ -46,6 +66,39 @@ def right_hand_side(data, work):
     zeros = np.zeros((n, K, K), dtype=object)
     packed = ((exact,), (work,), zeros[:, 0, 0], zeros, np.zeros(n, int), np.zeros(m, dtype=object))
     chain.slope(state, torque, packed, out)
-    lines, constants, operations = symbols.emit(graph, out, "out")
-    body = "\n".join(f"    {line}" for line in lines)
-    return HEADER + body + "\n", np.array(constants or [0.0]), operations
+    lines, words, constants, operations = symbols.emit(graph, out)
+    lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]
+    source = SLOPE.format(body=_indented(lines, 1))
+    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m))
+    return parts, np.array(constants or [0.0]), operations
+
+
+def _low_storage(graph, out, n, half):
+    lines, words, _, _ = symbols.emit(graph, out, scalars=True)
+    # Of each pair of states (z, rate): rate is the slope of z, a the slope of the rate.
+    pairs = [(i, half + i) for i in range(half)]
+    move = [f"a{i} = {words[r]}" for i, r in pairs]
+    move += [f"w{i} += gain * x{r}" for i, r in pairs] + [f"w{r} += gain * a{i}" for i, r in pairs]
+    move += [f"x{i} = s{i} + ahead * x{r}" for i, r in pairs]
+    move += [f"x{r} = s{r} + ahead * a{i}" for i, r in pairs]
+    torque = []
+    for j in range(n):
+        torque += [
+            f"u{j} = torque[{j}] + now * change[{j}] - friction[{j}, 0] * x{half + j}",
+            f"if friction[{j}, 1] != 0.0:",
+            f"    u{j} -= friction[{j}, 1] * np.tanh(x{half + j} / friction[{j}, 2])",
+        ]
+    every = range(2 * half)
+    return LOW_STORAGE.format(
+        read=_indented([f"s{i} = state[{i}]" for i in every], 1),
+        begin=_indented([f"x{i} = w{i} = s{i}" for i in every], 2),
+        torque=_indented(torque, 3),
+        body=_indented(lines, 3),
+        move=_indented(move, 3),
+        end=_indented([f"s{i} = w{i}" for i in every], 2),
+        write=_indented([f"state[{i}] = s{i}" for i in every], 1),
+    )
+
+
+def _indented(lines, depth):
+    return "\n".join("    " * depth + line for line in lines)

@@ -169,12 +169,22 @@ class Symbol:
         return self.graph.symbol("np.sqrt", self)
 
 
-def emit(graph, outputs, target):
-    """Python statements that assign `outputs` to ``target[0]``, ``target[1]`` ...
+def emit(graph, outputs, scalars=False):
+    """Python statements that compute `outputs`.
+
+    Parameters
+    ----------
+    graph : Graph
+    outputs : sequence of Symbol or float
+    scalars : bool
+        Inputs are ``x0`` instead of ``x[0]``.
 
     Returns
     -------
     lines : list of str
+        Assignments of temporaries.
+    words : list of str
+        What each output is then.
     constants : list of float
         What ``c[0]``, ``c[1]`` ... stand for in them.
     operations : int
@@ -212,7 +222,7 @@ def emit(graph, outputs, target):
         words = [word(o) for o in operands]
         length = 1 + sum(size[o.index] for o in operands if isinstance(o, Symbol))
         if not operands:
-            expression = op
+            expression = op.replace("[", "").replace("]", "") if scalars else op
         elif op == "neg":
             expression = f"(-{words[0]})"
         elif len(op) == 1:
@@ -223,5 +233,4 @@ def emit(graph, outputs, target):
             lines.append(f"t{index} = {expression}")
             expression, length = f"t{index}", 1
         text[index], size[index] = expression, length
-    lines += [f"{target}[{i}] = {word(o)}" for i, o in enumerate(outputs)]
-    return lines, constants, len(seen)
+    return lines, [word(o) for o in outputs], constants, len(seen)
