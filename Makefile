@@ -1,6 +1,7 @@
 # `make help` says what there is.
 PYTHON ?= python3
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
 ifneq ($(origin PYTHON),file)
@@ -11,13 +12,14 @@ export FLEXARM_ROOT := $(CURDIR)
 TESTS := $(wildcard src/*/test tests)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test lint clean distclean
+.PHONY: help build demo test bench lint clean distclean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make build      set up .venv and build the workspace; again: only what changed'
 	@echo 'make demo       build, then run the case study'
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
+	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make lint       check style (ruff)'
 	@echo 'make clean      remove what was built, results and caches; .venv stays'
 	@echo 'make distclean  clean, and remove .venv'
@@ -34,6 +36,10 @@ demo: build
 
 test: build
 	@. tools/env.sh && ROS_PYTHON_CHECK_FIELDS=1 python -m pytest -q $(PYTEST_ARGS) $(TESTS)
+
+# Its peers are no business of the other targets.
+bench: build
+	@. tools/env.sh && python -m pip install -q --disable-pip-version-check -r requirements/bench.txt && python -m benchmarks $(BENCH_ARGS)
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check
