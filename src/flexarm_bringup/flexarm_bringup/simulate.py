@@ -204,8 +204,6 @@ def _prescribed(chain, motion, times, options):
     if options.method == "implicit":
         raise FlexarmError("--method implicit: a prescribed motion wants dop853 or rk4")
     advance = chain.driven_stepper(METHODS[options.method])
-    no_friction = chain.friction_table()
-    no_friction[:, :2] = 0.0
     state = np.zeros(2 * (n + m))
     longest = options.step / substeps(chain, options.step, options.method)
     for k, t in enumerate(times):
@@ -215,7 +213,7 @@ def _prescribed(chain, motion, times, options):
             for a, b in itertools.pairwise(grid):
                 start, end = motion(a)[2], motion(b)[2]
                 inner = max(1, int(np.ceil((b - a) / longest - 1e-9)))
-                advance(state, start, (b - a) / inner, inner, no_friction, end - start)
+                advance(state, start, (b - a) / inner, inner, None, end - start)
         # The joints are where the table says, not where rounding took them.
         state[:n], state[n + m : 2 * n + m], acceleration = motion(t)
         yield state, prescribed_torque(chain, state, acceleration)

@@ -254,13 +254,18 @@ class Stepper:
         What they take after the number of substeps, but for friction and data.
     data : object
         What the right-hand side needs.
+
+    Attributes
+    ----------
+    friction : ndarray, shape (n, 3)
+        Taken where a call names none.
     """
 
     def __init__(self, model, step, trajectory, arguments, data):
         self._step, self._trajectory = step, trajectory
         self._arguments, self._data = arguments, data
         self._none = np.zeros(model.n_joints)
-        self._friction = model.friction_table()
+        self.friction = model.friction_table()
 
     def __call__(self, state, torque, step, substeps=1, friction=None, change=None):
         """Advance a state in place.
@@ -287,7 +292,7 @@ class Stepper:
             step,
             substeps,
             *self._arguments,
-            self._friction if friction is None else friction,
+            self.friction if friction is None else friction,
             self._data,
         )
 
@@ -310,7 +315,7 @@ class Stepper:
             step,
             substeps,
             *self._arguments,
-            self._friction if friction is None else friction,
+            self.friction if friction is None else friction,
             self._data,
         )
 

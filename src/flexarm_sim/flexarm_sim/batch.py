@@ -47,7 +47,8 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
                 f"{model.arm.name}: states have {size} entries, wanted"
                 f" {2 * (model.n_joints + model.n_modes)}"
             )
-    n = each[0].n_joints if count else 0
+    first = models[0] if isinstance(models, (list, tuple)) and models else models
+    n = getattr(first, "n_joints", 0)
     starts, ends = (np.asarray(torque, float) for torque in (starts, ends))
     if starts.shape != ends.shape or starts.ndim not in (2, 3) or starts.shape[-1] != n:
         raise ShapeError(f"torque has shapes {starts.shape} and {ends.shape}, wanted (..., {n})")

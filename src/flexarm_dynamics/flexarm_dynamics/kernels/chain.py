@@ -1168,8 +1168,9 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                 if stage == 0:
                     slip = friction[i, 0]
                     if friction[i, 1] != 0.0:
-                        c = 1.0 / np.cosh(min(abs(qd[i] / friction[i, 2]), 300.0))
-                        slip += friction[i, 1] / friction[i, 2] * c * c
+                        # The secant, not the tangent: a joint that slips now may stick within the step.
+                        x = max(abs(qd[i]) / friction[i, 2], 1e-6)
+                        slip += friction[i, 1] / friction[i, 2] * np.tanh(x) / x
                     joint_extra[i] = g * slip
                 else:
                     net[i] += 2.0 * joint_extra[i] * k1[size + i]

@@ -48,7 +48,8 @@ def right_hand_side(data, work):
     Returns
     -------
     sources : tuple of str
-        What `load.joined` makes a module of. They depend on which constants are zero or one, not on their values.
+        What `load.joined` makes a module of. They depend on which constants are zero, one, negative, or equal to
+        one another, not on their values.
     constants : ndarray
     operations : int
     """
