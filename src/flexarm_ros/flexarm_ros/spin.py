@@ -27,18 +27,18 @@ class Line:
     period : float, optional
         A callback in real time is wanted every so many seconds (steady clock).
     on_period : callable, optional
-        That callback. A period that was missed is not made up for.
+        That callback. A period that was missed whole is not made up for.
 
     Attributes
     ----------
-    lost : float
+    lost : int
         Periods that passed without a callback.
     """
 
     def __init__(self, subscription, period=None, on_period=None):
         self.subscription = subscription
         self.period, self.on_period = period, on_period
-        self.lost = 0.0
+        self.lost = 0
 
 
 def spin(node, stopped):
@@ -79,11 +79,12 @@ def _spin_line(node, line, executor, stopped):
             others = now + HOUSEKEEPING
         if due is not None and now >= due:
             line.on_period()
+            # On the grid of whole periods: a late one is followed by a short one, one missed whole is lost.
             due += line.period
-            behind = clock() - due
-            if behind > 0.0:
-                line.lost += behind / line.period
-                due += behind
+            missed = int((clock() - due) / line.period)
+            if missed > 0:
+                line.lost += missed
+                due += missed * line.period
         until = others if due is None else min(others, due)
         waiting.clear_entities()
         with handle:

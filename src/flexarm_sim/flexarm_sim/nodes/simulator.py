@@ -290,7 +290,7 @@ class SimulatorNode(ArmNode):
             "controllers seen": len(self._controllers),
         }
         if self.line is not None and not self._lockstep:
-            values["periods lost"] = f"{self.line.lost:.1f}"
+            values["periods lost"] = self.line.lost
         if self._fault:
             return ERROR, self._fault, values
         several, self._several = self._several, set()
