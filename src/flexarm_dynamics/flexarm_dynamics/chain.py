@@ -382,7 +382,7 @@ class Chain(ArmModel):
         return axes[0] if np.allclose(np.cross(axes, axes[0]), 0.0, atol=1e-9) else None
 
     def base_angles(self, q, delta=None):
-        """Absolute rotation of each link's base about the axis of a planar arm, shape (n,) [rad].
+        """Absolute rotation of each link's base about its joint's axis, of a planar arm, shape (n,) [rad].
 
         From the base frame's orientation, fixed turns of the joints' origins left out; counted on beyond a
         turn. For a straight planar arm the sum of the joint angles.
