@@ -16,10 +16,17 @@ LARGE_SAG = 0.05
 USUAL_RATE = 1000.0
 
 
-def add_frequency_arguments(parser):
-    """Arguments of ``frequencies``."""
+def _add_arm(parser):
+    """What both commands take: an arm, where, which model of it, and how to print."""
     parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
     parser.add_argument("--at", metavar="q1,q2,...", help="joint angles [rad]; zero if not given")
+    add_model_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def add_frequency_arguments(parser):
+    """Arguments of ``frequencies``."""
+    _add_arm(parser)
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--locked", action="store_true", help="joints locked alone (both if neither is given)"
@@ -28,8 +35,6 @@ def add_frequency_arguments(parser):
     parser.add_argument(
         "--shapes", action="store_true", help="joint angles and modal amplitudes of each mode"
     )
-    add_model_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def frequencies(options):
@@ -70,8 +75,7 @@ def frequencies(options):
 
 def add_show_arguments(parser):
     """Arguments of ``show``."""
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
-    parser.add_argument("--at", metavar="q1,q2,...", help="joint angles [rad]; zero if not given")
+    _add_arm(parser)
     parser.add_argument(
         "--plot",
         metavar="FILE.png",
@@ -79,8 +83,6 @@ def add_show_arguments(parser):
         const="",
         help="draw the arm and its mode shapes (results/ARM.png if no file is named)",
     )
-    add_model_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def show(options):

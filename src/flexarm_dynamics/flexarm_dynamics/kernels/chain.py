@@ -1206,10 +1206,7 @@ def implicit_trajectory(states, starts, ends, step, substeps, stages, net, extra
     """As `runge_kutta_trajectory`, by `implicit_step`."""
     change = np.empty(net.size)
     for k in range(starts.shape[0]):
-        for v in range(states.shape[1]):
-            states[k + 1, v] = states[k, v]
-        for i in range(change.size):
-            change[i] = ends[k, i] - starts[k, i]
+        begin_row(states, starts, ends, k, change)  # noqa: F821 - of kernels.integrators
         implicit_step(
             states[k + 1], starts[k], change, step, substeps, stages, net, extra, friction, data
         )

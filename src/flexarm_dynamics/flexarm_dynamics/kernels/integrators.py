@@ -64,6 +64,14 @@ def runge_kutta(
                     state[v] += gain * stages[j, v]
 
 
+def begin_row(states, starts, ends, k, change):
+    """Copy row k of a trajectory to row k + 1, and set the change of torque in between."""
+    for v in range(states.shape[1]):
+        states[k + 1, v] = states[k, v]
+    for i in range(change.size):
+        change[i] = ends[k, i] - starts[k, i]
+
+
 def runge_kutta_trajectory(
     states, starts, ends, step, substeps, tableau, weights, nodes, stages, net, friction, data
 ):
@@ -80,10 +88,7 @@ def runge_kutta_trajectory(
     """
     change = np.empty(net.size)
     for k in range(starts.shape[0]):
-        for v in range(states.shape[1]):
-            states[k + 1, v] = states[k, v]
-        for i in range(change.size):
-            change[i] = ends[k, i] - starts[k, i]
+        begin_row(states, starts, ends, k, change)
         runge_kutta(
             states[k + 1],
             starts[k],
@@ -138,10 +143,7 @@ def low_storage_trajectory(
     """As `runge_kutta_trajectory`, by `low_storage`."""
     change = np.empty(net.size)
     for k in range(starts.shape[0]):
-        for v in range(states.shape[1]):
-            states[k + 1, v] = states[k, v]
-        for i in range(change.size):
-            change[i] = ends[k, i] - starts[k, i]
+        begin_row(states, starts, ends, k, change)
         low_storage(
             states[k + 1],
             starts[k],
