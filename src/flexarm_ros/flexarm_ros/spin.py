@@ -53,12 +53,15 @@ def spin(node, stopped):
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    while not stopped and node.context.ok():
-        line = node.line
-        if line is None:
-            executor.spin_once(timeout_sec=0.1)
-        else:
-            _spin_line(node, line, executor, stopped)
+    try:
+        while not stopped and node.context.ok():
+            line = node.line
+            if line is None:
+                executor.spin_once(timeout_sec=0.1)
+            else:
+                _spin_line(node, line, executor, stopped)
+    finally:
+        executor.shutdown()
 
 
 def _spin_line(node, line, executor, stopped):

@@ -2,6 +2,7 @@
 
 import contextlib
 import faulthandler
+import gc
 import importlib
 import os
 import signal
@@ -17,11 +18,18 @@ def start(module):
 
 
 def leave(code):
-    """End this process, whose nodes are destroyed and whose context is shut down, with an exit code.
+    """End this process, whose nodes are destroyed and whose contexts are shut down, with an exit code.
 
     Without the destructors of the middleware's libraries: under load Fast DDS was seen to corrupt its heap or
     to hang in them, some three times in a thousand exits, after the interpreter had finished.
     """
+    # What still refers to a context goes now: with it the participant, and what that has in shared memory.
+    gc.unfreeze()
+    gc.collect()
+    if "rclpy" in sys.modules:
+        from rclpy.utilities import get_default_context
+
+        get_default_context().destroy()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody reads it any more
             stream.flush()
