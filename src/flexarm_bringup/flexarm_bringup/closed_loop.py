@@ -159,11 +159,16 @@ class _ProfileReference:
     def at(self, t):
         """Set position, velocity and acceleration to those of time t; held after the end."""
         p = self._profile
-        t = min(max(t, 0.0), p.duration)
+        t = self._t = min(max(t, 0.0), p.duration)
         self.position = np.atleast_1d(p.position(t))
         self.velocity = np.atleast_1d(p.velocity(t))
         self.acceleration = np.atleast_1d(p.acceleration(t))
         return self
+
+    def near(self, offset):
+        """State (3, n) at an offset [s] from the time of `at`."""
+        p, t = self._profile, self._t + offset
+        return np.array([p.position(t), p.velocity(t), p.acceleration(t)]).reshape(3, -1)
 
 
 def continuous_loop(model, law, profile, times):

@@ -1,7 +1,7 @@
 r"""Composite control, (12) of Siciliano & Book (1986): u = u_slow(x) + u_fast(x, z_f).
 
-The deflections' quasi-steady state (9) under the slow torque is what the fast control holds on to:
-z_f = z - z_bar(x, u_slow). On the manifold z_f = 0 and u_fast = 0.
+The deflections that go with the slow motion, z_bar, are what the fast control holds on to: z_f = z - z_bar. The
+paper takes their quasi-steady state (9); `manifold` has it and better ones. On the manifold z_f = 0 and u_fast = 0.
 """
 
 import numpy as np
@@ -9,37 +9,54 @@ import numpy as np
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.parameters import check_all
-from flexarm_dynamics.singular_perturbation import quasi_steady_state
 
-SLOW, FAST = "flexarm.slow_laws", "flexarm.fast_laws"
+from .manifold.quasi_steady import QuasiSteady
+
+SLOW, FAST, MANIFOLD = "flexarm.slow_laws", "flexarm.fast_laws", "flexarm.manifolds"
+
+#: Prefix of the parameters of each group.
+PREFIX = {SLOW: "slow.", FAST: "fast.", MANIFOLD: "manifold."}
 
 
 class CompositeControl:
-    """Slow and fast law together; every array of the last step stays readable.
+    """Slow law, slow manifold and fast law together; every array of the last step stays readable.
 
     Parameters
     ----------
     model : ArmModel
     slow : SlowLaw
     fast : FastLaw
+    manifold : Manifold, optional
+        The paper's, `QuasiSteady`, if not given.
 
     Attributes
     ----------
     slow_torque, fast_torque, torque : ndarray, shape (n,)
-        [N m]
+        [N m]; the feed-forward of the manifold is part of the slow torque.
     quasi_steady : ndarray, shape (m,)
-        delta_bar of (9) [m, rad].
+        delta_bar of the manifold [m, rad].
     deviation : ndarray, shape (2m,)
         z_f = z - z_bar [m, rad, m/s, rad/s].
     """
 
-    def __init__(self, model, slow, fast):
+    def __init__(self, model, slow, fast, manifold=None):
         self.model, self.slow, self.fast = model, slow, fast
+        self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
 
-    def step(self, q, qd, delta, delta_d, reference):
+    @property
+    def needs_rates(self):
+        """Whether the rates of the deflections are needed: an observer."""
+        return self.fast.needs_rates
+
+    def reset(self):
+        """A new session begins: the laws forget their own states."""
+        self.slow.reset()
+        self.fast.reset()
+
+    def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample; the control path.
 
         Parameters
@@ -47,22 +64,32 @@ class CompositeControl:
         q, qd : ndarray, shape (n,)
             Joint position and velocity [rad], [rad/s].
         delta, delta_d : ndarray, shape (m,)
-            Modal amplitude and rate [m, rad], [m/s, rad/s].
+            Modal amplitude and rate [m, rad], [m/s, rad/s]; the rate may be None for a fast law without it.
         reference : object
-            With `position`, `velocity`, `acceleration`, each (n,).
+            With `position`, `velocity`, `acceleration`, each (n,), and ``near``, as `Manifold.update` has it.
+        dt : float
+            Time since the last sample [s], for laws with states of their own; 0: the first one.
 
         Returns
         -------
         ndarray, shape (n,)
             u of (12) [N m]; before any limit. Overwritten by the next step.
         """
-        m = delta.size
+        m, manifold = delta.size, self.manifold
+        if dt > 0.0:
+            self.slow.advance(dt)
+            self.fast.advance(dt)
         terms = self.model.terms(q, qd)
         self.slow_torque[:] = self.slow.torque(q, qd, reference, terms)
-        self.quasi_steady[:] = quasi_steady_state(terms, self.slow_torque)
-        np.subtract(delta, self.quasi_steady, out=self.deviation[:m])
-        self.deviation[m:] = delta_d  # the quasi-steady rates of (9) are zero
-        self.fast_torque[:] = self.fast.torque(self.deviation)
+        manifold.update(q, qd, reference, terms, self.slow_torque)
+        self.slow_torque += manifold.feedforward
+        self.quasi_steady[:] = manifold.amplitude
+        np.subtract(delta, manifold.amplitude, out=self.deviation[:m])
+        if delta_d is None:
+            self.deviation[m:] = np.nan
+        else:
+            np.subtract(delta_d, manifold.rate, out=self.deviation[m:])
+        self.fast_torque[:] = self.fast.torque(self.deviation, q)
         np.add(self.slow_torque, self.fast_torque, out=self.torque)
         return self.torque
 
@@ -72,51 +99,58 @@ def sizes(model):
     return {"joints": model.n_joints, "modes": model.n_modes, "z": 2 * model.n_modes}
 
 
-def design_law(group, name, model, values):
+def design_law(group, name, model, values, *known):
     """Find a law by name, check its parameters and design it.
 
     Parameters
     ----------
     group : str
-        `SLOW` or `FAST`.
+        `SLOW`, `FAST` or `MANIFOLD`.
     name : str
         As registered.
     model : ArmModel
     values : mapping
         Parameter values without prefix; those of other laws are ignored by the caller, not here.
+    *known
+        What the component is designed for beside the model: the slow law, for a manifold.
 
     Returns
     -------
-    SlowLaw or FastLaw
+    SlowLaw, FastLaw or Manifold
 
     Raises
     ------
     UnknownComponentError, ParameterError, DesignError
     """
     law = registry.find(group, name)
-    prefix = "slow." if group == SLOW else "fast."
-    return law(model, check_all(law.PARAMETERS, values, sizes(model), prefix))
+    return law(model, *known, check_all(law.PARAMETERS, values, sizes(model), PREFIX[group]))
 
 
-def design(model, slow, fast):
-    """Composite control from two mappings with the key `type` and the law's parameters.
+def design(model, slow, fast, manifold=None):
+    """Composite control from mappings with the key `type` and the component's parameters.
 
     Parameters
     ----------
     model : ArmModel
-    slow, fast : mapping
-        ``{"type": "linear_model_following", "kp": [6.25], …}``.
+    slow, fast, manifold : mapping
+        ``{"type": "linear_model_following", "kp": [6.25], …}``; no manifold: the paper's.
 
     Returns
     -------
     CompositeControl
     """
 
-    def law(group, given):
-        name, values = typed(given, "slow" if group == SLOW else "fast")
-        return design_law(group, name, model, values)
+    def law(group, given, *known):
+        name, values = typed(given, PREFIX[group][:-1])
+        return design_law(group, name, model, values, *known)
 
-    return CompositeControl(model, law(SLOW, slow), law(FAST, fast))
+    slow_law = law(SLOW, slow)
+    return CompositeControl(
+        model,
+        slow_law,
+        law(FAST, fast),
+        law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law),
+    )
 
 
 def typed(given, prefix):

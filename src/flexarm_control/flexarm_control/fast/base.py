@@ -28,11 +28,59 @@ class FastLaw(ABC):
         """What a person should know of this law on this arm; each a sentence."""
         return ()
 
-    @abstractmethod
-    def torque(self, z_f):
-        """Fast torque, shape (n,) [N m], for z_f = z - z_bar, shape (2m,) [m, m/s]."""
+    #: False for a law that uses the amplitudes alone: it runs without an observer.
+    needs_rates = True
 
-    @property
+    def reset(self):
+        """A new session begins: forget the states that the last one left."""
+
+    def advance(self, dt):
+        """Move the law's own states, if it has any, by the time since the last sample.
+
+        Called before `torque`, once for every new sample but the first; a repeated sample moves nothing.
+
+        Parameters
+        ----------
+        dt : float
+            True time since the last sample [s].
+        """
+
     @abstractmethod
-    def K_f(self):
-        """Feedback gain, u_fast = K_f z_f, shape (n, 2m): for analysis and reports."""
+    def torque(self, z_f, q):
+        """Fast torque.
+
+        Parameters
+        ----------
+        z_f : ndarray, shape (2m,)
+            z - z_bar [m, rad, m/s, rad/s]; NaN in the place of rates for a law that needs none.
+        q : ndarray, shape (n,)
+            Joint position, for gains that depend on it [rad].
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            [N m]
+        """
+
+    def gain(self, q):
+        """Feedback gain K_f of (15) in configuration q, u_fast = K_f z_f, shape (n, 2m): for analysis.
+
+        None for a law with states of its own, which has `state_space` instead.
+        """
+        return self.K_f
+
+    def state_space(self, dt):
+        r"""Discrete compensator of a law with states: :math:`w' = A w + B z_f,\; u_f = C w + D z_f`.
+
+        None for a law without.
+
+        Parameters
+        ----------
+        dt : float
+            Sampling period [s].
+
+        Returns
+        -------
+        A, B, C, D : ndarray or None
+        """
+        return None

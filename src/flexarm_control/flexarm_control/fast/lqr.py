@@ -109,7 +109,7 @@ class Lqr(FastLaw):
         i = np.argmin(np.linalg.norm(left.conj().T @ self.B2, axis=1))
         return self.model.mode_names[int(np.argmax(np.abs(right[: self.model.n_modes, i])))]
 
-    def torque(self, z_f):
+    def torque(self, z_f, q):
         return self._K_f @ z_f
 
     @property

@@ -12,7 +12,7 @@ class NoFastLaw(FastLaw):
         super().__init__(model, parameters)
         self._zero = np.zeros(model.n_joints)
 
-    def torque(self, z_f):
+    def torque(self, z_f, q):
         return self._zero
 
     @property

@@ -51,6 +51,27 @@ class SlowLaw(ABC):
         """What a person should know of this law on this arm; each a sentence."""
         return ()
 
+    def error_gains(self):
+        """Gains (kp, kv) of the tracking error's dynamics, e'' = -kv e' - kp e, each (n,); None for another law.
+
+        The slow manifold is continued off the reference by them.
+        """
+        return None
+
+    def reset(self):
+        """A new session begins: forget what was learnt from the samples of the last one."""
+
+    def advance(self, dt):
+        """Move the law's own states, if it has any, by the time since the last sample.
+
+        Called before `torque`, once for every new sample but the first; a repeated sample moves nothing.
+
+        Parameters
+        ----------
+        dt : float
+            True time since the last sample [s].
+        """
+
     @abstractmethod
     def torque(self, q, qd, reference, terms):
         """Slow torque.

@@ -57,6 +57,9 @@ class LinearModelFollowing(SlowLaw):
             )
         return ()
 
+    def error_gains(self):
+        return None if self.printed else (self.kp, self.kv)
+
     def torque(self, q, qd, reference, terms):
         v = reference.position - q
         v *= self.kp

@@ -29,6 +29,9 @@ class ModelFollowing(SlowLaw):
         self.Lambda0 = -np.array(self.parameters["kp"])
         self.Lambda1 = -np.array(self.parameters["kv"])
 
+    def error_gains(self):
+        return -self.Lambda0, -self.Lambda1
+
     def torque(self, q, qd, reference, terms):
         u_hat = (
             reference.acceleration

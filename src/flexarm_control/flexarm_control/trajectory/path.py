@@ -112,15 +112,27 @@ class Path:
             return False
         if not self._low_ns <= elapsed_ns < self._high_ns:
             self._enter_segment(elapsed_ns)
-        x = self._x
-        x[()] = (elapsed_ns - self._low_ns) / SECOND
+        self._horner((elapsed_ns - self._low_ns) / SECOND, out)
+        return True
+
+    def near(self, stamp_ns, offset, out):
+        """Fill `out` (3, n) with the state `offset` [s] from a stamp, on the polynomial at that stamp."""
+        elapsed_ns = max(stamp_ns - self.start_ns, 0)
+        if elapsed_ns >= self.duration_ns:
+            np.copyto(out, self._end)
+            return
+        if not self._low_ns <= elapsed_ns < self._high_ns:
+            self._enter_segment(elapsed_ns)
+        self._horner((elapsed_ns - self._low_ns) / SECOND + offset, out)
+
+    def _horner(self, x, out):
+        self._x[()] = x
         rows = self._rows
-        np.multiply(rows[0], x, out)
+        np.multiply(rows[0], self._x, out)
         for row in rows[1:-1]:
             np.add(out, row, out)
-            np.multiply(out, x, out)
+            np.multiply(out, self._x, out)
         np.add(out, rows[-1], out)
-        return True
 
     def _enter_segment(self, elapsed_ns):
         """Find the segment of a time before the end, and lay out its coefficients."""

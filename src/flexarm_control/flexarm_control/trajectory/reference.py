@@ -87,7 +87,7 @@ class ReferenceGenerator:
         )
         n = len(self.joint_names)
         self._state = np.zeros((3, n))
-        self._scratch = np.zeros((3, n))
+        self._scratch, self._near = np.zeros((3, n)), np.zeros((3, n))
         self.position, self.velocity, self.acceleration = self._state
         self.reset()
 
@@ -265,6 +265,18 @@ class ReferenceGenerator:
         self.active = moving and of_trajectory
         self.finished = not moving and of_trajectory
         self.stopping = moving and not of_trajectory
+
+    def near(self, offset):
+        """State (position, velocity, acceleration), (3, n), at an offset [s] from the last sampled stamp.
+
+        On the polynomial that is followed there, continued beyond its ends: what derivatives of the reference
+        are taken from. Overwritten by the next call.
+        """
+        if self._path is None:
+            np.copyto(self._near, self._state)
+        else:
+            self._path.near(self._last_ns, offset, self._near)
+        return self._near
 
     def _follow(self, path, start_ns):
         """Leave what is followed for a path, from the reference at that moment."""

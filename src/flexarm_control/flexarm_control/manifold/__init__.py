@@ -1,0 +1,1 @@
+"""Slow manifolds: where the deflections belong while the slow motion goes on. One manifold per file."""
