@@ -8,8 +8,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import beta, betainc
 
 from flexarm_dynamics.errors import TrajectoryError
+
+#: Beyond this the middle of the motion gets steep, and nothing is gained at its ends.
+MOST_SMOOTHNESS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +134,56 @@ def quintic(start, end, duration) -> Profile:
     )
 
 
+def smooth(start, end, duration, smoothness=3) -> Profile:
+    r"""Return the point-to-point motion with k derivatives that vanish at both ends.
+
+    .. math:: \sigma = I_s(k+1, k+1), \qquad
+        \sigma' = \frac{s^k (1-s)^k}{B(k+1, k+1)}
+
+    with the beta function B and the regularised incomplete beta function I: the polynomial of degree
+    2 k + 1 that is C^k with rest on both sides, so of least degree. k = 2 is the quintic, k = 3 the
+    septic, and so on, e.g. Biagiotti & Melchiorri (2008), section 2.1.7; this form keeps its digits
+    where the power series of a high k cancels. The more derivatives, the faster the motion's spectrum
+    falls (as omega^-(k+2)), and the higher its peaks: speed 1 / (4^k B(k+1, k+1)) of the mean.
+
+    Parameters
+    ----------
+    start, end : float or (n,) array_like
+        Positions at t = 0 and t = T [rad]; floats are one joint.
+    duration : float
+        T [s].
+    smoothness : int
+        k, from 2 to `MOST_SMOOTHNESS`.
+
+    Returns
+    -------
+    Profile
+        The motion.
+
+    Raises
+    ------
+    TrajectoryError
+        If the smoothness is out of range, and as for `quintic`.
+    """
+    k = smoothness
+    if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 2 <= k <= MOST_SMOOTHNESS:
+        raise TrajectoryError(
+            f"smoothness is {k!r}: give an integer from 2 (quintic) to {MOST_SMOOTHNESS}"
+        )
+    start, end, duration = _checked(start, end, duration, "end")
+    peak = 1.0 / beta(k + 1, k + 1)
+    return Profile(
+        start,
+        end - start,
+        duration,
+        (
+            lambda s: betainc(k + 1, k + 1, s),
+            lambda s: peak * (s * (1.0 - s)) ** k,
+            lambda s: peak * k * (s * (1.0 - s)) ** (k - 1) * (1.0 - 2.0 * s),
+        ),
+    )
+
+
 class SampledProfile(NamedTuple):
     """A profile's points, all fields given: quintic interpolation.
 
@@ -153,7 +207,7 @@ def sample(profile, n_points) -> SampledProfile:
     Parameters
     ----------
     profile : Profile
-        The motion.
+        The motion; anything that has its methods and duration.
     n_points : int
         k, at least 2.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from flexarm_control.profiles import paper_profile, quintic, sample
+from flexarm_control.profiles import MOST_SMOOTHNESS, paper_profile, quintic, sample, smooth
 from flexarm_control.trajectory import ReferenceGenerator, validate
 from flexarm_dynamics.errors import TrajectoryError
 
@@ -14,6 +14,8 @@ PROFILES = [
     paper_profile(3.0, [0.5, -1.0], [0.1, 0.2]),
     quintic(0.2, -1.3, 0.7),
     quintic([0.0, 1.0], [2.0, 1.0], 5.0),
+    smooth([0.3, 1.0], [2.0, 1.0], 1.7, 3),
+    smooth(0.0, -1.0, 0.4, 7),
 ]
 
 
@@ -42,12 +44,37 @@ def test_the_quintic_has_its_hand_computed_middle():
     np.testing.assert_allclose(profile.acceleration(0.5), [45 / 32, -45 / 16], rtol=1e-14)
 
 
+def test_smooth_motions_are_the_polynomials_that_are_written_out_elsewhere():
+    s = np.linspace(0.0, 1.0, 23)
+    quintics = smooth(0.2, -1.3, 0.7, 2), quintic(0.2, -1.3, 0.7)
+    for name in ("position", "velocity", "acceleration"):
+        a, b = (getattr(motion, name)(0.7 * s) for motion in quintics)
+        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+    # Biagiotti & Melchiorri (2008), (2.20): the septic from rest to rest.
+    septic = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+    motion = smooth(0.0, 1.0, 1.0, 3)
+    np.testing.assert_allclose(motion.position(s)[:, 0], septic(s), atol=1e-13)
+    np.testing.assert_allclose(motion.velocity(s)[:, 0], septic.deriv()(s), atol=1e-12)
+    np.testing.assert_allclose(motion.acceleration(s)[:, 0], septic.deriv(2)(s), atol=1e-12)
+
+
+@pytest.mark.parametrize("k", [2, 3, 5, MOST_SMOOTHNESS])
+def test_smoothness_is_how_many_derivatives_vanish_at_the_ends(k):
+    """theta leaves its ends as s^(k+1) / ((k+1) B): derivative k vanishes there and k + 1 does not."""
+    motion, small = smooth(0.0, 1.0, 1.0, k), 1e-3
+    leading = small ** (k + 1) * np.exp(
+        sum(np.log((k + 1 + i) / i) for i in range(1, k + 1))
+    )  # 1 / ((k+1) B(k+1, k+1)) = (2k+1)! / (k! (k+1)!)
+    assert motion.position(small)[0] == pytest.approx(leading, rel=0.05)
+    assert 1.0 - motion.position(1.0 - 0.2)[0] == pytest.approx(motion.position(0.2)[0], rel=1e-9)
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_velocity_and_acceleration_integrate_to_position_and_velocity(profile):
     for joint in range(profile.start.size):
         for t in np.linspace(0.1, 1.0, 4) * profile.duration:
-            way = quad(lambda x, j=joint: profile.velocity(x)[j], 0.0, t, epsabs=1e-13)[0]
-            gain = quad(lambda x, j=joint: profile.acceleration(x)[j], 0.0, t, epsabs=1e-13)[0]
+            way = quad(lambda x, j=joint: profile.velocity(x)[j], 0.0, t, epsabs=1e-12)[0]
+            gain = quad(lambda x, j=joint: profile.acceleration(x)[j], 0.0, t, epsabs=1e-12)[0]
             assert profile.position(t)[joint] - profile.start[joint] == pytest.approx(
                 way, abs=1e-12
             )
@@ -111,6 +138,10 @@ def test_sampled_profiles_are_followed(profile, n_points, tolerance):
         (lambda: quintic([0.0, 1.0], [1.0, 2.0, 3.0], 1.0), "start, end, duration: .*shape"),
         (lambda: quintic([[0.0]], 1.0, 1.0), r"have shape \(1, 1\)"),
         (lambda: quintic("x", 1.0, 1.0), "start, end, duration"),
+        (lambda: smooth(0.0, 1.0, 1.0, 1), r"smoothness is 1: give an integer from 2 \(quintic\)"),
+        (lambda: smooth(0.0, 1.0, 1.0, 21), "smoothness is 21: give an integer from 2 .* to 20"),
+        (lambda: smooth(0.0, 1.0, 1.0, 3.0), "smoothness is 3.0"),
+        (lambda: smooth(0.0, 1.0, 0.0), "duration is 0.0 s"),
         (lambda: sample(paper_profile(), 1), "n_points is 1: give an integer of at least 2"),
         (lambda: sample(paper_profile(), 2.5), "n_points is 2.5"),
     ],

@@ -1,0 +1,159 @@
+r"""What a motion excites: the linear response of the fast subsystem (11) along it.
+
+The slow torque of the motion is that of the reduced model (10), :math:`\bar u = B^{-1}(\ddot q - a)`; with it the
+deflections have the quasi-steady state :math:`\bar\delta` (9). What is left, :math:`z_f = z - \bar z`, follows
+(11) with nothing but the motion of that state to drive it,
+
+.. math:: \dot z_f = A_2 z_f - \frac{d}{dt}\begin{bmatrix}\bar\delta\\0\end{bmatrix},\qquad z_f(0) = 0,
+
+with :math:`A_2` at one configuration. It is measured by its energy,
+:math:`E = \frac12\delta_f^T K\delta_f + \frac12\dot\delta_f^T H_{22}^{-1}\dot\delta_f` (joints free), which
+counts metres and radians of all modes alike. The fast control is taken as absent: this is what it has to do.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from flexarm_dynamics.singular_perturbation import (
+    fast_subsystem,
+    quasi_steady_state,
+    slow_subsystem,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """What a motion does to the modes, by the linear theory.
+
+    Attributes
+    ----------
+    times : (k,) array
+        From 0 to the motion's end [s].
+    torque : (k, n) array
+        Slow torque [N m].
+    quasi_steady : (k, m) array
+        Amplitudes of (9) [m, rad].
+    deviation : (k, 2m) array
+        z_f: amplitudes and rates about the quasi-steady state.
+    energy : (k,) array
+        Energy of the deviation [J].
+    """
+
+    times: np.ndarray
+    torque: np.ndarray
+    quasi_steady: np.ndarray
+    deviation: np.ndarray
+    energy: np.ndarray
+
+    @property
+    def residual(self):
+        """Energy left at the motion's end [J]."""
+        return float(self.energy[-1])
+
+    @property
+    def transient(self):
+        """Mean energy along the motion [J]."""
+        return float(np.mean(self.energy))
+
+    @property
+    def peak_torque(self):
+        """Largest torque of each joint, (n,) [N m]."""
+        return np.abs(self.torque).max(axis=0)
+
+
+def along(model, profile, configuration=None, points=801) -> Excitation:
+    """Return what a motion excites.
+
+    Parameters
+    ----------
+    model : ArmModel
+    profile : Profile
+        Or what has its methods and duration; from rest to rest.
+    configuration : (n,) array_like, optional
+        Where (11) is taken [rad]; where the motion is at half its time if not given.
+    points : int
+        Of time; the quasi-steady state is taken as linear between them.
+
+    Returns
+    -------
+    Excitation
+    """
+    times = np.linspace(0.0, profile.duration, points)
+    q, qd, qdd = (f(times) for f in (profile.position, profile.velocity, profile.acceleration))
+    torque, steady = np.empty_like(q), np.empty((points, model.n_modes))
+    for k in range(points):
+        torque[k], steady[k] = reduced(model, q[k], qd[k], qdd[k])
+    if configuration is None:
+        configuration = profile.position(0.5 * profile.duration)
+    response = FastResponse(model, configuration, times[1] - times[0])
+    deviation = response.deviation(steady)
+    return Excitation(times, torque, steady, deviation, response.energy(deviation))
+
+
+def reduced(model, q, qd, qdd):
+    """Slow torque (n,) [N m] and quasi-steady amplitudes (m,) [m, rad] of a motion: (10) and (9)."""
+    terms = model.terms(q, qd)
+    if not model.n_modes:
+        torque = terms.M @ qdd + terms.f1
+        return torque, np.zeros(0)
+    a, B = slow_subsystem(terms)
+    torque = np.linalg.solve(B, qdd - a)
+    return torque, quasi_steady_state(terms, torque)
+
+
+class FastResponse:
+    """The response of (11) at one configuration to a quasi-steady state that moves, on a grid of time.
+
+    Exact for a state that is linear between the grid's points, whatever the step.
+
+    Parameters
+    ----------
+    model : ArmModel
+    configuration : (n,) array_like
+        [rad]
+    step : float
+        Of the grid [s].
+    """
+
+    def __init__(self, model, configuration, step):
+        n, m = model.n_joints, model.n_modes
+        self.m, self.step = m, step
+        if not m:
+            return
+        terms = model.terms(np.asarray(configuration, float), np.zeros(n))
+        A2, _ = fast_subsystem(terms)
+        # e^{A h} and its integral over the step, from one exponential.
+        block = np.zeros((4 * m, 4 * m))
+        block[: 2 * m, : 2 * m], block[: 2 * m, 2 * m :] = A2, np.eye(2 * m)
+        both = expm(block * step)
+        self.propagate = both[: 2 * m, : 2 * m]
+        self.drive = -both[: 2 * m, 2 * m : 3 * m] / step
+        H22 = terms.partition()[3]
+        self.root = np.zeros((2 * m, 2 * m))  # E = |root z|^2 / 2
+        self.root[:m, :m] = np.linalg.cholesky(model.stiffness_matrix()).T
+        self.root[m:, m:] = np.linalg.cholesky(np.linalg.inv(0.5 * (H22 + H22.T))).T
+
+    def deviation(self, steady):
+        """Return z_f at the grid's points.
+
+        Parameters
+        ----------
+        steady : (k, m) or (k, m, c) array
+            Quasi-steady amplitudes; the last axis are c motions side by side.
+
+        Returns
+        -------
+        (k, 2m) or (k, 2m, c) array
+        """
+        out = np.zeros((steady.shape[0], 2 * self.m, *steady.shape[2:]))
+        for k, change in enumerate(np.diff(steady, axis=0) if self.m else ()):
+            out[k + 1] = self.propagate @ out[k] + self.drive @ change
+        return out
+
+    def energy(self, deviation):
+        """Energy of deviations (k, 2m), shape (k,) [J]."""
+        if not self.m:
+            return np.zeros(deviation.shape[0])
+        return 0.5 * np.sum((deviation @ self.root.T) ** 2, axis=1)

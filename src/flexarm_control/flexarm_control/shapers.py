@@ -1,0 +1,234 @@
+r"""Input shapers: a motion that is delayed copies of itself, so that what one copy excites the next cancels.
+
+Of a mode :math:`\omega,\zeta` at rest before, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,
+:math:`\sum A_i = 1`, leaves after its last impulse :math:`t_n` the part
+
+.. math:: V(\omega,\zeta) = e^{-\zeta\omega t_n}\sqrt{C^2 + S^2},\quad
+    C = \sum_i A_i e^{\zeta\omega t_i}\cos\omega_d t_i,\quad S = \sum_i A_i e^{\zeta\omega t_i}\sin\omega_d t_i
+
+of the vibration that a single impulse makes (Singer & Seering 1990), :math:`\omega_d=\omega\sqrt{1-\zeta^2}`;
+and of any motion convolved with it the same part. With :math:`K = e^{-\zeta\pi/\sqrt{1-\zeta^2}}`:
+
+- ZV (zero vibration), half a period long: A = (1, K) / (1 + K), V = 0 at the design frequency;
+- ZVD (and zero derivative), one period: A = (1, 2K, K^2) / (1 + K)^2, dV/domega = 0 there as well. It is
+  ZV convolved with itself.
+
+Several modes: the trains convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
+subsystem (11), whose input, the slow torque, is what the motion becomes: with a mass matrix and a
+configuration that do not change, the torque is shaped as the motion is, and V is exact.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
+
+#: Every sample of a shaped motion evaluates the motion once per impulse.
+MOST_IMPULSES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Shaper:
+    """A train of impulses.
+
+    Attributes
+    ----------
+    times : (k,) array
+        From 0, ascending [s].
+    amplitudes : (k,) array
+        Above 0, with sum 1 [-].
+    """
+
+    times: np.ndarray
+    amplitudes: np.ndarray
+
+    @property
+    def duration(self):
+        """How much longer it makes a motion [s]."""
+        return float(self.times[-1])
+
+    def __matmul__(self, other):
+        """Convolve with another shaper."""
+        times = np.add.outer(self.times, other.times).ravel()
+        order = np.argsort(times, kind="stable")
+        amplitudes = np.outer(self.amplitudes, other.amplitudes).ravel()
+        return Shaper(times[order], amplitudes[order])
+
+    def residual(self, omega, zeta):
+        """Return V: the part of a mode's vibration that is left.
+
+        Parameters
+        ----------
+        omega, zeta : float or array
+            Natural frequency [rad/s] and damping ratio [-] of the mode.
+
+        Returns
+        -------
+        float or array
+            0: none, 1: as without shaper.
+        """
+        omega, zeta = np.asarray(omega, float)[..., None], np.asarray(zeta, float)[..., None]
+        pole = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
+        # With e^{-zeta omega t_n} inside the sum, where it can't overflow.
+        left = self.amplitudes * np.exp(-pole * self.times + pole.real * self.duration)
+        return np.abs(left.sum(axis=-1))
+
+    def apply(self, profile):
+        """Return the shaped motion: `ShapedProfile`."""
+        return ShapedProfile(profile, self)
+
+
+class ShapedProfile:
+    """A motion convolved with a shaper: sum of its delayed copies, each with its amplitude.
+
+    It has the methods of a `Profile`, with derivatives as exact as that one's.
+
+    Parameters
+    ----------
+    profile : Profile
+        From rest to rest.
+    shaper : Shaper
+
+    Attributes
+    ----------
+    start, angle : (n,) array
+        As the profile's [rad].
+    duration : float
+        The profile's and the shaper's together [s].
+    """
+
+    def __init__(self, profile, shaper):
+        self._profile, self._shaper = profile, shaper
+        self.start, self.angle = profile.start, profile.angle
+        self.duration = profile.duration + shaper.duration
+
+    def position(self, t) -> np.ndarray:
+        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
+        return self._sum(self._profile.position, t)
+
+    def velocity(self, t) -> np.ndarray:
+        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
+        return self._sum(self._profile.velocity, t)
+
+    def acceleration(self, t) -> np.ndarray:
+        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
+        return self._sum(self._profile.acceleration, t)
+
+    def _sum(self, function, t):
+        t = np.asarray(t, float)
+        copies = zip(self._shaper.amplitudes, self._shaper.times, strict=True)
+        return sum(amplitude * function(t - delay) for amplitude, delay in copies)
+
+
+def zv(omega, zeta) -> Shaper:
+    """Return the zero-vibration shaper of a mode.
+
+    Parameters
+    ----------
+    omega : float
+        Natural frequency [rad/s], above 0.
+    zeta : float
+        Damping ratio, at least 0 and below 1 [-].
+
+    Raises
+    ------
+    DesignError
+        If the mode does not vibrate, or grows.
+    """
+    omega, zeta = float(omega), float(zeta)
+    if not 0.0 < omega < np.inf:
+        raise DesignError(f"shaper: a mode's frequency is {omega} rad/s: it must be above 0")
+    if not 0.0 <= zeta < 1.0:
+        raise DesignError(
+            f"shaper: the damping ratio of the mode at {omega:g} rad/s is {zeta:g}: only one from 0 to below 1"
+            " makes vibrations to cancel; shape fewer modes"
+        )
+    root = np.sqrt(1.0 - zeta**2)
+    K = np.exp(-zeta * np.pi / root)
+    return Shaper(np.array([0.0, np.pi / (omega * root)]), np.array([1.0, K]) / (1.0 + K))
+
+
+def zvd(omega, zeta) -> Shaper:
+    """Return the zero-vibration-and-derivative shaper of a mode; parameters as for `zv`."""
+    single = zv(omega, zeta)
+    first, last = single.amplitudes
+    half = single.duration
+    return Shaper(
+        np.array([0.0, half, 2.0 * half]), np.array([first**2, 2.0 * first * last, last**2])
+    )
+
+
+SHAPERS = {"zv": zv, "zvd": zvd}
+
+
+def for_modes(kind, omega, zeta) -> Shaper:
+    """Return the shaper of several modes.
+
+    Parameters
+    ----------
+    kind : str
+        ``zv`` or ``zvd``.
+    omega, zeta : (k,) array_like
+        Natural frequencies [rad/s] and damping ratios [-].
+
+    Raises
+    ------
+    DesignError
+        If there is no such shaper, no mode, more impulses than `MOST_IMPULSES`, and as for `zv`.
+    """
+    if kind not in SHAPERS:
+        raise DesignError(f"shaper {kind!r}: there are {', '.join(SHAPERS)}")
+    trains = [SHAPERS[kind](w, z) for w, z in zip(omega, zeta, strict=True)]
+    if not trains:
+        raise DesignError("shaper: no modes to shape for: give at least one")
+    impulses = int(np.prod([train.times.size for train in trains]))
+    if impulses > MOST_IMPULSES:
+        raise DesignError(
+            f"shaper {kind} of {len(trains)} modes has {impulses} impulses, above {MOST_IMPULSES}:"
+            " shape fewer modes"
+        )
+    out = trains[0]
+    for train in trains[1:]:
+        out = out @ train
+    return out
+
+
+def modes_at(model, q):
+    """Natural frequencies [rad/s] and damping ratios [-] of the fast subsystem (11) at rest, ascending."""
+    n = model.n_joints
+    if not model.n_modes:
+        return np.zeros(0), np.zeros(0)
+    A2, _ = fast_subsystem(model.terms(np.asarray(q, float), np.zeros(n)))
+    omega, zeta = frequencies_and_damping(np.linalg.eigvals(A2))
+    # Without damping an eigenvalue's real part is rounding, of either sign.
+    return omega, np.where(np.abs(zeta) < 1e-12, 0.0, zeta)
+
+
+def for_arm(model, q, kind, modes=2) -> Shaper:
+    """Return the shaper of an arm's lowest modes (11), at the configuration where the motion ends.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q : (n,) array_like
+        Where the motion ends: the vibration that is left is the one there [rad].
+    kind : str
+        ``zv`` or ``zvd``.
+    modes : int
+        How many of the lowest; at most as many as the arm has.
+
+    Raises
+    ------
+    DesignError
+        If the arm has not that many modes, and as for `for_modes`.
+    """
+    omega, zeta = modes_at(model, q)
+    if not 1 <= modes <= omega.size:
+        raise DesignError(
+            f"{model.arm.name}: a shaper of {modes} modes; the arm has {omega.size}: give 1 to {omega.size}"
+            if omega.size
+            else f"{model.arm.name}: a rigid arm has no modes to shape for"
+        )
+    return for_modes(kind, omega[:modes], zeta[:modes])

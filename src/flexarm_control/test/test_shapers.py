@@ -1,0 +1,139 @@
+"""Shapers: closed forms, the vibration that is left at and off the design frequency, and on the arms."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from flexarm_control import excitation, shapers
+from flexarm_control.profiles import quintic, smooth
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.singular_perturbation import fast_subsystem
+
+OMEGA, ZETA = 7.3, 0.06
+
+
+def vibration_left(motion, omega, zeta, extra=0.0):
+    """Amplitude of an oscillator on the moving base, at the motion's end; by integration, not by theory.
+
+    x'' + 2 zeta omega x' + omega^2 x = -q'', and the amplitude is that of the free vibration after.
+    """
+
+    def slope(t, x):
+        return [x[1], -2 * zeta * omega * x[1] - omega**2 * x[0] - motion.acceleration(t)[0]]
+
+    end = motion.duration + extra
+    x, v = solve_ivp(slope, (0.0, end), [0.0, 0.0], rtol=1e-10, atol=1e-13, max_step=0.02).y[:, -1]
+    damped = omega * np.sqrt(1.0 - zeta**2)
+    return np.hypot(x, (v + zeta * omega * x) / damped)
+
+
+def test_zv_and_zvd_are_those_of_the_literature():
+    """Undamped: halves half a period apart; quarter, half, quarter. Damped: by hand with K."""
+    train = shapers.zv(2.0 * np.pi, 0.0)
+    np.testing.assert_allclose(train.times, [0.0, 0.5], rtol=1e-15)
+    np.testing.assert_allclose(train.amplitudes, [0.5, 0.5], rtol=1e-15)
+    train = shapers.zvd(2.0 * np.pi, 0.0)
+    np.testing.assert_allclose(train.times, [0.0, 0.5, 1.0], rtol=1e-15)
+    np.testing.assert_allclose(train.amplitudes, [0.25, 0.5, 0.25], rtol=1e-15)
+    K = np.exp(-0.1 * np.pi / np.sqrt(0.99))
+    train = shapers.zvd(3.0, 0.1)
+    np.testing.assert_allclose(train.amplitudes * (1 + K) ** 2, [1.0, 2 * K, K * K], rtol=1e-14)
+    np.testing.assert_allclose(train.times[1], np.pi / (3.0 * np.sqrt(0.99)), rtol=1e-15)
+
+
+def test_nothing_is_left_at_the_design_frequency_and_for_zvd_no_slope_either():
+    step = 1e-4 * OMEGA
+    for make in (shapers.zv, shapers.zvd):
+        assert make(OMEGA, ZETA).residual(OMEGA, ZETA) < 1e-15
+    slopes = [
+        make(OMEGA, ZETA).residual(OMEGA + step, ZETA) / step for make in (shapers.zv, shapers.zvd)
+    ]
+    # Undamped ZV: V = |cos(pi omega / (2 omega_0))|, of slope pi / (2 omega_0); ZVD is its square.
+    assert slopes[0] == pytest.approx(np.pi / (2.0 * OMEGA), rel=0.2)
+    assert slopes[1] < 1e-3 * slopes[0]
+
+
+def test_undamped_residuals_are_the_cosines():
+    ratio = np.linspace(0.3, 2.5, 40)
+    expected = np.abs(np.cos(0.5 * np.pi * ratio))
+    np.testing.assert_allclose(
+        shapers.zv(OMEGA, 0).residual(ratio * OMEGA, 0.0), expected, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        shapers.zvd(OMEGA, 0).residual(ratio * OMEGA, 0.0), expected**2, atol=1e-14
+    )
+
+
+@pytest.mark.parametrize("kind", ["zv", "zvd"])
+@pytest.mark.parametrize("off", [0.8, 1.0, 1.15])
+def test_an_integrated_oscillator_keeps_what_the_formula_says(kind, off):
+    """Off the design frequency the shaped motion leaves V times what the motion itself leaves."""
+    shaper = shapers.for_modes(kind, [OMEGA], [ZETA])
+    motion = quintic(0.0, 1.0, 0.9)
+    bare = vibration_left(motion, off * OMEGA, ZETA)
+    left = vibration_left(shaper.apply(motion), off * OMEGA, ZETA)
+    assert bare > 0.01
+    assert left == pytest.approx(shaper.residual(off * OMEGA, ZETA) * bare, rel=1e-5, abs=1e-8)
+
+
+def test_shapers_of_two_modes_cancel_both_and_their_residuals_multiply():
+    omega, zeta = np.array([OMEGA, 31.0]), np.array([ZETA, 0.01])
+    both = shapers.for_modes("zv", omega, zeta)
+    single = [shapers.zv(w, z) for w, z in zip(omega, zeta, strict=True)]
+    assert both.times.size == 4 and both.amplitudes.sum() == pytest.approx(1.0, abs=1e-15)
+    assert np.all(np.diff(both.times) > 0.0)
+    assert both.duration == pytest.approx(single[0].duration + single[1].duration)
+    np.testing.assert_allclose(both.residual(omega, zeta), 0.0, atol=1e-14)
+    anywhere = np.linspace(5.0, 40.0, 9)
+    product = single[0].residual(anywhere, 0.02) * single[1].residual(anywhere, 0.02)
+    np.testing.assert_allclose(both.residual(anywhere, 0.02), product, rtol=1e-10, atol=1e-15)
+
+
+def test_a_shaped_motion_is_the_sum_of_delayed_copies_with_exact_derivatives():
+    motion = smooth([0.2, -1.0], [1.0, 3.0], 1.1, 4)
+    shaper = shapers.zvd(OMEGA, ZETA)
+    shaped = shaper.apply(motion)
+    assert shaped.duration == pytest.approx(1.1 + shaper.times[2])
+    t, small = np.linspace(0.01, shaped.duration, 50), 1e-5
+    by_hand = sum(
+        a * motion.position(t - d) for a, d in zip(shaper.amplitudes, shaper.times, strict=True)
+    )
+    np.testing.assert_allclose(shaped.position(t), by_hand, rtol=1e-14)
+    for f, df in ((shaped.position, shaped.velocity), (shaped.velocity, shaped.acceleration)):
+        np.testing.assert_allclose((f(t + small) - f(t - small)) / (2 * small), df(t), atol=2e-7)
+    for at, where in ((-1.0, motion.start), (0.0, motion.start), (9.0, [1.0, 3.0])):
+        np.testing.assert_allclose(shaped.position(at), where, rtol=1e-14)
+        np.testing.assert_allclose(shaped.velocity(at), 0.0, atol=1e-14)
+    assert shaped.position(0.3).shape == (2,)
+
+
+def test_on_the_papers_arm_the_fast_subsystem_is_left_at_rest(arm_r):
+    """A slow, small motion: (11) does not change along it, so that the theory is exact."""
+    q = np.array([1.0])
+    A2, _ = fast_subsystem(arm_r.terms(q, np.zeros(1)))
+    omega, _ = shapers.modes_at(arm_r, q)
+    np.testing.assert_allclose(omega, np.sort(np.abs(np.linalg.eigvals(A2)))[::2], rtol=1e-12)
+    motion = quintic(1.0, 1.001, 0.5)
+    bare = excitation.along(arm_r, motion, q).residual
+    for kind, modes in (("zv", 2), ("zvd", 2)):
+        shaped = shapers.for_arm(arm_r, q, kind, modes).apply(motion)
+        assert excitation.along(arm_r, shaped, q).residual < 1e-7 * bare
+    one = shapers.for_arm(arm_r, q, "zv", 1)
+    assert one.times.size == 2 and one.residual(omega[0], 0.0) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda arm: shapers.zv(0.0, 0.1), "frequency is 0.0 rad/s: it must be above 0"),
+        (lambda arm: shapers.zvd(3.0, 1.0), "damping ratio of the mode at 3 rad/s is 1"),
+        (lambda arm: shapers.zv(3.0, -0.1), "is -0.1: only one from 0"),
+        (lambda arm: shapers.for_modes("ei", [1.0], [0.0]), "shaper 'ei': there are zv, zvd"),
+        (lambda arm: shapers.for_modes("zv", [], []), "no modes to shape for"),
+        (lambda arm: shapers.for_modes("zvd", [1.0] * 7, [0.0] * 7), "2187 impulses, above 1000"),
+        (lambda arm: shapers.for_arm(arm, [0.0], "zv", 3), "R: a shaper of 3 modes; the arm has 2"),
+    ],
+)
+def test_what_makes_no_shaper_is_refused(arm_r, make, message):
+    with pytest.raises(DesignError, match=message):
+        make(arm_r)
