@@ -1,20 +1,22 @@
 """The loop without ROS: the very objects that the nodes call, sample by sample; and the continuous loop."""
 
+from collections import deque
+
 import numpy as np
 
 from flexarm_control.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
-from flexarm_control.arm_controller import ArmController
-from flexarm_control.arm_observer import ArmObserver, design_observer
+from flexarm_control.arm_controller import START_TOLERANCE, ArmController, Supervisor
+from flexarm_control.arm_observer import observe
 from flexarm_control.composite import design, typed
 from flexarm_control.samples import ArmSample
 from flexarm_dynamics import arm_file
-from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.errors import FlexarmError, MessageError, ModelError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.integrators import integrate
 from flexarm_sim.simulator import PARAMETERS as SIMULATOR_PARAMETERS
 from flexarm_sim.simulator import Simulator
 
-from .metrics import Record
+from .metrics import Record, SimulatedRecord
 
 #: Where a recorded trajectory starts on the simulator's clock [ns]: the observer has converged by then.
 TRAJECTORY_START_NS = Simulator.START_NS + 100_000_000
@@ -31,21 +33,59 @@ class ClosedLoop:
         ``{"type": …, parameters…}``.
     simulator, controller : mapping, optional
         Further parameters of the simulator and of the controller.
+    manifold : mapping, optional
+        ``{"type": …, parameters…}``; not given: the paper's.
+    plant_arm : Arm, optional
+        The simulated arm, when it is none of a file: see `arm.scaled`.
+    delay : float
+        How long after its measurement a torque begins to act [s]: whole periods and a part of one.
+
+    Attributes
+    ----------
+    lost : str
+        Why the last run of `follow` ended early; empty if it did not.
     """
 
-    def __init__(self, arm, slow, fast, observer, simulator=None, controller=None):
-        sizes = {"joints": len(arm_file.load(arm).joints)}
+    def __init__(
+        self,
+        arm,
+        slow,
+        fast,
+        observer,
+        simulator=None,
+        controller=None,
+        manifold=None,
+        plant_arm=None,
+        delay=0.0,
+    ):
+        known = arm_file.load(arm)
+        sizes = {"joints": len(known.joints)}
         settings = check_all(SIMULATOR_PARAMETERS, {"arm": str(arm), **(simulator or {})}, sizes)
+        settings["arm"] = known
+        if plant_arm is not None:
+            settings["plant_arm"] = plant_arm
         self.simulator = Simulator(settings)
         model = self.model = self.simulator.nominal
-        name, values = typed(observer, "observer")
-        self.observer = ArmObserver(model, design_observer(name, model, values))
-        limits = check_all(CONTROLLER_PARAMETERS, controller or {}, {"joints": model.n_joints})
-        self.controller = ArmController(model, design(model, slow, fast), limits)
+        self.observer = observe(model, *typed(observer, "observer"))
+        declared = (*CONTROLLER_PARAMETERS, START_TOLERANCE)
+        limits = check_all(declared, controller or {}, {"joints": model.n_joints})
+        law = design(model, slow, fast, manifold)
+        self.controller = ArmController(model, law, limits, limits.pop("start_tolerance"))
         n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
         self._measured, self._estimate = ArmSample(n, m, g), ArmSample(n, m)
         self._publish_rates = settings["publish_rates"]
         self._publish_velocity = settings["publish_joint_velocity"]
+        self._set_delay(delay)
+        self._reach = sum(link.length for link in model.arm.links)
+        self.lost = ""
+
+    def _set_delay(self, delay):
+        if not 0.0 <= delay <= self.LONGEST_DELAY:
+            raise FlexarmError(f"delay {delay} s: from 0 to {self.LONGEST_DELAY:g} s are possible")
+        whole, rest = divmod(round(delay * 1e9), self.simulator.period_ns)
+        self._share = rest / self.simulator.period_ns
+        # Torques on their way, the oldest first; until the first arrives, safe actions.
+        self._on_the_way = deque([None] * (whole + 1))
 
     def measure(self):
         """The present sample as `arm_state` has it."""
@@ -66,19 +106,23 @@ class ClosedLoop:
         e, observer = self._estimate, self.observer
         converged = observer.step(measured)
         e.stamp_ns, e.session, e.sequence = measured.stamp_ns, measured.session, measured.sequence
-        e.position[:] = measured.position
+        e.position[:] = observer.position
         e.velocity[:] = observer.velocity
-        e.amplitude = observer.observer.amplitude
-        e.rate = observer.observer.rate if converged else None
+        e.amplitude = observer.amplitude
+        e.rate = observer.rate if converged else None
         return e
 
     #: The observer has this long to converge [s].
     LONGEST_START = 10.0
+    #: A longer delay than this is a wrong number [s].
+    LONGEST_DELAY = 1.0
+    #: A joint farther than this off its reference is not controlled any more [rad].
+    LARGEST_ERROR = 2.0 * np.pi
 
     def step(self):
         """One sample: measure, estimate, control, and advance the plant; returns the torque sent or None."""
         torque = self.controller.torque if self._answer() else None
-        self.simulator.advance(torque)
+        self._advance(torque)
         return torque
 
     def _answer(self):
@@ -88,6 +132,13 @@ class ClosedLoop:
         except MessageError as error:
             self.controller.disable(str(error))
             return False
+
+    def _advance(self, torque):
+        """One period of the plant under what has arrived by then."""
+        way = self._on_the_way
+        way.append(None if torque is None else torque.copy())
+        before = way.popleft()
+        self.simulator.advance(way[0], before, self._share)
 
     def run(self, trajectory, duration):
         """Offer a trajectory and record `duration` seconds from its start.
@@ -101,31 +152,81 @@ class ClosedLoop:
 
         Returns
         -------
-        Record
+        SimulatedRecord
+
+        Raises
+        ------
+        MessageError
+            When the trajectory is refused, or not followed to its end.
+        ModelError
+            When the plant leaves what its model holds for.
         """
+        record = self.follow(trajectory, duration)
+        if isinstance(self._failure, ModelError):
+            raise self._failure
+        if self.lost:
+            raise MessageError(f"the trajectory was not followed: {self.lost}")
+        return record
+
+    def follow(self, trajectory, duration):
+        """As `run`, but a loop that loses the arm is a result, too: the record ends there, and `lost` says why.
+
+        Raises
+        ------
+        MessageError
+            When the trajectory is refused or does not start.
+        """
+        self.lost, self._failure = "", None
         self._answer()
         verdict = self.controller.offer(trajectory)
         if not verdict.accepted:
             raise MessageError(f"trajectory refused: {verdict.reason}")
         simulator, length = self.simulator, round(duration * 1e9)
-        start, stamps, rows = trajectory.stamp_ns or None, [], []
+        begin, start, stamps, rows = simulator.time, trajectory.stamp_ns or None, [], []
         while start is None or simulator.stamp_ns <= start + length:
-            if start is None and simulator.time > self.LONGEST_START:
+            if start is None and simulator.time > begin + self.LONGEST_START:
                 raise MessageError(f"the trajectory does not start: {self.controller.reason}")
+            enabled = self._answer()
             stamps.append(simulator.stamp_ns)
-            self.step()
             rows.append(self._row())
-            if start is None and self.controller.reference.active:
+            reference = self.controller.reference
+            if start is None and (reference.active or reference.finished):
                 start = stamps[-1]  # "now": with the first torque
-        if not (self.controller.reference.active or self.controller.reference.finished):
-            raise MessageError(f"the trajectory was not followed: {self.controller.reason}")
-        time = 1e-9 * (np.array(stamps) - start)
-        return split_record(np.column_stack([time, rows]), self.model.n_joints, self.model.n_modes)
+            if start is not None and stamps[-1] >= start:
+                self.lost = self._why_lost()
+            if self.lost or not self._moved(enabled):
+                break
+        time = 1e-9 * (np.array(stamps) - (stamps[0] if start is None else start))
+        return self._record(np.column_stack([time, rows]))
+
+    def _moved(self, enabled):
+        """Advance the plant; False when it left what its model holds for."""
+        try:
+            self._advance(self.controller.torque if enabled else None)
+        except ModelError as error:
+            self._failure, self.lost = error, str(error)
+        return self._failure is None
+
+    def _why_lost(self):
+        """Why the arm does not follow the trajectory any more; empty if it does."""
+        controller, plant = self.controller, self.simulator.plant
+        reference = controller.reference
+        if controller.state in (Supervisor.INACTIVE, Supervisor.FAULT) or not (
+            reference.active or reference.finished or reference.stopping
+        ):
+            return controller.reason or f"supervisor in state {controller.state.name}"
+        if np.abs(plant.delta).max(initial=0.0) > self._reach:
+            return f"{self.model.arm.name} is bent by more than it is long"
+        error = np.abs(plant.q - reference.position)
+        if error.max() > self.LARGEST_ERROR:
+            i = int(np.argmax(error))
+            return f"{self.model.joint_names[i]} is {error[i]:.3g} rad off its reference"
+        return ""
 
     def _row(self):
-        """What a `Record` holds of the sample that was just answered, time aside."""
+        """What a `SimulatedRecord` holds of the sample that was just answered, time aside."""
         controller, law = self.controller, self.controller.law
-        estimate = self._estimate
+        estimate, plant = self._estimate, self.simulator.plant
         rate = np.full(self.model.n_modes, np.nan) if estimate.rate is None else estimate.rate
         return np.concatenate(
             [
@@ -139,8 +240,19 @@ class ClosedLoop:
                 law.slow_torque,
                 law.fast_torque,
                 controller.torque,
+                plant.q,
+                plant.delta,
+                (controller.saturated, controller.state),
             ]
         )
+
+    def _record(self, rows):
+        """Rows of time and what `_row` gives as a record."""
+        n, m = self.model.n_joints, self.model.n_modes
+        widths = [1, n, n, n, n, m, m, m, n, n, n, n, self.simulator.plant.delta.size, 1, 1]
+        parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
+        saturated, state = parts[13][:, 0] > 0.0, parts[14][:, 0].astype(int)
+        return SimulatedRecord(parts[0][:, 0], *parts[1:13], saturated, state)
 
 
 def split_record(rows, n, m):
@@ -166,9 +278,16 @@ class _ProfileReference:
         return self
 
     def near(self, offset):
-        """State (3, n) at an offset [s] from the time of `at`."""
-        p, t = self._profile, self._t + offset
-        return np.array([p.position(t), p.velocity(t), p.acceleration(t)]).reshape(3, -1)
+        """State (3, n) at an offset [s] from the time of `at`: the motion's formula, continued beyond its ends."""
+        p, out = self._profile, np.zeros((3, self.position.size))
+        if self._t >= p.duration:
+            out[0] = self.position
+            return out
+        s = np.asarray((self._t + offset) / p.duration)
+        for order in range(3):
+            out[order] = p.shape[order](s) * p.angle / p.duration**order
+        out[0] += p.start
+        return out
 
 
 def continuous_loop(model, law, profile, times):

@@ -37,7 +37,7 @@ class Record:
 
     def thinned(self, every):
         """The same with one row in `every`."""
-        return Record(*(getattr(self, f.name)[::every] for f in fields(self)))
+        return type(self)(*(getattr(self, f.name)[::every] for f in fields(self)))
 
     def tip_deflection(self, model):
         """Deflection of the tip, y = phi_e delta, of an arm of one link, shape (k,) [m]."""
@@ -57,6 +57,28 @@ class Record:
         actual -= (self.rate @ _phi_tip(model)) * np.sin(q)
         wanted = -length * np.sin(self.reference[:, 0]) * self.reference_velocity[:, 0]
         return actual, wanted
+
+
+@dataclass(frozen=True)
+class SimulatedRecord(Record):
+    """A record that also knows what no sensor tells.
+
+    Attributes
+    ----------
+    plant_position : ndarray, shape (k, n)
+        The simulated arm's joint angles [rad].
+    plant_amplitude : ndarray, shape (k, modes of the plant)
+        Its true modal amplitudes [m, rad].
+    saturated : ndarray of bool, shape (k,)
+        Whether the controller met a limit.
+    state : ndarray of int, shape (k,)
+        The controller's, as `Supervisor` numbers them.
+    """
+
+    plant_position: np.ndarray
+    plant_amplitude: np.ndarray
+    saturated: np.ndarray
+    state: np.ndarray
 
 
 def _phi_tip(model):
@@ -95,6 +117,146 @@ def case_study_metrics(record, model, settle=3.0, until=8.0):
             "total": float(np.abs(record.torque[inside]).max() / POUND_FORCE_FOOT),
         },
     }
+
+
+#: A settling time is not told finer than this [s].
+SETTLING_FLOOR = 0.05
+#: How far apart static deflections are evaluated along the motion; linear between [s].
+SAG_INTERVAL = 0.01
+
+
+def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3):
+    """How well an arm followed a motion, and how it came to rest; for any number of joints and links.
+
+    The tip's error is its distance from where the tip of the equivalent rigid arm is at the reference. Under
+    gravity the arm sags even at rest: the errors `about_sag` are distances from the tip of the statically bent
+    arm at the reference instead, and settling is judged by them.
+
+    Parameters
+    ----------
+    record : SimulatedRecord
+    model, plant_model : ArmModel
+        The arm as the controller knows it, and as it is simulated.
+    end : float
+        When the motion ends [s].
+    window : float
+        Over how long after the end the rest is judged [s].
+    tolerance : float
+        Of the tip, for the settling time [m].
+
+    Returns
+    -------
+    dict
+        Numbers, lists with one number per joint, and None for what the record does not reach: ready for JSON.
+
+        ``peak_joint_error_rad``, ``rms_joint_error_rad``
+            Reference less the true joint angle, over the whole motion and after it, per joint.
+        ``peak_tip_error_mm``, ``rms_tip_error_mm``
+            Of the tip, as above; under gravity also ``…_about_sag_mm``, and ``static_sag_mm`` of the arm at rest
+            at the motion's end.
+        ``residual_tip_rms_mm``
+            Deflection of the tip about its static value, over the window.
+        ``settling_time_s``
+            From the motion's end until the tip's error stays below the tolerance, at least `SETTLING_FLOOR`.
+        ``peak_torque_Nm``, ``rms_torque_Nm``
+            As sent, per joint.
+        ``saturation_share``
+            Share of the samples whose torque met a limit.
+        ``peak_deflection_mm``, ``case_study``
+            Of arms of one link in a plane: the tip's own deflection y, and `case_study_metrics` where the record
+            reaches its window.
+    """
+    record = _from(record, 0.0)
+    if not record.time.size:
+        return {}
+    error = np.abs(record.reference - record.plant_position)
+    tip = _path(plant_model, record.plant_position, record.plant_amplitude)
+    wanted = _path(model, record.reference, np.zeros((record.time.size, model.n_modes)))
+    found = {
+        "peak_joint_error_rad": error.max(0).tolist(),
+        "rms_joint_error_rad": _rms(error, 0).tolist(),
+        **_tip_errors("mm", distance := np.linalg.norm(tip - wanted, axis=1)),
+    }
+    if any(plant_model.arm.gravity):
+        at_rest = _sagging_path(plant_model, record)
+        distance = np.linalg.norm(tip - at_rest, axis=1)
+        found["static_sag_mm"] = 1e3 * float(np.linalg.norm(at_rest[-1] - wanted[-1]))
+        found |= _tip_errors("about_sag_mm", distance)
+    found["residual_tip_rms_mm"] = _residual(record, plant_model, tip, end, window)
+    found["settling_time_s"] = _settling_time(record.time, distance, end, tolerance)
+    found["peak_torque_Nm"] = np.abs(record.torque).max(0).tolist()
+    found["rms_torque_Nm"] = _rms(record.torque, 0).tolist()
+    found["saturation_share"] = float(np.mean(record.saturated))
+    if len(model.arm.links) == 1 and set(model.arm.links[0].flexible) == {"y"}:
+        deflection = record.plant_amplitude @ _phi_tip(plant_model)
+        found["peak_deflection_mm"] = 1e3 * float(np.abs(deflection).max())
+        long_enough = record.time[-1] >= 8.0 - 1e-9
+        found["case_study"] = case_study_metrics(record, model) if long_enough else None
+    return found
+
+
+def _from(record, start):
+    """The part of a record from a time on [s]."""
+    kept = record.time >= start - 1e-9
+    return type(record)(*(getattr(record, f.name)[kept] for f in fields(record)))
+
+
+def _rms(values, axis=None):
+    return np.sqrt(np.mean(np.square(values), axis))
+
+
+def _tip_errors(unit, distance):
+    return {
+        f"peak_tip_error_{unit}": 1e3 * float(distance.max()),
+        f"rms_tip_error_{unit}": 1e3 * float(_rms(distance)),
+    }
+
+
+def _path(model, position, amplitude):
+    """The tip along a record, shape (k, 3) [m]; a row that repeats the one before is not computed again."""
+    rows, out = np.hstack([position, amplitude]), np.empty((len(position), 3))
+    new = np.append(True, (rows[1:] != rows[:-1]).any(1))
+    for k in np.flatnonzero(new):
+        out[k] = model.tip_position(position[k], amplitude[k])
+    return out[np.maximum.accumulate(np.where(new, np.arange(len(out)), 0))]
+
+
+def _sagging_path(model, record):
+    """The tip of the statically bent arm along the reference, shape (k, 3) [m]."""
+    time, reference = record.time, record.reference
+    knots = np.searchsorted(time, np.arange(time[0], time[-1], SAG_INTERVAL) - 1e-9)
+    knots = np.unique(np.append(knots, len(time) - 1))
+    amplitude, before = [], None
+    for k in knots:
+        if before is None or (reference[k] != before).any():
+            before, bent = reference[k], model.static_deflection(reference[k])
+        amplitude.append(bent)
+    amplitude = np.array(amplitude).reshape(len(knots), model.n_modes)
+    columns = [np.interp(time, time[knots], column) for column in amplitude.T]
+    return _path(model, reference, np.array(columns).reshape(model.n_modes, -1).T)
+
+
+def _residual(record, model, tip, end, window):
+    """Rms of the tip's deflection about its static value after the end [mm]; None before that."""
+    late = (record.time >= end - 1e-9) & (record.time <= end + window + 1e-9)
+    if record.time[-1] < end + window - 1e-6 or not late.any():
+        return None
+    position = record.plant_position[late]
+    straight = np.zeros((len(position), model.n_modes))
+    middle = position.mean(0)
+    bent = model.tip_position(middle, model.static_deflection(middle))
+    static = bent - model.tip_position(middle, straight[0])
+    deflection = tip[late] - _path(model, position, straight)
+    return 1e3 * float(_rms(np.linalg.norm(deflection - static, axis=1)))
+
+
+def _settling_time(time, distance, end, tolerance):
+    """From the end until the tip stays within the tolerance [s]; None when it does not."""
+    outside = np.flatnonzero((time >= end - 1e-9) & (distance > tolerance))
+    if time[-1] < end - 1e-9 or (outside.size and outside[-1] == len(time) - 1):
+        return None
+    settled = float(time[outside[-1] + 1] - end) if outside.size else 0.0
+    return max(settled, SETTLING_FLOOR)
 
 
 def linear_metrics(model, law, q):

@@ -6,7 +6,7 @@ import yaml
 
 from flexarm_dynamics.errors import ParameterError
 
-PREFIXES = {"controller": ("slow", "fast"), "observer": ("observer",), "simulator": ()}
+PREFIXES = {"controller": ("slow", "fast", "manifold"), "observer": ("observer",), "simulator": ()}
 
 
 def directory():

@@ -205,3 +205,60 @@ class Arm:
         arm = replace(self, links=links)
         kept = tuple(n for n in self.observed_modes if n in arm.mode_names)
         return replace(arm, observed_modes=kept)
+
+
+def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
+    """The same arm with another payload, stiffness or damping: what a controller that has not been told meets.
+
+    Gauges, observed modes and everything else stay. Where mode shapes depend on the payload (`loaded`), they
+    change with it.
+
+    Parameters
+    ----------
+    arm : Arm
+    payload : float
+        Factor of the payload's mass and inertia; its offset stays [-].
+    stiffness : float
+        Factor of every link's EI and GJ. Measured frequencies (`from_frequencies`) go with its root, so that
+        their shapes stay as they are [-].
+    damping : float
+        Factor of every modal damping ratio [-].
+
+    Returns
+    -------
+    Arm
+
+    Raises
+    ------
+    ModelError
+        For a factor that is negative or not finite, or for a stiffness of 0.
+    """
+    for name, value in (("payload", payload), ("stiffness", stiffness), ("damping", damping)):
+        low = value > 0.0 if name == "stiffness" else value >= 0.0
+        if not (low and np.isfinite(value)):
+            wanted = "above 0" if name == "stiffness" else "not below 0"
+            raise ModelError(
+                f"{arm.name}: {name} times {value}: a finite factor {wanted} is wanted"
+            )
+    body = replace(
+        arm.payload,
+        mass=payload * arm.payload.mass,
+        inertia=tuple(tuple(payload * i for i in row) for row in arm.payload.inertia),
+    )
+    return replace(
+        arm, payload=body, links=tuple(_scaled_link(i, stiffness, damping) for i in arm.links)
+    )
+
+
+def _scaled_link(link, stiffness, damping):
+    root = np.sqrt(stiffness)
+    flexible = {
+        d: replace(
+            f,
+            frequencies=tuple(float(root * v) for v in f.frequencies),
+            damping=tuple(damping * v for v in f.damping),
+        )
+        for d, f in link.flexible.items()
+    }
+    rigidity = {d: stiffness * v for d, v in link.stiffness.items()}
+    return replace(link, stiffness=rigidity, flexible=flexible)

@@ -1,5 +1,7 @@
 """The arm that is simulated: its state, its motion under torque, its safe action."""
 
+import math
+
 import numpy as np
 
 from flexarm_dynamics.errors import ModelError, ShapeError
@@ -52,16 +54,17 @@ class Plant:
         self.q[:] = position
         self.delta[:] = self.model.static_deflection(position) if delta is None else delta
 
-    def advance(self, torque):
-        """One period under constant torque, shape (n,) [N m]."""
-        self._run(torque, self._friction)
+    def advance(self, torque, share=1.0):
+        """One period, or a share of it, under constant torque, shape (n,) [N m]."""
+        self._run(torque, self._friction, share)
 
-    def advance_safely(self):
-        """One period without drive torque, under each joint's safe action."""
-        self._run(self._no_torque, self._safe)
+    def advance_safely(self, share=1.0):
+        """One period, or a share of it, without drive torque, under each joint's safe action."""
+        self._run(self._no_torque, self._safe, share)
 
-    def _run(self, torque, friction):
-        self._advance(self.state, torque, self.period / self.substeps, self.substeps, friction)
+    def _run(self, torque, friction, share):
+        count = max(1, math.ceil(share * self.substeps))  # no longer ones than of a whole period
+        self._advance(self.state, torque, share * self.period / count, count, friction)
         if not np.isfinite(self.state).all():
             raise ModelError(
                 f"the state of {self.model.arm.name} is no longer finite: torque or speed beyond what its"

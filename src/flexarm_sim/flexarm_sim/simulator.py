@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import Arm
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.strain_map import StrainMap
@@ -93,7 +94,7 @@ class Simulator:
     Parameters
     ----------
     settings : mapping
-        Checked values of `PARAMETERS`.
+        Checked values of `PARAMETERS`; `arm` and `plant_arm` may each be an `Arm` in the place of a name.
 
     Attributes
     ----------
@@ -112,10 +113,10 @@ class Simulator:
 
     def __init__(self, settings):
         self.settings = dict(settings)
-        arm = arm_file.load(settings["arm"])
+        arm = _arm(settings["arm"])
         self.arm = arm
         self.nominal = model.build(arm)
-        plant_arm = arm_file.load(settings["plant_arm"]) if settings["plant_arm"] else arm
+        plant_arm = _arm(settings["plant_arm"]) if settings["plant_arm"] else arm
         if settings["plant_modes"]:
             plant_arm = plant_arm.with_modes(settings["plant_modes"])
         self._same_names(plant_arm)
@@ -162,14 +163,16 @@ class Simulator:
         self.torque[:] = 0.0
         self._measure()
 
-    def advance(self, torque):
-        """One period under `torque` (n,) [N m], or under the safe actions where it is None."""
-        if torque is None:
-            self.plant.advance_safely()
-            self.torque[:] = 0.0
-        else:
-            self.plant.advance(torque)
-            self.torque[:] = torque
+    def advance(self, torque, before=None, share=0.0):
+        """One period under `torque` (n,) [N m], or under the safe actions where it is None.
+
+        When torque comes late, `before` goes on to act over the first `share` of the period; the torque of the
+        next sample is then the mean over the period.
+        """
+        self.torque[:] = 0.0
+        if share > 0.0:
+            self._advance(before, share)
+        self._advance(torque, 1.0 - share)
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         self._measure()
@@ -180,5 +183,18 @@ class Simulator:
         self.velocity[:] = plant.qd
         self.sensors.strain(plant.delta, self.strain)
         if self.strain_map is not None:
+    def _advance(self, torque, share):
+        """A share of a period under one torque, which counts into the mean."""
+        if torque is None:
+            self.plant.advance_safely(share)
+        else:
+            self.plant.advance(torque, share)
+            self.torque += share * np.asarray(torque)
+
             self.strain_map.amplitudes(self.strain, self.amplitude)
         self.rate[:] = plant.delta_d[self._observed]
+
+
+def _arm(given):
+    """An arm as given, or from its file."""
+    return given if isinstance(given, Arm) else arm_file.load(given)
