@@ -7,7 +7,9 @@ from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import Parameter, check_all
 from flexarm_dynamics.strain_map import StrainMap
 
+from . import gauge_health
 from .composite import sizes
+from .observers.motion import Motion
 from .samples import SampleOrder
 
 OBSERVERS = "flexarm.observers"
@@ -23,6 +25,22 @@ PARAMETERS = (
         low=1.0,
         high=1e6,
     ),
+    Parameter(
+        "delay",
+        "float",
+        0.0,
+        "From a sample's stamp to when the torque that answers it acts: the estimate is predicted ahead by it.",
+        unit="s",
+        low=0.0,
+        high=0.1,
+    ),
+    Parameter(
+        "smooth_position",
+        "bool",
+        True,
+        "Pass on the observer's joint positions, where it estimates them, in place of the encoders'.",
+    ),
+    *gauge_health.PARAMETERS,
 )
 
 
@@ -37,8 +55,27 @@ def design_observer(name, model, values):
     return law(model, check_all(law.PARAMETERS, values, sizes(model), "observer."))
 
 
+def observe(model, name, values):
+    """An `ArmObserver` from an observer's name and its parameters, those of `PARAMETERS` among them.
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError, ModelError
+    """
+    common = {p.name for p in PARAMETERS}
+    options = {k: v for k, v in values.items() if k in common}
+    law = design_observer(name, model, {k: v for k, v in values.items() if k not in common})
+    return ArmObserver(model, law, **check_all(PARAMETERS, options, prefix="observer."))
+
+
 class ArmObserver:
-    """Turns a sample of the arm into one with modal amplitudes and rates filled in.
+    r"""Turns a sample of the arm into one with modal amplitudes and rates filled in.
+
+    Where the source gives no joint velocity it is the observer's, if that estimates one, else the filtered
+    derivative of the positions.
+
+    With a `delay`, what is passed on is the state at the stamp plus the delay: the model's motion (`motion`) under
+    the torque that the sample reports, held. Torques that were sent since are not known here.
 
     Parameters
     ----------
@@ -47,18 +84,49 @@ class ArmObserver:
     observer : Observer
     joint_velocity_bandwidth : float
         [rad/s]
+    delay : float
+        [s]
+    smooth_position : bool
+        Whether `position` is the observer's where it has one.
+    calibration_samples, stuck_samples : int
+        See `gauge_health.PARAMETERS`.
 
     Attributes
     ----------
     observer : Observer
         May be replaced whole between two samples.
-    estimate : ArmSample fields
-        `velocity` (n,), and the observer's `amplitude` and `rate`.
+    gauges : GaugeHealth or None
+        What is known of each gauge; None for an arm without.
+    calibration : BiasCalibration or None
+        The last samples, for `calibrate`.
+    calibrated : bool
+        Whether strains are mapped with a bias found here; the source's amplitudes, made with the arm file's bias,
+        are no longer used then.
+    position, velocity : ndarray, shape (n,)
+        Of the joints, measured or estimated, predicted ahead by the delay [rad], [rad/s].
+    amplitude, rate : ndarray, shape (m,)
+        The observer's, predicted ahead by the delay.
     """
 
-    def __init__(self, model, observer, joint_velocity_bandwidth=500.0):
+    def __init__(
+        self,
+        model,
+        observer,
+        joint_velocity_bandwidth=500.0,
+        delay=0.0,
+        smooth_position=True,
+        calibration_samples=200,
+        stuck_samples=50,
+    ):
         self.model, self.observer = model, observer
-        self.strain_map = StrainMap(model) if model.arm.gauges else None
+        self.strain_map = self.gauges = self.calibration = None
+        if model.arm.gauges:
+            self.strain_map = StrainMap(model)
+            self.gauges = gauge_health.GaugeHealth(model, self.strain_map, stuck_samples)
+            self.calibration = gauge_health.BiasCalibration(
+                model, self.strain_map, calibration_samples
+            )
+        self.calibrated = False
         observed = model.arm.observed_modes
         if tuple(observed) != tuple(model.mode_names):
             missing = [n for n in model.mode_names if n not in observed]
@@ -66,10 +134,14 @@ class ArmObserver:
                 f"{model.arm.name}: {', '.join(missing)} in links[].flexible but not in observed_modes: the"
                 " controller's arm has just the modes that it observes; lower `modes`"
             )
-        self.bandwidth = joint_velocity_bandwidth
-        self.velocity = np.zeros(model.n_joints)
-        self._position = np.zeros(model.n_joints)
-        self._mapped = np.zeros(model.n_modes)
+        self.bandwidth, self.delay = joint_velocity_bandwidth, delay
+        self.smooth_position = smooth_position
+        n, m = model.n_joints, model.n_modes
+        self.position, self.velocity = np.zeros(n), np.zeros(n)
+        self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        self._measured, self._derivative = np.zeros(n), np.zeros(n)
+        self._mapped, self._used = np.zeros(m), np.zeros(m)
+        self._motion = Motion(model)
         self._order = SampleOrder()
         self.reason = ""
 
@@ -84,8 +156,8 @@ class ArmObserver:
         Returns
         -------
         bool
-            Whether `velocity`, `observer.amplitude` and `observer.rate` are a converged estimate. A repeated
-            (session, sequence) leaves everything as it was.
+            Whether `velocity`, `amplitude` and `rate` are a converged estimate. A repeated (session, sequence)
+            leaves everything as it was.
 
         Raises
         ------
@@ -103,19 +175,86 @@ class ArmObserver:
                 f" {self._order.sequence} of {last_stamp * 1e-9:.6f} s: left out"
             )
         restart = verdict == SampleOrder.RESTART
+        self._map_strain(sample, restart)
         if restart:
             self.observer.reset()
         dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
-        if sample.amplitude is None:
-            sample.amplitude = self.strain_map.amplitudes(sample.strain, out=self._mapped)
+        if self.delay and not restart and not np.isfinite(sample.torque).all():
+            raise MessageError(
+                "joint_torque is unknown (NaN), and observer.delay predicts with it: have the driver report the"
+                " applied torque, or set observer.delay to 0.0"
+            )
         if not sample.velocity_known:
             sample.velocity[:] = self._joint_velocity(sample, dt)
         self._update(sample, dt)
         # Only now: a sample that the observer refused has left nothing behind, its time step included.
         self._order.take(sample)
-        self.velocity[:] = sample.velocity
-        self._position[:] = sample.position
+        self._derivative[:], self._measured[:] = sample.velocity, sample.position
+        self._used[:] = sample.amplitude
+        if sample.strain is not None and self.calibration is not None:
+            self.calibration.push(sample)
+        self._pass_on(sample)
         return self.observer.converged
+
+    def _map_strain(self, sample, restart):
+        """Judge the gauges, and fill in the amplitudes where they are this observer's to make."""
+        if sample.strain is None or self.gauges is None:
+            return
+        if restart:
+            self.gauges.reset()
+            self.calibration.reset()
+        self.gauges.update(sample.strain)
+        if sample.amplitude is None or self.calibrated:
+            sample.amplitude = self.gauges.amplitudes(sample.strain, out=self._mapped)
+
+    def calibrate(self):
+        """Take the gauges' bias from the last samples, on an arm at rest; not on the control path.
+
+        The estimate moves with it, so that its rates don't jump.
+
+        Returns
+        -------
+        old, new : ndarray, shape (gauges,)
+            The bias before and now [strain].
+
+        Raises
+        ------
+        MessageError, ModelError
+            When there is nothing to calibrate or the arm is not at rest; nothing has changed then.
+        """
+        if self.calibration is None:
+            raise MessageError(f"the arm file of {self.model.arm.name} has no gauges")
+        old, new = self.strain_map.bias, self.calibration.bias()
+        self.strain_map.bias = new
+        self.calibrated = True
+        now = self.strain_map.amplitudes(self.calibration.last)
+        self.observer.amplitude += now - self._used
+        self._used[:] = now
+        return old, new
+
+    def _pass_on(self, sample):
+        """Fill in what is passed on: the observer's estimate, or the sample's own, ahead by the delay."""
+        observer = self.observer
+        smooth = self.smooth_position and observer.joint_position is not None
+        estimated = not sample.velocity_known and observer.joint_velocity is not None
+        self.position[:] = observer.joint_position if smooth else sample.position
+        self.velocity[:] = observer.joint_velocity if estimated else sample.velocity
+        self.amplitude[:], self.rate[:] = observer.amplitude, observer.rate
+        if self.delay and observer.converged:
+            self._predict(sample.torque)
+
+    def _predict(self, torque):
+        """Move what is passed on ahead by the delay."""
+        groups = (self.position, self.amplitude, self.velocity, self.rate)
+        x = np.concatenate(groups)
+        count = int(np.ceil(self.delay / LONGEST_PREDICTION))
+        part = self.delay / count
+        for _ in range(count):
+            x = self._motion.advance(x, torque, part, self._motion.step_for(part, x[: torque.size]))
+        start = 0
+        for group in groups:
+            group[:] = x[start : start + group.size]
+            start += group.size
 
     def _update(self, sample, dt):
         try:
@@ -142,26 +281,25 @@ class ArmObserver:
                 raise MessageError(
                     f"strain is given, but the arm file of {arm.name} has no gauges to map it"
                 )
-            check_finite(sample.strain, arm.gauge_names, "strain", LARGEST_STRAIN)
         if sample.rate is not None:
             check_finite(sample.rate, arm.mode_names, "modal_rate")
 
     def _joint_velocity(self, sample, dt):
         """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""
         if dt == 0.0:
-            return np.zeros_like(self.velocity)
-        slope = (sample.position - self._position) / dt
-        return slope + (self.velocity - slope) * np.exp(-self.bandwidth * dt)
+            return np.zeros_like(self._derivative)
+        slope = (sample.position - self._measured) / dt
+        return slope + (self._derivative - slope) * np.exp(-self.bandwidth * dt)
 
 
-#: No arm strains by a tenth: such a number is in microstrain, or a broken bridge's [-].
-LARGEST_STRAIN = 0.1
-#: Values beyond this are no measurement of an arm (rad, m, strain, and their rates).
+#: A longer delay is predicted in parts, each with the forces at its start [s].
+LONGEST_PREDICTION = 0.01
+#: Values beyond this are no measurement of an arm (rad, m, and their rates).
 HUGE = 1e6
 
 
-def check_finite(values, names, field, largest=HUGE):
+def check_finite(values, names, field):
     """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
-    if not np.abs(values).max(initial=0.0) < largest:  # false for NaN too
-        i = int(np.argmin(np.abs(values) < largest))
+    if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
+        i = int(np.argmin(np.abs(values) < HUGE))
         raise MessageError(f"{field} of {names[i]} is {values[i]}: not a usable measurement")

@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
-from flexarm_control import arm_observer, composite
+from std_srvs.srv import Trigger
+
+from flexarm_control import arm_observer, composite, gauge_health
 from flexarm_control.samples import ArmSample
 from flexarm_dynamics import arm_file, model, registry
-from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
@@ -42,8 +44,7 @@ class ObserverNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(composite.sizes(self.model))
-        bandwidth = parameters["observer.joint_velocity_bandwidth"]
-        self.core = arm_observer.ArmObserver(self.model, self._design(), bandwidth)
+        self.core = arm_observer.ArmObserver(self.model, self._design(), **self._common())
         parameters.on_change(self._changed)
         arm = self.arm
         self._reader = StateReader(arm)
@@ -58,6 +59,7 @@ class ObserverNode(ArmNode):
         self._state_pub = self.make_publisher(
             ObserverState, "observer/state", qos.LINE, qos_overriding_options=options
         )
+        self.make_service(Trigger, "~/calibrate_gauges", self._on_calibrate)
         self.make_line(
             self.make_subscription(
                 ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
@@ -71,10 +73,16 @@ class ObserverNode(ArmNode):
         values = self.parameters.group("observer.", declared)
         return arm_observer.design_observer(name, self.model, values)
 
+    def _common(self):
+        """What belongs to no single law."""
+        return self.parameters.group("observer.", {p.name for p in arm_observer.PARAMETERS})
+
     def _changed(self, names):
         """Swap in a new observer, which goes on from the old one's estimate."""
-        self.core.bandwidth = self.parameters["observer.joint_velocity_bandwidth"]
-        if names - {"observer.joint_velocity_bandwidth"}:
+        common = self._common()
+        self.core.bandwidth, self.core.delay = common["joint_velocity_bandwidth"], common["delay"]
+        self.core.smooth_position = common["smooth_position"]
+        if names - {"observer." + name for name in common}:
             observer = self._design()
             observer.resume(self.core.observer)
             self.core.observer = observer
@@ -97,18 +105,37 @@ class ObserverNode(ArmNode):
             return
         self._samples += 1
         writer.head(sample.stamp_ns, sample.session, sample.sequence)
-        writer.write("joint_position", sample.position)
+        writer.write("joint_position", core.position)
         writer.write("joint_velocity", core.velocity)
         writer.write("joint_torque", sample.torque)
         writer.write("strain", sample.strain)
-        writer.write("modal_amplitude", core.observer.amplitude)
-        writer.write("modal_rate", core.observer.rate if known else None)
+        writer.write("modal_amplitude", core.amplitude)
+        writer.write("modal_rate", core.rate if known else None)
         self._estimate_pub.publish(writer.message)
         if self._state_pub.get_subscription_count():
             name = self.parameters["observer.type"]
             self._state_pub.publish(
-                self._state_writer.fill(sample, name, core.observer, sample.strain)
+                self._state_writer.fill(
+                    sample, name, core.observer, sample.strain, core.gauges and core.gauges.health
+                )
             )
+
+    def _on_calibrate(self, request, response):
+        """Service: the gauges' bias from the samples at hand; answers at once."""
+        core = self.core
+        try:
+            if not self.active:
+                raise MessageError("not active")
+            old, new = core.calibrate()
+        except FlexarmError as error:
+            response.success, response.message = False, str(error)
+            return response
+        names = self.arm.gauge_names
+        said = gauge_health.calibration_text(names, old, new, core.calibration.samples)
+        lines = gauge_health.calibration_yaml(names, new)
+        self.get_logger().info(f"gauges calibrated; for the arm file:\n{lines}")
+        response.success, response.message = True, said
+        return response
 
     def _forward_unknown(self, msg):
         """Pass a bad sample on without modal states, so that the controller disables at once."""
@@ -124,12 +151,14 @@ class ObserverNode(ArmNode):
         self._estimate_pub.publish(out)
 
     def diagnose(self):
+        observer = self.core.observer
         rate, self._samples_before = self._samples - self._samples_before, self._samples
         values = {
             "observer": self.parameters["observer.type"],
             "samples per second": rate,
             "samples refused": self._refused,
-            "converged": self.core.observer.converged,
+            "converged": observer.converged,
+            **observer.parameters_estimated,
         }
         refused, self._refused_before = self._refused - self._refused_before, self._refused
         if not self.active:
@@ -138,8 +167,13 @@ class ObserverNode(ArmNode):
             return ERROR, f"{refused} states refused: {self._refusal}", values
         if rate == 0:
             return ERROR, "no usable arm_state: start the simulator or driver", values
-        if not self.core.observer.converged:
+        if not observer.converged:
             return WARN, "not converged yet", values
+        if self.core.gauges and (wrong := self.core.gauges.warnings()):
+            return WARN, "; ".join(wrong), values
+        if not observer.consistent:
+            wrong = "innovations are larger than the noise explains: raise observer noise levels, or mend the arm file"
+            return WARN, wrong, values
         return OK, "", values
 
 

@@ -28,10 +28,23 @@ class Observer(ABC):
         Where the observer has one.
     converged : bool
         Whether the estimate may be used for control.
+    joint_position, joint_velocity : ndarray, shape (n,), or None
+        The estimate of the joints [rad], [rad/s], where the observer makes one.
+    innovation_squared : float
+        Normalised innovation squared of the last sample [-], whose mean is the number of measurements if the
+        noise is as assumed; NaN where the observer has none.
+    consistent : bool
+        False while the innovations are larger than the assumed noise explains.
+    parameters_estimated : dict of str to float
+        What the observer estimates of the arm itself; the name has the unit.
     """
 
     #: Declared parameters, named ``observer.<name>`` in the observer node.
     PARAMETERS = ()
+
+    joint_position = joint_velocity = None
+    innovation_squared = float("nan")
+    consistent = True
 
     def __init__(self, model, parameters):
         self.model = model
@@ -40,6 +53,7 @@ class Observer(ABC):
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self.innovation = np.zeros(0)
         self.covariance_diagonal = np.zeros(0)
+        self.parameters_estimated = {}
         self.converged = False
         self._elapsed = -1.0  # [s] since the first sample; negative before it
 

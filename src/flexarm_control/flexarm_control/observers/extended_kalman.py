@@ -1,0 +1,230 @@
+r"""Extended Kalman filter of joints, modes, and what is not known of the arm: payload and joint friction.
+
+The state of `kalman` is augmented by parameters that walk slowly at random:
+
+.. math::
+    \dot x = f(x, u, \theta), \qquad \dot\theta = w, \qquad
+    \theta = (s,\ b_1 \ldots b_n,\ c_1 \ldots c_n)
+
+with s the scale of the payload, its mass and inertia alike, and the friction torque
+:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` of each joint in place of the arm file's. Mass matrix and forces
+are affine in s, so that with :math:`M_1, a_1` of the arm as in its file and :math:`M_2, a_2` of the arm with twice
+the payload (mode shapes held) the acceleration is, exactly,
+
+.. math:: a = [(2 - s)M_1 + (s - 1)M_2]^{-1}[(2 - s)M_1a_1 + (s - 1)M_2a_2] .
+
+The prediction is the exponential Euler step of `motion` on f, with the Jacobian :math:`\partial(f, w)/\partial(x,
+\theta)` at the estimate itself, by central differences, taken anew every ``relinearise`` seconds.
+Measurement and update are those of `kalman`. Estimates stay inside bounds: no negative mass or friction.
+
+A parameter is found only where the motion excites it: friction at rest is not observable, nor is a payload. It
+costs milliseconds per linearisation: for records, and for arms sampled slowly; see docs/observers.md.
+"""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from flexarm_dynamics.assembly import assemble, outboard
+from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.model import ArmModel
+from flexarm_dynamics.parameters import Parameter
+
+from .kalman import NOISE, Kalman
+from .motion import discretise, force_density, jacobian, mass_matrix
+
+
+def _flag(name, default, what):
+    return Parameter(name, "bool", default, f"Whether to estimate {what}.")
+
+
+def _size(name, default, unit, what):
+    return Parameter(name, "float", default, what, unit=unit, low=0.0, high=1e6)
+
+
+#: Bounds of the estimates: scale of the payload [-], viscous [N m s/rad] and Coulomb friction [N m].
+LARGEST_SCALE, LARGEST_FRICTION = 20.0, 1e6
+
+
+class ExtendedKalman(Kalman):
+    """Kalman filter with parameters of the arm in its state; see the module.
+
+    Attributes
+    ----------
+    state, covariance : ndarray, shape (N + k,), (N + k, N + k)
+        (q, delta, qd, delta_d), then the k parameters.
+    parameters_estimated : dict
+        The parameters and their deviations, by name and unit.
+    """
+
+    NAME = "extended_kalman"
+    PARAMETERS = (
+        *NOISE,
+        _flag("estimate_payload", True, "the scale of the payload's mass and inertia"),
+        _flag("estimate_viscous", True, "viscous friction of the joints"),
+        _flag("estimate_coulomb", False, "Coulomb friction of the joints"),
+        _size("payload_deviation", 1.0, "-", "Of the payload's scale from 1 at the start, rms."),
+        _size("viscous_deviation", 0.5, "N m s/rad", "Of viscous friction from the file's, rms."),
+        _size("coulomb_deviation", 0.2, "N m", "Of Coulomb friction from the file's, rms."),
+        _size("payload_drift", 1e-3, "s^-0.5", "Random walk of the payload's scale, per root of a second."),
+        _size("viscous_drift", 1e-3, "N m s^0.5/rad", "Random walk of viscous friction."),
+        _size("coulomb_drift", 1e-3, "N m s^-0.5", "Random walk of Coulomb friction."),
+        Parameter(
+            "relinearise",
+            "float",
+            0.01,
+            "Jacobians are taken anew after this time; 0.0: at every sample.",
+            unit="s",
+            low=0.0,
+            high=1.0,
+        ),
+    )  # fmt: skip
+
+    #: Steps of the central differences in the parameters, which enter smoothly.
+    DIFFERENCE = 1e-5
+
+    def _prepare(self):
+        model, values, n = self.model, self.parameters, self._n
+        self._friction = model.friction_table().copy()
+        names, joints = [], model.joint_names
+        start, deviation, drift, high = [], [], [], []
+
+        def add(labels, kind, first, largest):
+            names.extend(labels)
+            start.extend(first)
+            deviation.extend([values[f"{kind}_deviation"]] * len(labels))
+            drift.extend([values[f"{kind}_drift"]] * len(labels))
+            high.extend([largest] * len(labels))
+
+        self._heavier = None
+        if values["estimate_payload"]:
+            self._heavier = with_payload(model, 2.0)
+            add(["payload scale [-]"], "payload", [1.0], LARGEST_SCALE)
+        self._viscous_at, self._coulomb_at = slice(0, 0), slice(0, 0)
+        for column, kind, unit in ((0, "viscous", "N m s/rad"), (1, "coulomb", "N m")):
+            if values[f"estimate_{kind}"]:
+                at = slice(len(names), len(names) + n)
+                setattr(self, f"_{kind}_at", at)
+                labels = [f"{kind} friction of {j} [{unit}]" for j in joints]
+                add(labels, kind, self._friction[:, column], LARGEST_FRICTION)
+        self.names, self._first = tuple(names), np.array(start)
+        self._deviation, self._drift = np.array(deviation), np.array(drift)
+        self._high = np.array(high)
+        size = 2 * self._p + len(names)
+        self.state, self.covariance = np.zeros(size), np.zeros((size, size))
+        self._design, self._age = None, 0.0
+        self._tell()
+
+    def reset(self):
+        super().reset()
+        self._design, self._age = None, 0.0
+
+    def resume(self, other):
+        same = isinstance(other, ExtendedKalman) and other.names == self.names
+        if same:
+            super().resume(other)
+            self._tell()
+        else:
+            self.reset()
+
+    def _start(self, sample):
+        N = 2 * self._p
+        super()._start(sample)
+        self.state[N:] = self._first
+        np.fill_diagonal(self.covariance[N:, N:], self._deviation**2)
+        self._tell()
+
+    def update(self, sample, dt):
+        super().update(sample, dt)
+        parameters = self.state[2 * self._p :]
+        np.clip(parameters, 0.0, self._high, out=parameters)
+        self._tell()
+
+    def _tell(self):
+        N = 2 * self._p
+        deviation = np.sqrt(np.diagonal(self.covariance)[N:])
+        for name, value, sigma in zip(self.names, self.state[N:], deviation, strict=True):
+            self.parameters_estimated[name] = float(value)
+            self.parameters_estimated[f"{name}, deviation"] = float(sigma)
+
+    def slope(self, x, torque):
+        """Time derivative of the augmented state, shape (N + k,)."""
+        model, n, p = self.model, self._n, self._p
+        N, speed = 2 * p, x[p : p + n]
+        theta = x[N:]
+        viscous, coulomb, smoothing = self._friction.T
+        viscous = theta[self._viscous_at] if self._viscous_at.stop else viscous
+        coulomb = theta[self._coulomb_at] if self._coulomb_at.stop else coulomb
+        friction = viscous * speed + coulomb * np.tanh(speed / smoothing)
+        net = torque + model.friction(speed) - friction  # the model takes its own off again
+        out = np.zeros(x.size)
+        out[:N] = model.derivative(x[:N], net)
+        if self._heavier is not None:
+            s, q, delta = theta[0], x[:n], x[n:p]
+            one = (2.0 - s) * mass_matrix(model, q, delta)
+            two = (s - 1.0) * mass_matrix(self._heavier, q, delta)
+            force = one @ out[p:N] + two @ self._heavier.derivative(x[:N], net)[p:]
+            out[p:N] = np.linalg.solve(one + two, force)
+        return out
+
+    def _predict(self, torque, dt):
+        self._age += dt
+        design, relinearise = self._design, self.parameters["relinearise"]
+        if design is None or self._age > relinearise - 0.5 * dt or dt != design.length:
+            design = self._linearised(torque, dt)
+            self._design, self._age = design, 0.0
+        return self.state + design.Gamma @ self.slope(self.state, torque), design
+
+    def _linearised(self, torque, dt):
+        """The step at the estimate under this torque."""
+        N, x = 2 * self._p, self.state
+        density = np.zeros((x.size, x.size))
+        density[:N, :N] = force_density(self.model, x[:N], self.density)
+        np.fill_diagonal(density[N:, N:], self._drift**2)
+        A = jacobian(lambda at: self.slope(at, torque), x)
+        return discretise(A, dt, density)
+
+
+def with_payload(model, scale):
+    """The same arm with its payload's mass and inertia scaled; mode shapes and modal damping of the original.
+
+    Held shapes keep the modal coordinates what they were, and the equations of motion affine in the scale.
+
+    Raises
+    ------
+    DesignError
+        When the arm has no payload to scale.
+    """
+    payload = model.arm.payload
+    if not payload.mass > 0.0:
+        raise DesignError(
+            f"{model.arm.name}: payload.mass is {payload.mass}, and estimate_payload estimates its scale: give the"
+            " arm file the payload that is expected, or set observer.estimate_payload to false"
+        )
+    inertia = tuple(tuple(scale * v for v in row) for row in payload.inertia)
+    arm = replace(model.arm, payload=replace(payload, mass=scale * payload.mass, inertia=inertia))
+    if isinstance(model, Chain):
+        return _SameShapes(model, arm)
+    return _same_shapes(model, arm)
+
+
+class _SameShapes(Chain):
+    """A chain with another payload and everything else held."""
+
+    def __init__(self, model, arm):
+        ArmModel.__init__(self, arm)
+        self._compiled, self._shapes = model._compiled, model._shapes
+        loads = outboard(arm)
+        new = assemble(arm, self._shapes, loads)
+        self.data = new._replace(damping=model.data.damping)
+
+
+def _same_shapes(model, arm):
+    """The same of a closed one-link form."""
+    other = copy.copy(model)
+    other.arm = arm
+    other.coefficients = replace(other.derive(), D=model.coefficients.D)
+    other._terms_at_rest = other._constant_terms()
+    return other

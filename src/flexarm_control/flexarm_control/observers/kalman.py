@@ -1,0 +1,268 @@
+r"""Kalman filter of joints and modes, from noise levels in physical units.
+
+The state x = (q, delta, qd, delta_d) moves as `motion` has it, under the torque that was applied and under unknown
+white forces: torque of density ``torque_noise`` at the joints, ``modal_force_noise`` on the modes. Measured are the
+joint positions and the modal amplitudes, y = C x = (q, delta) + v, each sample; joint velocities are not needed.
+With P the covariance of the error,
+
+.. math::
+    x^- &= x + \Gamma f(x, u), & P^- &= \Phi P\Phi^T + Q, \\
+    S &= C P^- C^T + R, & K &= P^- C^T S^{-1}, \\
+    x &= x^- + K\nu, \quad \nu = y - C x^-, & P &= (I - KC)P^-(I - KC)^T + K R K^T
+
+(Joseph's form: positive whatever the rounding). R has the encoders' variance and, for the amplitudes, the gauges'
+noise through the strain map: :math:`R_\delta = W\,\mathrm{diag}(\sigma_i^2)\,W^T` with W its weighted inverse and
+the strain's gain in it. An encoder of N counts rounds to steps of :math:`2\pi/N`: variance step^2/12, as if white,
+which it is while the joint moves more than a step per sample and is not at rest.
+
+Lost samples only make the step longer; P grows as it should, the torque is taken as constant over the gap.
+The normalised innovation squared :math:`\nu^T S^{-1}\nu` is chi-squared of n + m degrees of freedom if all is as
+assumed. `consistent` turns False when over a tenth of the last fifty or so exceed the 99.9 % bound: then noise
+levels are set too low, or the model is not this arm's.
+
+The recursion of P does not depend on what is measured: once it has settled, at one time step in one configuration,
+gain and covariance are kept until either changes.
+"""
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.stats import chi2
+
+from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.strain_map import StrainMap
+
+from .base import Observer
+from .motion import Motion
+
+NOISE = (
+    Parameter(
+        "strain_noise",
+        "float",
+        0.0,
+        "Noise of every gauge, rms; 0: each as in the arm file, 1e-6 where it states none.",
+        unit="strain",
+        low=0.0,
+        high=1e-2,
+    ),
+    Parameter(
+        "position_noise",
+        "float",
+        0.0,
+        "Noise of the joint positions, rms; 0: that of the arm file's encoder_counts, 1e-5 rad where there are none.",
+        unit="rad",
+        low=0.0,
+        high=1.0,
+    ),
+    Parameter(
+        "amplitude_noise",
+        "float",
+        1e-5,
+        "Noise of the modal amplitudes, rms, of an arm whose file has no gauges.",
+        unit="m, rad",
+        low=1e-12,
+        high=1.0,
+    ),
+    Parameter(
+        "torque_noise",
+        "float_array",
+        [0.05],
+        "Unknown torque at each joint: root of the spectral density; an error of rms s that lasts t: s sqrt(2 t).",
+        unit="N m s^0.5",
+        low=1e-9,
+        high=1e6,
+        length="joints",
+    ),
+    Parameter(
+        "modal_force_noise",
+        "float",
+        0.01,
+        "Unknown force on every mode: root of the spectral density.",
+        unit="N s^0.5, N m s^0.5",
+        low=0.0,
+        high=1e6,
+    ),
+)
+
+#: Where neither arm file nor parameter states a noise: a good bridge's [strain], a fine encoder's [rad].
+UNSTATED_STRAIN, UNSTATED_POSITION = 1e-6, 1e-5
+
+
+class Kalman(Observer):
+    """Kalman filter; see the module.
+
+    Attributes
+    ----------
+    state : ndarray, shape (N,)
+        (q, delta, qd, delta_d).
+    covariance : ndarray, shape (N, N)
+        Of the error of `state`.
+    measurement_covariance : ndarray, shape (n + m, n + m)
+        R.
+    """
+
+    PARAMETERS = NOISE
+    NAME = "kalman"
+
+    #: Deviation of the first sample's rates from zero [rad/s, m/s].
+    START = 1.0
+    #: The estimate has converged once no rate's variance falls by more than this share per sample.
+    SETTLED = 0.1
+    #: P has settled once no variance changes by more than this share per sample.
+    STEADY = 1e-9
+    #: Innovations beyond this quantile are counted; over `TOO_MANY` of the recent ones (1/RECENT): inconsistent.
+    QUANTILE, TOO_MANY, RECENT = 0.999, 0.1, 0.02
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        n, m = model.n_joints, model.n_modes
+        self._n, self._p = n, n + m
+        self.innovation = np.zeros(m)
+        self.covariance_diagonal = np.zeros(2 * m)
+        self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
+        self.measurement_covariance = measurement_covariance(model, self.parameters)
+        self.density = np.concatenate(
+            [
+                np.square(np.asarray(self.parameters["torque_noise"], float)),
+                np.full(m, self.parameters["modal_force_noise"] ** 2),
+            ]
+        )
+        self._bound = float(chi2.ppf(self.QUANTILE, self._p))
+        self._measured = np.zeros(self._p)
+        self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
+        self._forget_gain()
+        self._beyond = 0.0
+        self._prepare()
+
+    def _prepare(self):
+        self.motion = Motion(self.model, self.density)
+
+    def reset(self):
+        super().reset()
+        self.consistent, self._beyond = True, 0.0
+        self._forget_gain()
+
+    def resume(self, other):
+        if not isinstance(other, Kalman) or other.state.size < self.state.size:
+            self.reset()  # nothing known of the joints: the next sample is the first
+            return
+        super().resume(other)
+        size = self.state.size
+        self.state[:] = other.state[:size]
+        self.covariance[:] = other.covariance[:size, :size]
+        self._forget_gain()
+        self._publish()
+
+    def update(self, sample, dt):
+        measured = self._measured
+        measured[: self._n], measured[self._n :] = sample.position, sample.amplitude
+        if self._elapsed < 0.0:
+            self._start(sample)
+            return
+        if not np.isfinite(sample.torque).all():
+            raise MessageError(
+                f"joint_torque is unknown (NaN), and observer.type {self.NAME} predicts with it:"
+                " have the driver report the applied torque, or use filtered_derivative"
+            )
+        before = np.diagonal(self.covariance)[self._p : 2 * self._p].copy()
+        x, step = self._predict(sample.torque, dt)
+        # Nothing is assigned before all is computed: a failure leaves no trace.
+        innovation = measured - x[: self._p]
+        if step is not self._step or not self._steady:
+            self._recursion(step)
+        weighted = dpotrs(self._root, innovation, lower=1)[0]
+        self.state[:] = x + innovation @ self._gain_transposed
+        self.innovation_squared = float(innovation @ weighted)
+        self.innovation[:] = innovation[self._n :]
+        self._judge()
+        self._publish()
+        self._elapsed += dt
+        if not self.converged:
+            after = np.diagonal(self.covariance)[self._p : 2 * self._p]
+            self.converged = bool(np.all(after >= (1.0 - self.SETTLED) * before))
+
+    def _start(self, sample):
+        p = self._p
+        self.state[:p], self.state[p:] = self._measured, 0.0
+        self.state[p : p + self._n] = sample.velocity
+        self.covariance[:] = 0.0
+        self.covariance[:p, :p] = self.measurement_covariance
+        np.fill_diagonal(self.covariance[p:, p:], self.START**2)
+        self.innovation[:], self.innovation_squared = 0.0, float("nan")
+        self._elapsed = 0.0
+        self._publish()
+
+    def _predict(self, torque, dt):
+        """The predicted state, and the step that the covariance makes."""
+        step = self.motion.step_for(dt, self.state[: self._n])
+        return self.motion.advance(self.state, torque, dt, step), step
+
+    def _recursion(self, step):
+        """Covariance after a step and a measurement, and the gain."""
+        p, R = self._p, self.measurement_covariance
+        P = step.Phi @ self.covariance @ step.Phi.T
+        P += step.Q
+        seen = P[:p]
+        root, failed = dpotrf(seen[:, :p] + R, lower=1)
+        if failed:
+            raise MessageError(
+                "the covariance of the innovation is not positive definite: the time step is too long for this"
+                " arm's model, or a noise level is too small"
+            )
+        gain = dpotrs(root, seen, lower=1)[0]  # K^T
+        P = P - gain.T @ seen
+        P -= (P[:, :p] - gain.T @ R) @ gain
+        P = 0.5 * (P + P.T)
+        variance, last = np.diagonal(P), np.diagonal(self.covariance)
+        same = np.all(np.abs(variance - last) <= self.STEADY * variance)
+        self._steady = bool(same) and step is self._step
+        self._step, self._root, self._gain_transposed = step, root, gain
+        self.covariance[:] = P
+
+    def _forget_gain(self):
+        self._step, self._steady, self._root, self._gain_transposed = None, False, None, None
+
+    def _judge(self):
+        self._beyond += self.RECENT * (float(self.innovation_squared > self._bound) - self._beyond)
+        self.consistent = self._beyond <= self.TOO_MANY
+
+    def _publish(self):
+        n, p, x = self._n, self._p, self.state
+        self.joint_position[:], self.amplitude[:] = x[:n], x[n:p]
+        self.joint_velocity[:], self.rate[:] = x[p : p + n], x[p + n : 2 * p]
+        m, variance = p - n, np.diagonal(self.covariance)
+        self.covariance_diagonal[:m] = variance[n:p]
+        self.covariance_diagonal[m:] = variance[p + n : 2 * p]
+
+
+def measurement_covariance(model, parameters):
+    """R of joint positions and modal amplitudes, shape (n + m, n + m) [rad^2, m^2].
+
+    Parameters
+    ----------
+    model : ArmModel
+    parameters : mapping
+        ``strain_noise``, ``position_noise`` and ``amplitude_noise``.
+    """
+    n, m = model.n_joints, model.n_modes
+    out = np.zeros((n + m, n + m))
+    for i, joint in enumerate(model.arm.joints):
+        out[i, i] = _position_noise(joint, parameters["position_noise"]) ** 2
+    if not m:
+        return out
+    if not model.arm.gauges:
+        out[n:, n:] = parameters["amplitude_noise"] ** 2 * np.eye(m)
+        return out
+    stated = [parameters["strain_noise"] or g.noise or UNSTATED_STRAIN for g in model.arm.gauges]
+    weighted = StrainMap(model).inverse * np.array(stated)
+    out[n:, n:] = weighted @ weighted.T
+    return out
+
+
+def _position_noise(joint, stated):
+    """Rms error of a joint's position [rad]."""
+    if stated > 0.0:
+        return stated
+    if joint.encoder_counts > 0:
+        return 2.0 * np.pi / joint.encoder_counts / np.sqrt(12.0)
+    return UNSTATED_POSITION
