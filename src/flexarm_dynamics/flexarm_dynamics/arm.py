@@ -101,8 +101,9 @@ class Payload:
 class Gauge:
     """A strain gauge, or the bridge it stands for.
 
-    The strain read is ``gain * (-c y''(eta)) + bias + noise`` for bending along y or z, with the curvature
-    ``y''`` at `position` and `surface_distance` c; for twist it is ``gain * c theta'(eta)``.
+    The strain read is ``gain * (-c y''(eta)) + bias + drift + noise`` for bending along y or z, with the
+    curvature ``y''`` at `position` and `surface_distance` c, and ``gain * c theta'(eta) + ...`` for twist; it is
+    rounded to the bridge's steps and ends at the ends of its range.
     """
 
     name: str
@@ -113,6 +114,24 @@ class Gauge:
     gain: float = 1.0  # [-]
     bias: float = 0.0  # [-] strain
     noise: float = 0.0  # [-] rms strain
+    bits: int = 0  # [-] of the bridge's converter over full scale; 0: not quantised
+    full_scale: float = 1000e-6  # [-] strain, the range's end on either side
+    drift: float = 0.0  # [1/sqrt(s)] strain: rms change of the bias over a second, a random walk
+
+    @property
+    def step(self):
+        """Strain of one count of the converter [-]; 0 without one."""
+        return 2.0 * self.full_scale / 2**self.bits if self.bits else 0.0
+
+    @property
+    def range(self):
+        """Least and greatest reading [-]; a converter's counts end one short of +full_scale."""
+        return -self.full_scale, self.full_scale - self.step
+
+    @property
+    def uncertainty(self):
+        """Rms error of one reading [-]: its noise, and rounding's step / sqrt(12)."""
+        return float(np.hypot(self.noise, self.step / np.sqrt(12.0)))
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,10 @@ from .units import SI_UNIT, to_si
 
 #: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
 LARGEST = 1e30
+#: No bridge converts to more.
+MOST_BITS = 32
+#: No arm strains by more [-].
+MOST_STRAIN = 0.1
 
 
 def _read_yaml(text, where):
@@ -405,9 +409,23 @@ def _gauge(s, links):
         gain=s.number("gain", "none", 1.0),
         bias=s.number("bias", "none", 0.0),
         noise=s.number("noise", "none", 0.0, low=0.0),
+        bits=s.integer("bits", 0, low=0, high=MOST_BITS),
+        full_scale=s.number("full_scale", "none", Gauge.full_scale, positive=True),
+        drift=s.number("drift", "none", 0.0, low=0.0),
     )
     if gauge.gain == 0.0:
         raise ArmFileError(s.at("gain"), "0: such a gauge sees nothing")
+    if gauge.full_scale > MOST_STRAIN:
+        raise ArmFileError(
+            s.at("full_scale"),
+            f"{gauge.full_scale:g} strain is more than {MOST_STRAIN}: in microstrain?",
+        )
+    for key in ("bias", "noise"):
+        if not abs(getattr(gauge, key)) < gauge.full_scale:
+            raise ArmFileError(
+                s.at(key),
+                f"{getattr(gauge, key):g} is not within full_scale, {gauge.full_scale:g} strain: in microstrain?",
+            )
     s.done()
     return gauge
 

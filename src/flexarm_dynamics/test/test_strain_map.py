@@ -7,9 +7,9 @@ import pytest
 
 from flexarm_dynamics import arm_file, beam
 from flexarm_dynamics.arm import Gauge
-from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.strain_map import StrainMap, confused, gauge_rows
 
 LENGTH, DISTANCE = 1.2192, 2.0e-3
 
@@ -217,3 +217,85 @@ def test_a_gauge_where_the_mode_has_no_curvature_is_refused():
 def test_shipped_gauges_are_well_placed(shipped):
     for name in ("R", "P3", "one_link"):
         assert StrainMap(shipped(name)).condition < 10.0
+
+
+# --------------------------------------------------------------------------- lost gauges, bias, noise
+
+
+def test_the_map_without_a_gauge_is_the_map_of_the_others():
+    gauges = [
+        replace(g, noise=n, bias=2e-5) for g, n in zip(GAUGES, (1e-6, 2e-6, 3e-6), strict=True)
+    ]
+    whole = StrainMap(model_with(gauges))
+    reading = np.array([1e-4, -5e-5, 7e-5])
+    for lost in range(3):
+        rest = StrainMap(model_with(gauges[:lost] + gauges[lost + 1 :]))
+        expected = rest.amplitudes(np.delete(reading, lost))
+        broken = reading.copy()
+        broken[lost] = np.nan
+        assert whole.possible_without((lost,))
+        np.testing.assert_allclose(whole.amplitudes_without((lost,), broken), expected, rtol=1e-11)
+    np.testing.assert_array_equal(whole.amplitudes_without((), reading), whole.amplitudes(reading))
+
+
+def test_without_too_many_there_is_no_map_and_the_modes_are_named():
+    whole = StrainMap(model_with(GAUGES))
+    assert not whole.possible_without((0, 2))
+    assert whole.unobservable_without((0, 2)) == ("link1_y_mode1", "link1_y_mode2")
+    assert whole.unobservable_without((0,)) == ()
+
+
+def test_a_new_bias_is_the_maps_from_then_on():
+    whole, fresh = StrainMap(model_with(GAUGES)), [1e-5, -2e-5, 3e-5]
+    told = StrainMap(model_with([replace(g, bias=b) for g, b in zip(GAUGES, fresh, strict=True)]))
+    reading = np.array([1e-4, -5e-5, 7e-5])
+    whole.bias = fresh
+    np.testing.assert_array_equal(whole.amplitudes(reading), told.amplitudes(reading))
+    np.testing.assert_array_equal(
+        whole.amplitudes_without((1,), reading), told.amplitudes_without((1,), reading)
+    )
+    with pytest.raises(ShapeError, match=r"\(2,\), wanted \(3,\)"):
+        whole.bias = [0.0, 0.0]
+
+
+def test_the_noise_of_each_amplitude_is_what_repeated_readings_scatter_by():
+    gauges = [replace(g, noise=n) for g, n in zip(GAUGES, (1e-6, 4e-6, 2e-6), strict=True)]
+    strain_map = StrainMap(model_with(gauges))
+    noise = np.array([1e-6, 4e-6, 2e-6]) * np.random.default_rng(0).standard_normal((20_000, 3))
+    scatter = np.std([strain_map.amplitudes(n) for n in noise], axis=0)
+    np.testing.assert_allclose(strain_map.amplitude_noise, scatter, rtol=0.02)
+    # and by (R^T W R)^-1
+    R, W = strain_map.rows, np.diag(strain_map.noise**-2.0)
+    np.testing.assert_allclose(
+        strain_map.amplitude_noise, np.sqrt(np.diag(np.linalg.inv(R.T @ W @ R))), rtol=1e-10
+    )
+    assert np.isnan(StrainMap(model_with(GAUGES)).amplitude_noise).all()
+
+
+def test_rounding_counts_as_noise_of_a_step_over_the_root_of_twelve():
+    g = replace(GAUGES[0], bits=10, full_scale=1e-3)
+    step = 2e-3 / 1024
+    assert g.step == step and g.range == (-1e-3, 1e-3 - step)
+    np.testing.assert_allclose(g.uncertainty, step / np.sqrt(12.0))
+    np.testing.assert_allclose(
+        StrainMap(model_with([g, replace(GAUGES[1], noise=3e-6), GAUGES[2]])).noise,
+        [step / np.sqrt(12.0), 3e-6, step / np.sqrt(12.0)],
+    )
+
+
+def test_modes_that_cannot_be_told_apart_are_named():
+    names = ("a", "b", "c")
+    rows = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 5.0], [3.0, 6.0, 1.0]])
+    assert confused(rows, names) == ((), ("a", "b"))
+    assert confused(np.array([[1.0, 0.0], [2.0, 0.0]]), names[:2]) == (("b",), ())
+    assert confused(np.array([[1.0, 2.0]]), names[:2]) == ((), ("a", "b"))
+    assert confused(np.array([[1.0, 2.0], [1.0, 3.0]]), names[:2]) == ((), ())
+    assert confused(np.zeros((2, 2)), names[:2]) == (("a", "b"), ())
+
+
+def test_an_arm_with_a_laboratorys_gauges_may_lose_any_two(shipped):
+    strain_map = StrainMap(shipped("R_lab"))
+    for i in range(4):
+        for j in range(i):
+            assert strain_map.possible_without((j, i))
+    assert not strain_map.possible_without((0, 1, 2))

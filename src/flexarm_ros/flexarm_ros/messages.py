@@ -276,8 +276,8 @@ class ObserverStateWriter:
         self.message = msg = ObserverState()
         msg.mode_names, msg.gauge_names = list(arm.observed_modes), list(arm.gauge_names)
 
-    def fill(self, sample, name, observer, strain):
-        """Copy what the observer holds."""
+    def fill(self, sample, name, observer, strain, health=None):
+        """Copy what the observer holds; without `health` (gauges,), a gauge is good that is finite."""
         msg = self.message
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
@@ -285,12 +285,14 @@ class ObserverStateWriter:
         msg.innovation = array("d", observer.innovation)
         msg.covariance_diagonal = array("d", observer.covariance_diagonal)
         if strain is None:
-            health = [ObserverState.GAUGE_MISSING] * len(msg.gauge_names)
+            judged = [ObserverState.GAUGE_MISSING] * len(msg.gauge_names)
+        elif health is not None:
+            judged = health
         else:
-            health = [
+            judged = [
                 ObserverState.GAUGE_GOOD if ok else ObserverState.GAUGE_MISSING
                 for ok in np.isfinite(strain)
             ]
-        msg.gauge_health = array("B", health)
+        msg.gauge_health = array("B", judged)
         msg.converged = observer.converged
         return msg

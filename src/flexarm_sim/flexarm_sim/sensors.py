@@ -1,4 +1,13 @@
-"""What the simulator measures: encoder and strain gauges."""
+r"""What the simulator measures: encoder and strain gauges.
+
+A gauge reads, for the plant's amplitudes :math:`\delta`,
+
+.. math:: \varepsilon = g\,R\,\delta + b + w + n
+
+with the drift w, a random walk whose change over a sample of length h has the variance ``drift**2 h``, and the
+white noise n. The bridge rounds this to its counts and ends at the ends of its range: those two are always
+there where the arm file states them, noise and drift when they are asked for.
+"""
 
 import numpy as np
 
@@ -13,26 +22,37 @@ class Sensors:
     model : ArmModel
         The plant's model: gauges see all of its modes.
     noise : bool
-        Whether gauges have the noise that the arm file states.
+        Whether gauges have the noise and drift that the arm file states.
     seed : int
-        Of the noise.
+        Of the noise and drift.
+    period : float
+        Time between two readings, over which the bias drifts [s].
     """
 
-    def __init__(self, model, noise=False, seed=0):
+    def __init__(self, model, noise=False, seed=0, period=0.0):
         arm = model.arm
         self.rows = gauge_rows(model, arm.gauges) * np.array(
             [[g.gain] for g in arm.gauges] or [[1.0]]
         )
         self.bias = np.array([g.bias for g in arm.gauges])
         self.sigma = np.array([g.noise if noise else 0.0 for g in arm.gauges])
+        #: Rms change of the bias from one reading to the next, shape (gauges,) [-].
+        self.walk = np.array([g.drift if noise else 0.0 for g in arm.gauges]) * np.sqrt(period)
+        self._low, self._high = np.array([g.range for g in arm.gauges]).reshape(-1, 2).T
+        self._count = np.array([g.step for g in arm.gauges])  # [-] strain per count
+        self._counted = self._count > 0.0
         counts = np.array([j.encoder_counts for j in arm.joints], float)
         self._step = np.where(counts > 0, 2.0 * np.pi / np.where(counts > 0, counts, 1.0), 0.0)
         self._seed = seed
         self.reset()
 
     def reset(self):
-        """Start the noise again."""
+        """Start the noise again; the drift from zero."""
         self._random = np.random.default_rng(self._seed)
+        # A stream of its own: an arm file without drift has the same noise as one with it.
+        self._walk_random = np.random.default_rng([self._seed, 1])
+        self.drift = np.zeros_like(self.bias)
+        self._first = True
 
     def position(self, q, out):
         """Encoder reading of joint angles, rounded to counts where the arm file states them [rad]."""
@@ -43,9 +63,18 @@ class Sensors:
         return out
 
     def strain(self, delta, out):
-        """Gauge readings [strain]."""
+        """Gauge readings [strain], one period after the last ones."""
         np.dot(self.rows, delta, out=out)
         out += self.bias
+        if self.walk.any():
+            if not self._first:
+                self.drift += self.walk * self._walk_random.standard_normal(out.size)
+            self._first = False
+            out += self.drift
         if self.sigma.any():
             out += self.sigma * self._random.standard_normal(out.size)
-        return out
+        if self._counted.any():
+            c = self._counted
+            out[c] = self._count[c] * np.round(out[c] / self._count[c])
+        np.maximum(out, self._low, out=out)
+        return np.minimum(out, self._high, out=out)

@@ -68,7 +68,11 @@ PARAMETERS = (
         length="joints",
     ),
     Parameter(
-        "noise", "bool", False, "Whether gauges have the noise of the arm file.", read_only=True
+        "noise",
+        "bool",
+        False,
+        "Whether gauges have the noise and drift of the arm file.",
+        read_only=True,
     ),
     Parameter("seed", "int", 0, "Seed of the noise.", low=0, high=2**31 - 1, read_only=True),
     Parameter(
@@ -126,7 +130,9 @@ class Simulator:
         self.plant_model = model.build(plant_arm)
         self.period_ns = round(1e9 / settings["rate"])
         self.plant = Plant(self.plant_model, 1e-9 * self.period_ns, settings["integrator"])
-        self.sensors = Sensors(self.plant_model, settings["noise"], settings["seed"])
+        self.sensors = Sensors(
+            self.plant_model, settings["noise"], settings["seed"], 1e-9 * self.period_ns
+        )
         self.strain_map = StrainMap(self.nominal) if arm.gauges else None
         n, m = len(arm.joints), len(arm.observed_modes)
         self.position, self.velocity = np.zeros(n), np.zeros(n)
@@ -177,12 +183,6 @@ class Simulator:
         self.stamp_ns += self.period_ns
         self._measure()
 
-    def _measure(self):
-        plant = self.plant
-        self.sensors.position(plant.q, self.position)
-        self.velocity[:] = plant.qd
-        self.sensors.strain(plant.delta, self.strain)
-        if self.strain_map is not None:
     def _advance(self, torque, share):
         """A share of a period under one torque, which counts into the mean."""
         if torque is None:
@@ -191,6 +191,12 @@ class Simulator:
             self.plant.advance(torque, share)
             self.torque += share * np.asarray(torque)
 
+    def _measure(self):
+        plant = self.plant
+        self.sensors.position(plant.q, self.position)
+        self.velocity[:] = plant.qd
+        self.sensors.strain(plant.delta, self.strain)
+        if self.strain_map is not None:
             self.strain_map.amplitudes(self.strain, self.amplitude)
         self.rate[:] = plant.delta_d[self._observed]
 

@@ -91,3 +91,66 @@ def test_a_quiet_gauge_beside_a_noisy_one_stays_quiet(arm_r):
 def test_an_arm_without_gauges_reads_none(arm_r):
     s = Sensors(model.build(replace(arm_r.arm, gauges=())), True)
     assert s.strain(np.zeros(2), np.zeros(0)).size == 0
+
+
+# --------------------------------------------------------------------------- bridge and drift
+
+
+def test_a_bridge_rounds_to_its_counts_with_noise_or_without(arm_r):
+    """12 bits over 2000 microstrain: 0.48828125 microstrain each."""
+    count = 0.48828125e-6
+    for noise in (False, True):
+        s = sensors(arm_r, noise, sigma=1e-6, bits=12, full_scale=1e-3)
+        plain = sensors(arm_r, noise, sigma=1e-6)
+        for k in range(200):
+            delta = np.array([2e-5 * k, -1e-6 * k])
+            read, exact = strains(s, delta)[0], strains(plain, delta)[0]
+            assert_allclose(read / count, np.round(read / count), atol=1e-9)
+            assert np.abs(read - exact).max() <= 0.5 * count * (1.0 + 1e-9)
+    assert np.abs(read - exact).max() > 0.0
+
+
+def test_a_gauge_ends_at_the_ends_of_its_range(arm_r):
+    s = sensors(arm_r, full_scale=2e-4)
+    bent = np.array([0.1, 0.0])
+    exact = strains(sensors(arm_r, full_scale=0.1), bent)[0]
+    assert exact[0] < -2e-4 and abs(exact[0]) > 5e-4
+    assert_array_equal(strains(s, bent)[0], np.clip(exact, -2e-4, 2e-4))
+    assert strains(s, -bent)[0, 0] == 2e-4
+    # a converter has one count less on the plus side
+    s = sensors(arm_r, full_scale=2e-4, bits=4)
+    assert_allclose([strains(s, d)[0, 0] for d in (bent, -bent)], [-2e-4, 2e-4 - 4e-4 / 16])
+
+
+def test_a_range_that_is_not_stated_is_a_thousand_microstrain(arm_r):
+    assert strains(sensors(arm_r), [-1.0, 0.0])[0, 0] == 1e-3
+
+
+def drifting(arm, drift, period=1e-3, seed=0, noise=True):
+    gauges = tuple(replace(g, drift=drift) for g in arm.arm.gauges)
+    return Sensors(model.build(replace(arm.arm, gauges=gauges)), noise, seed, period)
+
+
+def test_the_bias_walks_by_drift_times_the_root_of_time(arm_r):
+    """From 300 walks of 100 samples: the variance grows in proportion, steps are independent."""
+    walks = np.array([strains(drifting(arm_r, 2e-6, 1e-2, k), count=101) for k in range(300)])
+    assert_array_equal(walks[:, 0], 0.0)
+    for k, rms in ((1, 2e-7), (25, 1e-6), (100, 2e-6)):
+        assert_allclose(walks[:, k].std(), rms, rtol=0.12)
+    steps = np.diff(walks, axis=1)
+    assert abs(np.corrcoef(steps[:, :-1].ravel(), steps[:, 1:].ravel())[0, 1]) < 0.02
+
+
+def test_drift_starts_again_with_a_reset_and_leaves_the_noise_as_it_was(arm_r):
+    s = drifting(arm_r, 1e-6)
+    first = strains(s, count=20)
+    s.reset()
+    assert_array_equal(strains(s, count=20), first)
+    assert_array_equal(strains(drifting(arm_r, 1e-6, noise=False), count=3), np.zeros((3, 2)))
+    gauges = [tuple(replace(g, drift=d, noise=1e-6) for g in arm_r.arm.gauges) for d in (0.0, 1e-6)]
+    still, walking = (
+        strains(Sensors(model.build(replace(arm_r.arm, gauges=g)), True, 4, 1e-3), count=20)
+        for g in gauges
+    )
+    walk = strains(drifting(arm_r, 1e-6, seed=4), count=20)
+    assert_allclose(walking - still, walk, atol=1e-20)

@@ -1,0 +1,387 @@
+r"""Strain gauges that fail, and their bias at rest.
+
+A reading :math:`\varepsilon_i` of gauge i is
+
+- missing when it is not finite,
+- saturated when it stands at an end of the bridge's range,
+- stuck when it has been the same to the last bit for `stuck_samples` samples in which the others of its link and
+  direction, two of them where there are two, travelled so far that it must have moved: by more than 8 of its
+  resolutions, for whichever mode strains it least beside them,
+- suspect when it does not fit the others: with more gauges than modes, the residual
+  :math:`r = \varepsilon - b - R\hat\delta` of weighted least squares has the variance
+  :math:`\sigma_i^2(1-H_{ii})`, with :math:`H = R(R^TWR)^{-1}R^TW`; the mean square of
+  :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and the one that is wrong has the largest.
+
+The first three are left out of the strain map where the others still give every observed mode; otherwise the
+sample is refused: fewer gauges than modes give no amplitudes. A suspect one is reported and kept: modes that are
+not observed make residuals too.
+
+The bias of a gauge on an arm at rest is what it reads beyond the strain of the arm's own weight,
+
+.. math:: b = \bar\varepsilon - R\,\delta_s(q) ,
+
+with the static deflection :math:`\delta_s`, joints held; its rms error is that of one reading over
+:math:`\sqrt N`.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.parameters import Parameter
+
+#: As in flexarm_msgs/ObserverState.
+GOOD, MISSING, STUCK, SATURATED, SUSPECT = range(5)
+WORDS = ("good", "missing", "stuck", "saturated", "suspect")
+
+PARAMETERS = (
+    Parameter(
+        "calibration_samples",
+        "int",
+        200,
+        "Samples at rest of which ~/calibrate_gauges takes the mean.",
+        low=2,
+        high=100_000,
+        read_only=True,
+    ),
+    Parameter(
+        "stuck_samples",
+        "int",
+        50,
+        "A gauge that reads the same for so many samples while the others move is stuck; one that was bad is"
+        " taken back after as many good ones.",
+        low=2,
+        high=100_000,
+        read_only=True,
+    ),
+)
+
+
+def resolution(gauges):
+    """Least strain that each reading can be trusted to tell, shape (gauges,) [strain].
+
+    Its noise and rounding; a thousandth of full scale where the arm file states neither.
+    """
+    return np.array([g.uncertainty or 1e-3 * g.full_scale for g in gauges])
+
+
+def least_travel(rows, gauges):
+    """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
+
+    Zero for gauges of different links or directions, and for a gauge beside itself.
+    """
+    count = len(gauges)
+    least = np.zeros((count, count))
+    for i, a in enumerate(gauges):
+        for j, b in enumerate(gauges):
+            if i == j or (a.link, a.direction) != (b.link, b.direction):
+                continue
+            strains = np.abs(rows[j]) > 1e-9 * np.abs(rows[j]).max(initial=0.0)
+            if strains.any():
+                least[i, j] = (np.abs(rows[i, strains]) / np.abs(rows[j, strains])).min()
+    return least
+
+
+class GaugeHealth:
+    """Judges the gauges sample by sample, and maps the strains of those that can be trusted.
+
+    Parameters
+    ----------
+    model : ArmModel
+    strain_map : StrainMap
+        Of the same model.
+    stuck_samples : int
+        See `PARAMETERS`.
+
+    Attributes
+    ----------
+    health : ndarray of uint8, shape (gauges,)
+        `GOOD`, `MISSING`, `STUCK`, `SATURATED` or `SUSPECT`.
+    lost : tuple of int
+        Gauges left out of the last amplitudes; indices, ascending.
+    """
+
+    #: Resolutions by which a gauge must have moved to be called stuck; noise of n samples spans about as many.
+    TRAVEL = 8.0
+    #: Rms residual, in its own standard deviations, beyond which a gauge is suspect.
+    RESIDUAL = 6.0
+
+    def __init__(self, model, strain_map, stuck_samples=50):
+        gauges = model.arm.gauges
+        self.strain_map, self.stuck_samples = strain_map, stuck_samples
+        self.names = model.arm.gauge_names
+        self._low, self._high = np.array([g.range for g in gauges]).reshape(-1, 2).T
+        self._resolution = resolution(gauges)
+        self._least = least_travel(strain_map.rows, gauges)
+        places = [(g.link, g.direction) for g in gauges]
+        # One other gauge that jumps is broken itself; two have seen the arm move.
+        self._witnesses = np.clip((self._least > 0.0).sum(axis=1), 1, min(2, len(gauges)))
+        self._mates = np.array([[a == b for b in places] for a in places])
+        free = 1.0 - np.einsum("ij,ji->i", strain_map.rows, strain_map.inverse)
+        redundant = free > 1e-6
+        # A residual's mean square is one; a gauge that no other one checks has none.
+        self._weight = np.where(
+            redundant, 1.0 / (self._resolution**2 * np.maximum(free, 1e-6)), 0.0
+        )
+        self._redundant = bool(redundant.any())
+        count = len(gauges)
+        self.health = np.zeros(count, np.uint8)
+        self._mapped = np.zeros(len(strain_map.mode_names))
+        self._last, self._same = np.zeros(count), np.zeros(count, int)
+        self._hold = np.zeros(count, int)
+        self._least_seen, self._most_seen = np.zeros((2, count, count))
+        self._square = np.zeros(count)
+        self.reset()
+
+    def reset(self):
+        """Forget the past: a new session of the source."""
+        self.health[:] = GOOD
+        self.lost = ()
+        self._last[:] = np.nan
+        self._same[:] = 0
+        self._hold[:], self._holding = 0, False
+        self._least_seen[:], self._most_seen[:] = np.nan, np.nan
+        self._square[:] = 0.0
+
+    def update(self, strain):
+        """Judge the readings, shape (gauges,), of a new sample; the control path."""
+        self.health[:] = GOOD
+        outside = ~((strain > self._low) & (strain < self._high))  # NaN too
+        self.health[self._stuck(strain, outside)] = STUCK
+        if outside.any():
+            self.health[outside] = SATURATED
+            self.health[~np.isfinite(strain)] = MISSING
+        if self._holding or self.health.any():
+            self._hold -= 1
+            np.maximum(self._hold, 0, out=self._hold)
+            self._hold[self.health != GOOD] = self.stuck_samples
+            self._holding = bool(self._hold.any())
+        if self._redundant and not self._holding:
+            self._judge_residual(strain)
+
+    def _stuck(self, strain, bad):
+        moved = strain != self._last
+        self._last[:] = strain
+        if moved.all():
+            self._same[:] = 0
+            self._most_seen[:] = self._least_seen[:] = np.where(bad, np.nan, strain)
+            return []
+        self._same += 1
+        self._same[moved] = 0
+        # How far every gauge has travelled since gauge i last moved.
+        seen = np.where(bad, np.nan, strain)
+        self._most_seen[moved] = seen
+        self._least_seen[moved] = seen
+        np.fmax(self._most_seen, seen, out=self._most_seen)
+        np.fmin(self._least_seen, seen, out=self._least_seen)
+        still = self._same >= self.stuck_samples
+        if not still.any():
+            return []
+        travel = self._most_seen - self._least_seen - self.TRAVEL * self._resolution
+        travel = np.sort(np.nan_to_num(self._least * travel), axis=1)
+        travel = travel[np.arange(travel.shape[0]), -self._witnesses]
+        return still & (travel > self.TRAVEL * self._resolution)
+
+    def _judge_residual(self, strain):
+        strain_map = self.strain_map
+        residual = strain - strain_map.bias
+        residual -= strain_map.rows @ strain_map.amplitudes(strain, self._mapped)
+        self._square += (residual**2 * self._weight - self._square) / self.stuck_samples
+        if not (self._square > self.RESIDUAL**2).any():
+            return
+        # A wrong gauge spoils the others' residuals too: the largest of its link and direction is named.
+        largest = np.where(self._mates, self._square, 0.0).max(axis=1)
+        suspect = (self._square > self.RESIDUAL**2) & (self._square > 0.99 * largest)
+        self.health[suspect] = SUSPECT
+
+    def amplitudes(self, strain, out=None):
+        """Modal amplitudes from the gauges that can be trusted, shape (modes,) [m, rad].
+
+        Raises
+        ------
+        MessageError
+            When these don't give all observed modes; names gauges and modes.
+        """
+        self.lost = ()
+        if self._holding:
+            self.lost = self._left_out(strain)
+        return self.strain_map.amplitudes_without(self.lost, strain, out)
+
+    def _left_out(self, strain):
+        # One that was bad comes back after a while, so that a loose wire does not switch maps at each contact.
+        held = tuple(np.flatnonzero(self._hold).tolist())
+        if self.strain_map.possible_without(held):
+            return held
+        bad = tuple(np.flatnonzero(self._bad()).tolist())
+        if self.strain_map.possible_without(bad):
+            return bad
+        what = ", ".join(
+            f"strain of {self.names[i]} is {strain[i]} ({WORDS[self.health[i]]})" for i in bad
+        )
+        modes = ", ".join(self.strain_map.unobservable_without(bad))
+        left = ", ".join(n for i, n in enumerate(self.names) if i not in bad)
+        raise MessageError(f"{what}: without, the gauges ({left or 'none'}) can't give {modes}")
+
+    def _bad(self):
+        return (self.health != GOOD) & (self.health != SUSPECT)
+
+    def warnings(self):
+        """One sentence on every gauge that is not good; empty when all are."""
+        found = []
+        for i, name in enumerate(self.names):
+            state = self.health[i]
+            if state == SUSPECT:
+                found.append(
+                    f"gauge {name} does not fit the others ({np.sqrt(self._square[i]):.0f} times its noise):"
+                    " calibrate, check its gain, or the arm bends in modes that are not observed"
+                )
+            elif state != GOOD:
+                left_out = ", left out" if i in self.lost else ""
+                found.append(f"gauge {name} is {WORDS[state]}{left_out}")
+            elif i in self.lost:
+                found.append(f"gauge {name} was bad, left out")
+        return found
+
+
+class BiasCalibration:
+    """Bias of the gauges from the last samples, on an arm at rest.
+
+    Parameters
+    ----------
+    model : ArmModel
+    strain_map : StrainMap
+        Whose bias is to be found; `rows` and gauge names are its.
+    samples : int
+        How many the mean is taken of.
+    """
+
+    #: Mean joint speed [rad/s], and span of the joint angle beyond two encoder counts [rad], of an arm at rest.
+    REST_SPEED, REST_ANGLE = 0.01, 2e-3
+    #: Rms strain about the mean, in resolutions, and span of a torque as a part of its limit, at rest.
+    REST_STRAIN, REST_TORQUE = 4.0, 0.05
+
+    def __init__(self, model, strain_map, samples=200):
+        arm = model.arm
+        self.model, self.strain_map, self.samples = model, strain_map, samples
+        n = len(arm.joints)
+        self._rows = np.zeros((samples, 3 * n + len(arm.gauges)))
+        split = np.cumsum([n, n, n])
+        self._position, self._velocity, self._torque, self._strain = np.split(
+            self._rows, split, axis=1
+        )
+        counts = np.array([j.encoder_counts for j in arm.joints], float)
+        step = np.where(counts > 0, 2.0 * np.pi / np.where(counts > 0, counts, 1.0), 0.0)
+        self._span = self.REST_ANGLE + 2.0 * step
+        self._resolution = resolution(arm.gauges)
+        self._ranges = np.array([g.range for g in arm.gauges]).reshape(-1, 2).T
+        self.reset()
+
+    def reset(self):
+        """Forget the samples: a new session of the source."""
+        self.count, self._next = 0, 0
+
+    def push(self, sample):
+        """Keep a sample that has strains; the control path."""
+        k = self._next
+        self._position[k], self._velocity[k] = sample.position, sample.velocity
+        self._torque[k], self._strain[k] = sample.torque, sample.strain
+        self._next = (k + 1) % self.samples
+        self.count = min(self.count + 1, self.samples)
+
+    @property
+    def last(self):
+        """The newest strains, shape (gauges,)."""
+        return self._strain[self._next - 1]
+
+    def bias(self):
+        """The new bias, shape (gauges,) [strain].
+
+        Raises
+        ------
+        MessageError
+            When there are too few samples, a gauge is bad, or the arm is not at rest; says which and by how much.
+        ModelError
+            When the arm has no static deflection here.
+        """
+        if self.count < self.samples:
+            raise MessageError(
+                f"not enough samples yet ({self.count} of {self.samples}): call again"
+            )
+        self._check_gauges()
+        self._check_rest()
+        q = self._position.mean(axis=0)
+        found = self._strain.mean(axis=0) - self.strain_map.rows @ self._static(q)
+        for name, b, high in zip(self.model.arm.gauge_names, found, self._ranges[1], strict=True):
+            if not abs(b) < high:
+                raise MessageError(
+                    f"gauge {name}: a bias of {1e6 * b:.1f} microstrain is beyond its full scale: check the"
+                    " bridge, and the payload and gravity of the arm file"
+                )
+        return found
+
+    def _static(self, q):
+        """Amplitudes of the observed modes under the arm's own weight [m, rad]."""
+        delta = self.model.static_deflection(q)
+        if not np.isfinite(delta).all():
+            raise ModelError(f"{self.model.arm.name} has no static deflection at q = {q.tolist()}")
+        names = self.model.mode_names
+        return np.array([delta[names.index(n)] for n in self.strain_map.mode_names])
+
+    def _check_gauges(self):
+        low, high = self._ranges
+        for i, name in enumerate(self.model.arm.gauge_names):
+            values = self._strain[:, i]
+            if not np.isfinite(values).all():
+                raise MessageError(
+                    f"gauge {name} is missing: nothing to calibrate; check its wires"
+                )
+            if values.min() <= low[i] or values.max() >= high[i]:
+                raise MessageError(
+                    f"gauge {name} is saturated at {1e6 * values[-1]:.1f} microstrain: balance the bridge first"
+                )
+
+    def _check_rest(self):
+        arm = self.model.arm
+        speed = np.abs(self._velocity.mean(axis=0))
+        span = np.ptp(self._position, axis=0)
+        for joint, v, s, most in zip(arm.joints, speed, span, self._span, strict=True):
+            if not v <= self.REST_SPEED:
+                raise MessageError(
+                    f"{joint.name} moves at {v:.3g} rad/s, at most {self.REST_SPEED:g} is rest: call again at rest"
+                )
+            if not s <= most:
+                raise MessageError(
+                    f"{joint.name} moved by {s:.3g} rad, at most {most:.3g} is rest: call again at rest"
+                )
+        torque = np.ptp(self._torque, axis=0)  # NaN where the source does not know it
+        for joint, t in zip(arm.joints, torque, strict=True):
+            most = self.REST_TORQUE * joint.limits.torque
+            if t > most:
+                raise MessageError(
+                    f"the torque of {joint.name} changed by {t:.3g} N m, at most {most:.3g} is rest:"
+                    " call again at rest"
+                )
+        rms = self._strain.std(axis=0)
+        for name, r, one in zip(arm.gauge_names, rms, self._resolution, strict=True):
+            most = self.REST_STRAIN * one
+            if not r <= most:
+                raise MessageError(
+                    f"the strain of {name} varies by {1e6 * r:.3g} microstrain rms, at most {1e6 * most:.3g} is"
+                    " rest: the arm swings; call again at rest"
+                )
+
+    def error(self):
+        """Rms error of each bias by noise and rounding alone, shape (gauges,) [strain]."""
+        return self._resolution / np.sqrt(self.samples)
+
+
+def calibration_text(names, old, new, samples):
+    """What was found, in microstrain."""
+    each = ", ".join(
+        f"{n} {1e6 * b:+.2f} (was {1e6 * a:+.2f})" for n, a, b in zip(names, old, new, strict=True)
+    )
+    return f"bias [microstrain]: {each}; mean of {samples} samples"
+
+
+def calibration_yaml(names, bias):
+    """What to put into the arm file's gauges; one line each."""
+    return "\n".join(f"bias: {b:.4e}  # gauge {n}" for n, b in zip(names, bias, strict=True))
