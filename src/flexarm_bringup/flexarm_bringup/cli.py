@@ -119,9 +119,11 @@ def _add_arm_commands(commands):
 
     command = commands.add_parser(
         "simulate",
-        help="simulate an arm under given torques, or moved as prescribed; a CSV table",
-        description="Simulates an arm from rest, under torques over time or with its joints moved as prescribed.",
-        epilog="example: flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv",
+        help="simulate an arm under given torques, moved as prescribed, or under a controller",
+        description="Simulates an arm from rest: under torques over time, with its joints moved as prescribed, or"
+        " in a loop with an observer and a controller, of which it tells how well they did.",
+        epilog="examples: flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv;"
+        " flexarm simulate R --controller paper_composite --trajectory paper --payload-scale 2",
     )
     simulate.add_arguments(command)
     command.set_defaults(function=_simulate)

@@ -123,6 +123,8 @@ def case_study_metrics(record, model, settle=3.0, until=8.0):
 SETTLING_FLOOR = 0.05
 #: How far apart static deflections are evaluated along the motion; linear between [s].
 SAG_INTERVAL = 0.01
+#: What is called final: over the last of a record [s].
+FINAL = 0.5
 
 
 def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3):
@@ -156,6 +158,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
             at the motion's end.
         ``residual_tip_rms_mm``
             Deflection of the tip about its static value, over the window.
+        ``final_tip_error_mm``
+            The tip's greatest error over the record's last `FINAL`: large where the loop oscillates, too.
         ``settling_time_s``
             From the motion's end until the tip's error stays below the tolerance, at least `SETTLING_FLOOR`.
         ``peak_torque_Nm``, ``rms_torque_Nm``
@@ -183,6 +187,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
         found["static_sag_mm"] = 1e3 * float(np.linalg.norm(at_rest[-1] - wanted[-1]))
         found |= _tip_errors("about_sag_mm", distance)
     found["residual_tip_rms_mm"] = _residual(record, plant_model, tip, end, window)
+    last = record.time >= record.time[-1] - FINAL - 1e-9
+    found["final_tip_error_mm"] = 1e3 * float(distance[last].max())
     found["settling_time_s"] = _settling_time(record.time, distance, end, tolerance)
     found["peak_torque_Nm"] = np.abs(record.torque).max(0).tolist()
     found["rms_torque_Nm"] = _rms(record.torque, 0).tolist()

@@ -7,7 +7,6 @@ samples, to the last bit.
 
 import difflib
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import yaml
@@ -18,7 +17,7 @@ from flexarm_control.arm_controller import START_TOLERANCE, Supervisor
 from flexarm_control.arm_observer import OBSERVERS
 from flexarm_control.arm_observer import PARAMETERS as OBSERVER_PARAMETERS
 from flexarm_control.composite import FAST, MANIFOLD, SLOW
-from flexarm_control.trajectory import files, specs
+from flexarm_control.trajectory import specs
 from flexarm_dynamics import arm_file, registry
 from flexarm_dynamics.arm import scaled
 from flexarm_dynamics.errors import ParameterError, TrajectoryError
@@ -57,7 +56,8 @@ class Scenario:
     trajectory : str or dict
         A motion in a line, such as ``paper`` or ``quintic:to=1.5,duration=2`` (`trajectory.specs`); a file, .csv or
         .yaml (`trajectory.files`); or a mapping with ``times`` [s], ``positions`` [rad] and, if wanted,
-        ``velocities`` and ``accelerations``.
+        ``velocities`` and ``accelerations``. The arm starts where it does, unless `controller` has an
+        ``initial_position``.
     payload_scale, stiffness_scale, damping_scale : float
         Of the simulated arm alone, see `arm.scaled` [-].
     plant_arm : str
@@ -161,7 +161,7 @@ def _check_name(name, values):
     if name in known:
         return
     if prefix in COMPONENTS:
-        there, what = known, f" of {_type(prefix, values)!r}"
+        there, what = known, f" of {type_of(prefix, values)!r}"
     else:
         there, what = [*known, *(f"{p}.…" for p in COMPONENTS)], ""
     close = difflib.get_close_matches(name, known, 1)
@@ -169,14 +169,15 @@ def _check_name(name, values):
     raise ParameterError(f"{name}: no such parameter{what}; there are {', '.join(there)}{hint}")
 
 
-def _type(prefix, values):
+def type_of(prefix, values):
+    """Name of the component of a group: slow, fast, manifold or observer."""
     return values.get(f"{prefix}.type", COMPONENTS[prefix][1])
 
 
 def _declared(prefix, values):
     """Parameters of the chosen component of a group."""
     common = OBSERVER_PARAMETERS if prefix == "observer" else ()
-    kind = _type(prefix, values)
+    kind = type_of(prefix, values)
     if not isinstance(kind, str):
         raise ParameterError(f"{prefix}.type: {kind!r} is not a name")
     return (*common, *registry.find(COMPONENTS[prefix][0], kind).PARAMETERS)
@@ -184,7 +185,7 @@ def _declared(prefix, values):
 
 def _component(prefix, values):
     """Mapping with `type` for one component; what belongs to others of its group is left out, as by the node."""
-    given = parameter_files.under(values, prefix) | {"type": _type(prefix, values)}
+    given = parameter_files.under(values, prefix) | {"type": type_of(prefix, values)}
     own = {p.name for p in _declared(prefix, values)} | {"type"}
     if not set(given) <= own:
         everyone = registry.importable(COMPONENTS[prefix][0]).values()
@@ -213,7 +214,7 @@ def loop_of(scenario):
     simulator["plant_modes"] = scenario.plant_modes
     if scenario.rate is not None:
         simulator["rate"] = scenario.rate
-    if _type("observer", values) == "true_rates":
+    if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
     groups = {prefix: _component(prefix, values) for prefix in COMPONENTS}
     plant = scaled(
@@ -262,10 +263,17 @@ def run(scenario):
         For a scenario that can't be run: an arm, a parameter, a design or a trajectory that is refused, or an
         observer that does not converge. A loop that loses its arm is no error.
     """
+    return run_loop(scenario)[:2]
+
+
+def run_loop(scenario):
+    """As `run`, and the `ClosedLoop` in which it ran."""
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
         raise ParameterError(f"repeat {scenario.repeat}: an integer not below 1 is wanted")
     loop = loop_of(scenario)
     motion = trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
+    if "initial_position" not in scenario.controller and motion.times_ns[0] == 0:
+        loop.simulator.reset(motion.positions[0])
     back = _returning(motion, loop.simulator.position)
     end = 1e-9 * int(motion.times_ns[-1])
     duration = end + scenario.window if scenario.duration is None else scenario.duration
@@ -279,7 +287,9 @@ def run(scenario):
         record = loop.follow(_next(motion, loop) if i else motion, duration)
         passes.append(_metrics(scenario, loop, record, end, duration))
     metrics = passes[-1] | {"lost": bool(loop.lost), "reason": loop.lost}
-    return record, metrics | ({"passes": passes} if scenario.repeat > 1 else {})
+    if scenario.repeat > 1:
+        metrics["passes"] = passes
+    return record, metrics, loop
 
 
 def _check_times(scenario, duration):
@@ -332,10 +342,8 @@ def trajectory_of(given, model, start):
     ------
     TrajectoryError
     """
-    if isinstance(given, str) and Path(given).suffix.lower() in files.SUFFIXES:
-        return files.read(given, model.joint_names, *specs.limits(model))
     if isinstance(given, str):
-        return specs.from_spec(given, model, start)
+        return specs.load(given, model, start)
     names = model.joint_names
     return trajectory.validate(names, names, 0, _points(given), *specs.limits(model))
 

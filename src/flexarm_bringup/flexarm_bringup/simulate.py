@@ -1,4 +1,7 @@
-"""``flexarm simulate``: an arm under given torques, or moved as prescribed, to a table. No ROS."""
+"""``flexarm simulate``: an arm under given torques, or moved as prescribed, to a table. No ROS.
+
+With ``--controller`` the arm is in a closed loop: `run_controller`.
+"""
 
 import itertools
 import json
@@ -12,11 +15,13 @@ from flexarm_dynamics.chain import Chain
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_sim.integrators import METHODS, substeps
 
-from . import tables
+from . import run_controller, tables
 from .progress import Progress
 
 #: A table of more rows than this is a mistake in --rate or --duration.
 MOST_ROWS = 10_000_000
+#: What options are without a controller when they are not given.
+DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
 
 
 def add_arguments(parser):
@@ -37,22 +42,35 @@ def add_arguments(parser):
         metavar="q1,q2,...",
         help="joint angles at the start [rad]; the arm is straight, at rest",
     )
-    parser.add_argument("--duration", type=float, default=None, help="simulated time [s] (4)")
-    parser.add_argument("--rate", type=float, default=100.0, help="rows per second (100)")
     parser.add_argument(
-        "--step", type=float, default=0.001, help="longest step of the integrator [s] (0.001)"
+        "--duration",
+        type=float,
+        default=None,
+        help="simulated time [s] (4; with a controller the motion and the window after it)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=None,
+        help="rows per second (100); with a controller samples per second (1000)",
+    )
+    parser.add_argument(
+        "--step", type=float, default=None, help="longest step of the integrator [s] (0.001)"
     )
     parser.add_argument(
         "--method",
         choices=list(METHODS),
-        default="dop853",
+        default=None,
         help="integrator (dop853); implicit damps stiff modes",
     )
     add_model_arguments(parser)
     parser.add_argument("--out", metavar="FILE.csv", help="where to; standard output if not given")
     parser.add_argument(
-        "--json", action="store_true", help="columns and rows, or a summary with --out, as JSON"
+        "--json",
+        action="store_true",
+        help="columns and rows, or a summary with --out, as JSON; with a controller the metrics",
     )
+    run_controller.add_arguments(parser)
 
 
 def add_model_arguments(parser):
@@ -106,6 +124,13 @@ def angles(text, arm, option):
 
 def simulate(options):
     """Run the sub-command."""
+    run_controller.check_arguments(options)
+    if options.controller is not None:
+        run_controller.run_controller(options)
+        return
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
     arm = load_arm(options)
     arm_model = model.build(arm)
     kinematics = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
