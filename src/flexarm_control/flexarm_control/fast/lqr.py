@@ -13,6 +13,8 @@ are taken at one joint configuration, the trajectory's end, so that no Riccati e
 Every eigenvalue of the closed boundary layer has a real part below -alpha.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import eig
 
@@ -22,92 +24,153 @@ from flexarm_dynamics.singular_perturbation import fast_subsystem, is_stabilisab
 
 from .base import FastLaw
 
+#: Q, R and alpha of (18): the same declarations in every law that solves (20).
+WEIGHTS = (
+    Parameter(
+        "q",
+        "float_array",
+        [1.0],
+        "Diagonal of Q in (18): modal amplitudes, then modal rates.",
+        unit="1/m^2, s^2/m^2",
+        low=0.0,
+        high=1e12,
+        length="z",
+    ),
+    Parameter(
+        "r",
+        "float_array",
+        [1.0],
+        "Diagonal of R in (18).",
+        unit="1/(N m)^2",
+        low=1e-9,
+        high=1e12,
+        length="joints",
+    ),
+    Parameter(
+        "alpha",
+        "float",
+        5.0,
+        "Prescribed degree of stability: closed fast poles lie left of -alpha.",
+        unit="1/s",
+        low=0.0,
+        high=1e3,
+    ),
+)
+
+#: Where a law with one design is designed.
+CONFIGURATION = Parameter(
+    "configuration",
+    "float_array",
+    [0.0],
+    "Joint configuration of the design: the end of the trajectory.",
+    unit="rad",
+    low=-100.0,
+    high=100.0,
+    length="joints",
+)
+
+
+@dataclass(frozen=True)
+class Regulator:
+    """Boundary layer (11) in one joint configuration and its optimal gain.
+
+    Attributes
+    ----------
+    A2, B2 : ndarray, shape (2m, 2m), (2m, n)
+    V : ndarray, shape (2m, 2m)
+        Solution of (20).
+    K_f : ndarray, shape (n, 2m)
+        u_f = K_f z_f.
+    """
+
+    A2: np.ndarray
+    B2: np.ndarray
+    V: np.ndarray
+    K_f: np.ndarray
+
+
+def regulator(model, q, parameters):
+    """Solve (20) in joint configuration q; not for the control path.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q : ndarray, shape (n,)
+        [rad]
+    parameters : mapping
+        Checked values of `WEIGHTS`.
+
+    Returns
+    -------
+    Regulator
+        Without modes (a rigid arm) its arrays are empty.
+
+    Raises
+    ------
+    DesignError
+        A mode that has to be faster can't be reached, or (20) has no stabilising solution.
+    """
+    alpha = parameters["alpha"]
+    A2, B2 = fast_subsystem(model.terms(q, np.zeros(model.n_joints)))
+    if A2.size == 0:
+        return Regulator(A2, B2, A2, B2.T)
+    ok, worst = is_stabilisable(A2, B2, alpha)
+    if not ok:
+        raise DesignError(
+            f"fast.alpha: at joint configuration {q.tolist()} the torques can't reach"
+            f" {least_reached(model, A2, B2, alpha)}, which must decay faster than {alpha} 1/s (smallest"
+            f" singular value {worst:.2g}); lower fast.alpha or leave that mode out of the controller's arm file"
+        )
+    K_f, V = _solve(A2 + alpha * np.eye(A2.shape[0]), B2, q, parameters)
+    poles = np.linalg.eigvals(A2 + B2 @ K_f)
+    worst = poles.real.max()
+    if not worst < -alpha - 1e-9 * np.abs(poles).max():  # rounding may put an undamped pole there
+        raise DesignError(
+            f"fast: at joint configuration {q.tolist()} the closed boundary layer's slowest pole is at"
+            f" {worst:.4g} 1/s, not left of -alpha = {-alpha}; raise fast.q or lower fast.alpha"
+        )
+    return Regulator(A2, B2, V, K_f)
+
+
+def _solve(shifted, B2, q, parameters):
+    """K_f and V of (20) for A2 + alpha I."""
+    # Takes most of a second to import: only who designs this law waits for it.
+    import control
+
+    try:
+        gain, V, _ = control.lqr(shifted, B2, np.diag(parameters["q"]), np.diag(parameters["r"]))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(
+            f"fast: at joint configuration {q.tolist()} the Riccati equation (20) has no stabilising"
+            f" solution for q = {list(parameters['q'])}, r = {list(parameters['r'])},"
+            f" alpha = {parameters['alpha']}: {error}"
+        ) from None
+    return -np.asarray(gain), np.asarray(V)
+
+
+def least_reached(model, A2, B2, margin):
+    """Name of the modal coordinate that dominates the eigenvector B2 reaches least, right of -margin."""
+    poles, left, right = eig(A2, left=True)
+    reach = np.linalg.norm(left.conj().T @ B2, axis=1)
+    reach[poles.real < -margin - 1e-9 * np.linalg.norm(A2)] = np.inf
+    return dominant_mode(model, right[:, np.argmin(reach)])
+
+
+def dominant_mode(model, vector):
+    """Name of the modal coordinate with the largest amplitude in an eigenvector of (11)."""
+    return model.mode_names[int(np.argmax(np.abs(vector[: model.n_modes])))]
+
 
 class Lqr(FastLaw):
     """Constant gain at the final configuration; see the module."""
 
-    PARAMETERS = (
-        Parameter(
-            "q",
-            "float_array",
-            [1.0],
-            "Diagonal of Q in (18): modal amplitudes, then modal rates.",
-            unit="1/m^2, s^2/m^2",
-            low=0.0,
-            high=1e12,
-            length="z",
-        ),
-        Parameter(
-            "r",
-            "float_array",
-            [1.0],
-            "Diagonal of R in (18).",
-            unit="1/(N m)^2",
-            low=1e-9,
-            high=1e12,
-            length="joints",
-        ),
-        Parameter(
-            "alpha",
-            "float",
-            5.0,
-            "Prescribed degree of stability: closed fast poles lie left of -alpha.",
-            unit="1/s",
-            low=0.0,
-            high=1e3,
-        ),
-        Parameter(
-            "configuration",
-            "float_array",
-            [0.0],
-            "Joint configuration of the design: the end of the trajectory.",
-            unit="rad",
-            low=-100.0,
-            high=100.0,
-            length="joints",
-        ),
-    )
+    PARAMETERS = (*WEIGHTS, CONFIGURATION)
 
     def __init__(self, model, parameters):
-        # Takes most of a second to import: only who designs this law waits for it.
-        import control
-
         super().__init__(model, parameters)
-        q = np.array(self.parameters["configuration"])
-        alpha = self.parameters["alpha"]
-        self.A2, self.B2 = fast_subsystem(model.terms(q, np.zeros(model.n_joints)))
-        ok, worst = is_stabilisable(self.A2, self.B2, alpha)
-        if not ok:
-            raise DesignError(
-                f"fast.alpha: at joint configuration {q.tolist()} the torques can't reach"
-                f" {self._least_reached()}, which must decay faster than {alpha} 1/s (smallest singular"
-                f" value {worst:.2g}); lower fast.alpha or leave that mode out of the controller's arm file"
-            )
-        shifted = self.A2 + alpha * np.eye(self.A2.shape[0])
-        Q, R = np.diag(self.parameters["q"]), np.diag(self.parameters["r"])
-        try:
-            gain, self.V, _ = control.lqr(shifted, self.B2, Q, R)
-        except (np.linalg.LinAlgError, ValueError, control.ControlException) as error:
-            raise DesignError(
-                f"fast: the Riccati equation (20) has no stabilising solution for q = {np.diag(Q).tolist()},"
-                f" r = {np.diag(R).tolist()}, alpha = {alpha}: {error}"
-            ) from None
-        self._K_f = -np.asarray(gain)
-        poles = np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)
-        worst = poles.real.max()
-        if (
-            not worst < -alpha - 1e-9 * np.abs(poles).max()
-        ):  # rounding may put an undamped pole there
-            raise DesignError(
-                f"fast: the closed boundary layer's slowest pole is at {worst:.4g} 1/s, not left of"
-                f" -alpha = {-alpha}; raise fast.q or lower fast.alpha"
-            )
-
-    def _least_reached(self):
-        """Name of the modal coordinate that dominates the eigenvector B2 reaches least."""
-        _, left, right = eig(self.A2, left=True)
-        i = np.argmin(np.linalg.norm(left.conj().T @ self.B2, axis=1))
-        return self.model.mode_names[int(np.argmax(np.abs(right[: self.model.n_modes, i])))]
+        design = regulator(model, np.array(self.parameters["configuration"]), self.parameters)
+        self.A2, self.B2, self.V = design.A2, design.B2, design.V
+        self._K_f = design.K_f
 
     def torque(self, z_f, q):
         return self._K_f @ z_f

@@ -1,0 +1,207 @@
+r"""Fast control from the modal amplitudes alone: optimal gain on an observer of the boundary layer.
+
+Over a sample of length h under constant u_f the boundary layer (11), taken at one joint configuration, moves exactly by
+
+.. math:: z_{k+1} = \Phi z_k + \Gamma u_k, \qquad y_k = C z_k = \delta_k - \bar\delta_k, \qquad C = [I\;0].
+
+The law predicts over the time since the last sample and corrects by the amplitudes of this one,
+
+.. math::
+    \hat z^-_k = \Phi \hat z_{k-1} + \Gamma u_{k-1}, \qquad
+    \hat z_k = \hat z^-_k + L\,(y_k - C\hat z^-_k), \qquad u_k = K_f \hat z_k,
+
+with K_f of (19), (20), the gain of `lqr`. The rates are never looked at. With
+:math:`\rho = e^{-ph}` and the blocks of Phi,
+
+.. math::
+    L = \begin{bmatrix} (1-\rho^2)\,I \\
+        (1-\rho)\,(\Phi_{22}\Phi_{12}^{-1} - \rho\,\Phi_{12}^{-1}\Phi_{11}) \end{bmatrix}
+
+places the poles of the error, :math:`e_k = (I - LC)\Phi e_{k-1}`, at rho times those of Phi: in continuous
+time each open fast pole moved to the left by p, its frequency kept. A soft mode is so observed by two poles
+near -p; a stiff one is only damped, which asks little of it. By the separation principle the closed loop has
+these poles and those of Phi + Gamma K_f.
+
+Proof of L: eliminating the rates, amplitudes obey :math:`y_{k+2} = a_1 y_{k+1} + a_0 y_k` with
+:math:`a_1 = \Phi_{11} + \Phi_{12}\Phi_{22}\Phi_{12}^{-1}`,
+:math:`a_0 = \Phi_{12}\Phi_{21} - \Phi_{12}\Phi_{22}\Phi_{12}^{-1}\Phi_{11}`; their error with this L obeys
+:math:`e_{k+2} = \rho a_1 e_{k+1} + \rho^2 a_0 e_k`, the same with every pole times rho.
+
+Amplitudes that are half a period of the fastest mode apart do not tell its rate (Phi12 is singular): over a gap
+of more than 0.9 of that, as lost samples make it, the law predicts and does not correct.
+"""
+
+import numpy as np
+from scipy.linalg import expm
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import Parameter
+
+from .base import FastLaw
+from .lqr import CONFIGURATION, WEIGHTS, dominant_mode, regulator
+
+
+class OutputFeedback(FastLaw):
+    """Optimal gain on an observer driven by amplitudes; see the module.
+
+    Attributes
+    ----------
+    K_f : ndarray, shape (n, 2m)
+        Gain on the *estimated* deviation.
+    predicted, estimate : ndarray, shape (2m,)
+        State before the present sample and corrected by it [m, rad, m/s, rad/s].
+    """
+
+    PARAMETERS = (
+        *WEIGHTS,
+        CONFIGURATION,
+        Parameter(
+            "observer_pole",
+            "float",
+            200.0,
+            "How much faster than an open fast mode the estimate of it decays.",
+            unit="1/s",
+            low=1.0,
+            high=1e5,
+        ),
+        Parameter(
+            "period",
+            "float",
+            0.001,
+            "Sampling period that the design is checked for; the law follows the true one.",
+            unit="s",
+            low=1e-5,
+            high=1.0,
+        ),
+    )
+
+    needs_rates = False
+
+    #: Designs are kept for this many different time steps; a new one takes about 0.2 ms.
+    KEPT = 64
+    #: Part of half a period of the fastest mode, beyond which amplitudes do not correct.
+    LONGEST = 0.9
+    #: After so many samples in a row without a correction the law gives up.
+    BLIND = 20
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        q = np.array(self.parameters["configuration"])
+        self._design = regulator(model, q, self.parameters)
+        self.A2, self.B2, self._K_f = self._design.A2, self._design.B2, self._design.K_f
+        n, m = model.n_joints, model.n_modes
+        # Augmented by constant torques: its exponential holds Phi and Gamma.
+        self._held = np.zeros((2 * m + n, 2 * m + n))
+        self._held[: 2 * m, : 2 * m], self._held[: 2 * m, 2 * m :] = self.A2, self.B2
+        poles, vectors = np.linalg.eig(self.A2) if m else (np.zeros(1), np.zeros((0, 1)))
+        self._longest = self.LONGEST * np.pi / max(poles.imag.max(), 1e-300)
+        self._fastest = dominant_mode(model, vectors[:, np.argmax(poles.imag)]) if m else ""
+        self.estimate, self.predicted = np.zeros(2 * m), np.zeros(2 * m)
+        self._steps = {}
+        self._check_period(q)
+        self.reset()
+
+    def _check_period(self, q):
+        """The regulator is designed in continuous time and held in discrete: is it stable so?"""
+        period = self.parameters["period"]
+        Phi, Gamma, _ = self._step(period)
+        self._refuse_long(period)
+        poles = np.linalg.eigvals(Phi + Gamma @ self._K_f)
+        if poles.size and not np.abs(poles).max() < 1.0:
+            fastest = np.abs(np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)).max()
+            raise DesignError(
+                f"fast.period: at joint configuration {q.tolist()} closed fast poles of up to {fastest:.4g} rad/s"
+                f" are unstable in a loop sampled every {period:g} s (largest pole {np.abs(poles).max():.4g}); lower"
+                " fast.alpha and fast.q, raise fast.r, or sample faster"
+            )
+
+    def _refuse_long(self, dt):
+        if dt > self._longest:
+            raise DesignError(
+                f"fast.period: {dt:g} s between samples is more than {self._longest:.4g} s,"
+                f" {self.LONGEST} of half a period of {self._fastest}; sample faster or leave that mode out of the"
+                " controller's arm file"
+            )
+
+    def _step(self, dt):
+        """Phi, Gamma and L for the time step dt, L = 0 beyond the longest."""
+        found = self._steps.get(dt)
+        if found is not None:
+            return found
+        m = self.model.n_modes
+        flow = expm(self._held * dt)
+        Phi, Gamma = flow[: 2 * m, : 2 * m], flow[: 2 * m, 2 * m :]
+        L = np.zeros((2 * m, m))
+        if dt <= self._longest:
+            rho = np.exp(-self.parameters["observer_pole"] * dt)
+            inverse = np.linalg.inv(Phi[:m, m:])
+            L[:m] = (1.0 - rho**2) * np.eye(m)
+            L[m:] = (1.0 - rho) * (Phi[m:, m:] @ inverse - rho * inverse @ Phi[:m, :m])
+        if len(self._steps) >= self.KEPT:
+            self._steps.clear()
+        self._steps[dt] = Phi, Gamma, L
+        return Phi, Gamma, L
+
+    def reset(self):
+        self.estimate[:] = 0.0
+        self.predicted[:] = 0.0
+        self._u = np.zeros(self.model.n_joints)
+        self._L = None  # no prediction yet
+        self._blind = 0
+
+    def advance(self, dt):
+        Phi, Gamma, self._L = self._step(dt)
+        np.dot(Phi, self.estimate, out=self.predicted)
+        self.predicted += Gamma @ self._u
+        self._blind = self._blind + 1 if dt > self._longest else 0
+        if self._blind >= self.BLIND:
+            self._refuse_long(dt)
+
+    def torque(self, z_f, q):
+        m = self.model.n_modes
+        if self._L is None:  # first sample: from its amplitudes, at rest
+            self.predicted[:m] = z_f[:m]
+            np.copyto(self.estimate, self.predicted)
+        else:
+            np.dot(self._L, z_f[:m] - self.predicted[:m], out=self.estimate)
+            self.estimate += self.predicted
+        self._u = self._K_f @ self.estimate
+        return self._u
+
+    @property
+    def K_f(self):
+        return self._K_f
+
+    def gain(self, q):
+        """None: the law has states of its own, see `state_space`."""
+        return None
+
+    def state_space(self, dt):
+        r"""Discrete compensator with the state w, the prediction for the present sample.
+
+        .. math::
+            w' = (\Phi + \Gamma K_f)[(I - LC) w + L C z_f], \qquad u_f = K_f[(I - LC) w + L C z_f].
+
+        The law starts from w = (amplitudes of the first sample, 0).
+
+        Parameters
+        ----------
+        dt : float
+            Sampling period [s].
+
+        Returns
+        -------
+        A, B, C, D : ndarray, shapes (2m, 2m), (2m, 2m), (n, 2m), (n, 2m)
+            Columns of B and D for the rates are zero.
+
+        Raises
+        ------
+        DesignError
+            The period is too long for the fastest mode.
+        """
+        self._refuse_long(dt)
+        Phi, Gamma, L = self._step(dt)
+        correct = np.hstack([L, np.zeros_like(L)])
+        keep = np.eye(correct.shape[0]) - correct
+        closed = Phi + Gamma @ self._K_f
+        return closed @ keep, closed @ correct, self._K_f @ keep, self._K_f @ correct

@@ -1,0 +1,228 @@
+r"""Optimal fast control, its gain scheduled over the workspace: the law of `lqr` as (11) changes with q.
+
+Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular
+grid of joint configurations and the gain is interpolated between them, on the control path, multilinearly:
+
+.. math::
+    u_f = K_f(q)\,z_f, \qquad
+    K_f(q) = \sum_{c} \Big[\prod_j w_{j}(c, q_j)\Big] K_c, \qquad w_j \in \{1-t_j,\; t_j\},
+
+over the 2^d corners c of the cell that holds q, t_j in [0, 1] the place in the cell. Joints that leave A2 and B2
+as they are (the first of a planar arm, the yaw of one on a column) have no place in the grid; they are found by
+evaluation. Beyond the ends the gain is that of the end; a joint without position limits turns through: it is
+brought back into +-pi.
+
+The closed boundary layer A2(q) + B2(q) K_f(q) is checked where interpolation errs most, in the middle of every
+cell, and at random: with every pole left of -alpha/2 the design stands. This is frozen q: (11) is a boundary layer
+because q changes slowly beside it.
+"""
+
+import itertools
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import fast_subsystem
+
+from .base import FastLaw
+from .lqr import WEIGHTS, regulator
+
+
+class GainTable:
+    """Matrices on a regular grid of joint configurations, interpolated multilinearly.
+
+    Parameters
+    ----------
+    joints : sequence of int
+        Joints that span the grid, d of them; the last one's index runs fastest.
+    low, high : ndarray, shape (d,)
+        Ends of the grid [rad].
+    points : int
+        Points per joint.
+    turns : ndarray of bool, shape (d,)
+        Joints that turn through: brought into +-pi first.
+    matrices : ndarray, shape (points**d, rows, columns)
+    """
+
+    def __init__(self, joints, low, high, points, turns, matrices):
+        strides = points ** np.arange(len(joints) - 1, -1, -1)
+        scale = (points - 1) / (high - low)
+        # Plain numbers: cheaper one by one than arrays of this size.
+        self._axes = [
+            (int(j), float(a), float(s), int(stride), bool(turn))
+            for j, a, s, stride, turn in zip(joints, low, scale, strides, turns, strict=True)
+        ]
+        self._last = points - 1
+        self._corners = np.array(
+            [int(np.dot(c, strides)) for c in itertools.product((0, 1), repeat=len(joints))]
+        )
+        self._shape = matrices.shape[1:]
+        self._rows = np.ascontiguousarray(matrices.reshape(matrices.shape[0], -1))
+
+    def __call__(self, q):
+        """Matrix in joint configuration q, shape (rows, columns)."""
+        first, weights = 0, [1.0]
+        for joint, low, scale, stride, turns in self._axes:
+            angle = float(q[joint])
+            if turns:
+                angle -= 2.0 * np.pi * round(angle / (2.0 * np.pi))
+            place = min(max((angle - low) * scale, 0.0), self._last)
+            cell = min(int(place), self._last - 1)
+            t = place - cell
+            first += cell * stride
+            weights = [w * v for w in weights for v in (1.0 - t, t)]
+        return np.dot(weights, self._rows[first + self._corners]).reshape(self._shape)
+
+
+class ScheduledLqr(FastLaw):
+    """Gain interpolated over the workspace; see the module.
+
+    Attributes
+    ----------
+    scheduled : ndarray of int
+        Joints that the gain depends on.
+    nodes : ndarray, shape (N, n)
+        Joint configurations of the grid [rad]; the other joints in the middle of their range.
+    gains : ndarray, shape (N, n, 2m)
+        K_f at the nodes.
+    low, high : ndarray, shape (n,)
+        Range of every joint [rad].
+    """
+
+    PARAMETERS = (
+        *WEIGHTS,
+        Parameter(
+            "grid",
+            "int",
+            5,
+            "Designs per joint that changes the boundary layer (11); between them the gain is interpolated.",
+            low=2,
+            high=41,
+        ),
+        Parameter(
+            "low",
+            "float_array",
+            [0.0],
+            "Lower end of the scheduled range; 0.0 here and in high: limits.position, -pi where there is none.",
+            unit="rad",
+            low=-100.0,
+            high=100.0,
+            length="joints",
+        ),
+        Parameter(
+            "high",
+            "float_array",
+            [0.0],
+            "Upper end of the scheduled range; 0.0 here and in low: limits.position, pi where there is none.",
+            unit="rad",
+            low=-100.0,
+            high=100.0,
+            length="joints",
+        ),
+    )
+
+    #: Most designs: some minutes of Riccati equations for an arm of ten modes.
+    MOST = 20000
+    #: At most as many random configurations are checked beside the middles of the cells.
+    CHECKED = 1000
+    #: Relative change of A2 or B2 below which a joint is taken not to matter.
+    NEGLIGIBLE = 1e-9
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self._set_range()
+        self.scheduled = self._find_joints()
+        grid = self.parameters["grid"]
+        self._refuse_too_many(grid)
+        self.nodes = self._grid(np.linspace(0.0, 1.0, grid))
+        self.gains = np.array([regulator(model, q, self.parameters).K_f for q in self.nodes])
+        s = self.scheduled
+        self._table = GainTable(s, self.low[s], self.high[s], grid, self._turns[s], self.gains)
+        self._check(grid)
+        self._K_f = self._table(0.5 * (self.low + self.high))
+
+    def _set_range(self):
+        """Range of each joint, from the parameters or from the arm file's limits."""
+        low, high = np.array(self.parameters["low"]), np.array(self.parameters["high"])
+        default = (low == 0.0) & (high == 0.0)
+        limits = np.array([j.limits.position for j in self.model.arm.joints])
+        self._turns = default & np.isinf(limits).all(axis=1)
+        limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
+        self.low, self.high = (np.where(default, limits[:, i], (low, high)[i]) for i in (0, 1))
+        for i in np.flatnonzero(self.low > self.high):
+            raise DesignError(
+                f"fast.low[{i}]: {self.low[i]:.4g} rad of {self.model.joint_names[i]} is above fast.high[{i}],"
+                f" {self.high[i]:.4g} rad; give both"
+            )
+
+    def _find_joints(self):
+        """Joints that change A2 or B2, each turned alone from a few configurations."""
+        n = self.model.n_joints
+        if not self.model.n_modes:
+            return np.array([], int)
+        draw = np.random.default_rng(0)
+        matters = np.zeros(n, bool)
+        for _ in range(3):
+            base, other = draw.uniform(self.low, self.high, (2, n))
+            here = self._boundary_layer(base)
+            for i in np.flatnonzero(~matters & (self.high > self.low)):
+                turned = base.copy()
+                turned[i] = other[i]
+                matters[i] = any(
+                    np.abs(b - a).max() > self.NEGLIGIBLE * np.abs(a).max()
+                    for a, b in zip(here, self._boundary_layer(turned), strict=True)
+                )
+        return np.flatnonzero(matters)
+
+    def _boundary_layer(self, q):
+        return fast_subsystem(self.model.terms(q, np.zeros(q.size)))
+
+    def _refuse_too_many(self, grid):
+        d = self.scheduled.size
+        if grid**d > self.MOST:
+            names = ", ".join(self.model.joint_names[i] for i in self.scheduled)
+            raise DesignError(
+                f"fast.grid: {grid} points for each of {d} joints ({names}) make {grid**d} designs, more than"
+                f" {self.MOST}; lower fast.grid to {int(self.MOST ** (1.0 / d) + 1e-9)}, or hold a joint with"
+                " fast.low = fast.high"
+            )
+
+    def _grid(self, places):
+        """Joint configurations at all combinations of `places` in [0, 1], shape (N, n)."""
+        combined = np.array(list(itertools.product(places, repeat=self.scheduled.size)))
+        out = np.tile(0.5 * (self.low + self.high), (combined.shape[0], 1))
+        s = self.scheduled
+        out[:, s] = self.low[s] + combined * (self.high - self.low)[s]
+        return out
+
+    def _check(self, grid):
+        """Poles between the nodes; raises where one is too slow."""
+        if not self.scheduled.size:
+            return
+        middles = self._grid((np.arange(grid - 1) + 0.5) / (grid - 1))
+        count = min(max(50, len(middles)), self.CHECKED)
+        drawn = np.random.default_rng(1).uniform(self.low, self.high, (count, self.low.size))
+        slowest = -0.5 * self.parameters["alpha"]
+        for q in np.vstack([middles, drawn]):
+            A2, B2 = self._boundary_layer(q)
+            poles = np.linalg.eigvals(A2 + B2 @ self._table(q))
+            worst = poles[np.argmax(poles.real)]
+            if not worst.real < slowest:
+                raise DesignError(
+                    f"fast.grid: with {grid} points per joint the interpolated gain leaves a pole at"
+                    f" {worst.real:.4g} + {abs(worst.imag):.4g}j 1/s, not left of -alpha/2 = {slowest:.4g}, at joint"
+                    f" configuration {np.round(q, 4).tolist()}; raise fast.grid, narrow fast.low to fast.high,"
+                    " or lower fast.alpha"
+                )
+
+    def torque(self, z_f, q):
+        return self._table(q) @ z_f
+
+    def gain(self, q):
+        return self._table(q)
+
+    @property
+    def K_f(self):
+        """Gain in the middle of the range, shape (n, 2m); `gain` has the others."""
+        return self._K_f
