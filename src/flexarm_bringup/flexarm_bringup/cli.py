@@ -48,6 +48,12 @@ def _show(options):
     show(options)
 
 
+def _gauges(options):
+    from .gauges import gauges
+
+    gauges(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -115,7 +121,7 @@ def parser():
 
 def _add_arm_commands(commands):
     """What needs an arm file and no ROS."""
-    from . import inspect_arm, simulate
+    from . import gauges, inspect_arm, simulate
 
     command = commands.add_parser(
         "simulate",
@@ -143,6 +149,14 @@ def _add_arm_commands(commands):
     )
     inspect_arm.add_show_arguments(command)
     command.set_defaults(function=_show)
+    command = commands.add_parser(
+        "gauges",
+        help="how well the strain gauges tell the modes, and where they would do it best",
+        description="Noise and condition number of the present gauges, and the best positions on each link.",
+        epilog="example: flexarm gauges R --count 3 --plot results/gauges.png",
+    )
+    gauges.add_arguments(command)
+    command.set_defaults(function=_gauges)
 
 
 #: Options whose value may begin with a minus.
