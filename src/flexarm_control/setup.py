@@ -41,6 +41,10 @@ setup(
             "reference = flexarm_control.manifold.reference:ReferenceManifold",
             "corrected = flexarm_control.manifold.corrected:CorrectedManifold",
         ],
+        "flexarm.feedforwards": [
+            "model = flexarm_control.feedforward.model:ModelFeedforward",
+            "preview = flexarm_control.feedforward.preview:Preview",
+        ],
         "flexarm.observers": [
             "true_rates = flexarm_control.observers.true_rates:TrueRates",
             "filtered_derivative = flexarm_control.observers.filtered_derivative:FilteredDerivative",

@@ -174,11 +174,14 @@ class ArmController:
             return False
         if verdict == SampleOrder.REPEAT and (self.enabled or self._waiting):
             return self.enabled
-        if sample.amplitude is None or sample.rate is None:
+        law = self.answered_by = self.law
+        if sample.amplitude is None or (sample.rate is None and law.needs_rates):
             self._wait(sample, verdict)
             return False
         if verdict == SampleOrder.RESTART or self.state == Supervisor.INACTIVE:
             self._begin(sample, verdict)
+            law.reset()
+        dt = 1e-9 * (sample.stamp_ns - self._last_ns)  # 0 for the first
         self._state_reason = ""
         reference = self.reference
         reference.sample(sample.stamp_ns)
@@ -186,8 +189,7 @@ class ArmController:
         np.subtract(reference.position, q, out=self.position_error)
         np.subtract(reference.velocity, qd, out=self.velocity_error)
         try:
-            law = self.answered_by = self.law
-            u = law.step(q, qd, sample.amplitude, sample.rate, reference)
+            u = law.step(q, qd, sample.amplitude, sample.rate, reference, dt)
         except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
             self.disable(f"the control law failed: {type(error).__name__}: {error}")
             return False
@@ -195,7 +197,7 @@ class ArmController:
             i = int(np.argmin(np.isfinite(u)))
             self.disable(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
             return False
-        self._limited(u, 1e-9 * (sample.stamp_ns - self._last_ns))
+        self._limited(u, dt)
         self._last_ns = sample.stamp_ns
         self.enabled = True
         if reference.active:

@@ -28,6 +28,8 @@ class CompositeControl:
     fast : FastLaw
     manifold : Manifold, optional
         The paper's, `QuasiSteady`, if not given.
+    feedforward : Feedforward, optional
+        The motion that the arm is held to; the reference and the manifold's, if not given.
 
     Attributes
     ----------
@@ -39,9 +41,12 @@ class CompositeControl:
         z_f = z - z_bar [m, rad, m/s, rad/s].
     """
 
-    def __init__(self, model, slow, fast, manifold=None):
+    def __init__(self, model, slow, fast, manifold=None, feedforward=None):
         self.model, self.slow, self.fast = model, slow, fast
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
+        self.feedforward = feedforward
+        if feedforward is not None:
+            self._response = self.manifold.error_response(feedforward.settings.configuration)
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
@@ -55,6 +60,8 @@ class CompositeControl:
         """A new session begins: the laws forget their own states."""
         self.slow.reset()
         self.fast.reset()
+        if self.feedforward is not None:
+            self.feedforward.reset()
 
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample; the control path.
@@ -75,23 +82,45 @@ class CompositeControl:
         ndarray, shape (n,)
             u of (12) [N m]; before any limit. Overwritten by the next step.
         """
-        m, manifold = delta.size, self.manifold
+        m = delta.size
         if dt > 0.0:
             self.slow.advance(dt)
             self.fast.advance(dt)
-        terms = self.model.terms(q, qd)
-        self.slow_torque[:] = self.slow.torque(q, qd, reference, terms)
-        manifold.update(q, qd, reference, terms, self.slow_torque)
-        self.slow_torque += manifold.feedforward
-        self.quasi_steady[:] = manifold.amplitude
-        np.subtract(delta, manifold.amplitude, out=self.deviation[:m])
+        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
+        if self.feedforward is None:
+            amplitude, rate = self._on_manifold(q, qd, reference, terms)
+        else:
+            amplitude, rate = self._on_motion(q, qd, reference, terms, dt)
+        self.quasi_steady[:] = amplitude
+        np.subtract(delta, amplitude, out=self.deviation[:m])
         if delta_d is None:
             self.deviation[m:] = np.nan
         else:
-            np.subtract(delta_d, manifold.rate, out=self.deviation[m:])
+            np.subtract(delta_d, rate, out=self.deviation[m:])
         self.fast_torque[:] = self.fast.torque(self.deviation, q)
         np.add(self.slow_torque, self.fast_torque, out=self.torque)
         return self.torque
+
+    def _on_manifold(self, q, qd, reference, terms):
+        """Slow torque, and z_bar of the manifold."""
+        manifold = self.manifold
+        self.slow_torque[:] = self.slow.torque(q, qd, reference, terms)
+        manifold.update(q, qd, reference, terms, self.slow_torque)
+        self.slow_torque += manifold.feedforward
+        return manifold.amplitude, manifold.rate
+
+    def _on_motion(self, q, qd, reference, terms, dt):
+        """Slow torque about the feed-forward's motion, and z_bar: its deflections, moved by the tracking error."""
+        motion, m = self.feedforward, self.model.n_modes
+        motion.update(reference, dt)
+        along = self.model.terms(motion.position, motion.velocity)
+        self.slow_torque[:] = self.slow.torque(q, qd, motion, terms)
+        self.slow_torque += motion.torque - self.slow.nominal(along, motion.acceleration)
+        error = np.concatenate([q - motion.position, qd - motion.velocity])
+        L, U = self._response
+        self.slow_torque += U @ error
+        moved = L @ error
+        return motion.amplitude + moved[:m], motion.rate + moved[m:]
 
 
 def sizes(model):

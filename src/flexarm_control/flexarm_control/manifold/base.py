@@ -1,8 +1,14 @@
 """What a slow manifold is."""
 
 from abc import ABC, abstractmethod
+from types import SimpleNamespace
 
 import numpy as np
+
+from .expansion import STEP, Point, expand, reach
+
+#: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
+SMALL = 1e-5
 
 
 class Manifold(ABC):
@@ -14,7 +20,7 @@ class Manifold(ABC):
     Parameters
     ----------
     model : ArmModel
-        The arm.
+        The arm; its terms are taken from the slow law's, which may have learnt.
     slow : SlowLaw
         Whose motion the deflections go with.
     parameters : dict
@@ -30,9 +36,11 @@ class Manifold(ABC):
 
     #: Declared parameters, named ``manifold.<name>`` in the controller node.
     PARAMETERS = ()
+    #: Order in mu to which the deflections follow the motion.
+    order = 0
 
     def __init__(self, model, slow, parameters):
-        self.model, self.slow = model, slow
+        self.model, self.slow = slow.model, slow
         self.parameters = dict(parameters)
         m, n = model.n_modes, model.n_joints
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
@@ -54,3 +62,61 @@ class Manifold(ABC):
         slow_torque : ndarray, shape (n,)
             The slow law's [N m].
         """
+
+    def along(self, reference):
+        """The manifold of the reference itself: no tracking error.
+
+        Parameters
+        ----------
+        reference : object
+            As for `update`.
+
+        Returns
+        -------
+        amplitude, rate : ndarray, shape (m,)
+            [m, rad], [m/s, rad/s]
+        torque : ndarray, shape (n,)
+            Of the whole motion: the joint rows of (2) [N m].
+        """
+        points = {}
+        for i in range(-reach(self.order), reach(self.order) + 1):
+            state = reference.near(i * STEP)
+            points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
+        delta, rate, second = expand(points, self.order)
+        return delta, rate, points[0].torque(delta, rate, second)
+
+    def error_response(self, q):
+        """How a tracking error moves the manifold and its feed-forward, linearised at rest.
+
+        Parameters
+        ----------
+        q : ndarray, shape (n,)
+            Configuration [rad].
+
+        Returns
+        -------
+        L : ndarray, shape (2m, 2n)
+            z_bar by (q, qd).
+        U : ndarray, shape (n, 2n)
+            Feed-forward by (q, qd).
+        """
+        n, m = self.model.n_joints, self.model.n_modes
+        q = np.asarray(q, float)
+        state = np.zeros((3, n))
+        state[0] = q
+        reference = SimpleNamespace(
+            position=q, velocity=np.zeros(n), acceleration=np.zeros(n), near=lambda _: state.copy()
+        )
+        L, U = np.zeros((2 * m, 2 * n)), np.zeros((n, 2 * n))
+        for i in range(2 * n):
+            ends = []
+            for sign in (1.0, -1.0):
+                x = np.concatenate([q, np.zeros(n)])
+                x[i] += sign * SMALL
+                terms = self.model.terms(x[:n], x[n:])
+                torque = self.slow.torque(x[:n], x[n:], reference, terms)
+                self.update(x[:n], x[n:], reference, terms, torque)
+                ends.append(np.concatenate([self.amplitude, self.rate, self.feedforward]))
+            slope = (ends[0] - ends[1]) / (2.0 * SMALL)
+            L[:, i], U[:, i] = slope[: 2 * m], slope[2 * m :]
+        return L, U

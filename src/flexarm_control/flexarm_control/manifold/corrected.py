@@ -18,21 +18,19 @@ is left out is of order mu^(k+1). With the joint rows of (2) the joints then mov
 
 .. math:: u = \bar u + M_{12}\ddot\delta + C_1\dot\delta + K_1(\delta - \delta^{(0)}) .
 
-The derivatives are taken along the slow motion through the present state, central differences over `STEP`: the
+The derivatives are taken along the slow motion through the present state, central differences over `expansion.STEP`: the
 reference goes on as it is known to, and the tracking error decays as the slow law makes it,
 :math:`\ddot e = -k_v\dot e - k_p e`, so that the manifold holds off the reference, too, and the slow poles stay
-where they were placed. `derivation` of the orders, beside a manifold found numerically: docs/control.md.
+where they were placed. The derivation, beside a manifold found numerically: docs/control.md.
 """
 
 import numpy as np
-from scipy.linalg import expm, lu_factor, lu_solve
+from scipy.linalg import expm
 
 from flexarm_dynamics.parameters import Parameter
 
 from .base import Manifold
-
-#: Step of the central differences [s]: truncation 1e-7 and rounding 1e-9 of a motion within a second.
-STEP = 1e-3
+from .expansion import STEP, Point, expand, reach
 
 
 class CorrectedManifold(Manifold):
@@ -50,14 +48,11 @@ class CorrectedManifold(Manifold):
         ),
     )
 
-    #: Whether the tracking error's own motion bends the arm, or the reference's alone.
-    follows_error = True
-
     def __init__(self, model, slow, parameters):
         super().__init__(model, slow, parameters)
         self.order = self.parameters["order"]
-        self._reach = (self.order + 1) // 2  # points of the stencil on either side
-        self._flow = self._error_flow() if self.follows_error else None
+        self._reach = reach(self.order)
+        self._flow = self._error_flow()
 
     def _error_flow(self):
         """Tracking error (e, de/dt) at each point of the stencil from that now; None without a linear law."""
@@ -70,86 +65,40 @@ class CorrectedManifold(Manifold):
         return {i: expm(A * i * STEP) for i in range(-self._reach, self._reach + 1)}
 
     def update(self, q, qd, reference, terms, slow_torque):
-        here = self._slow_acceleration(terms, slow_torque)
-        points = {0: self._point(terms, here)}
-        if self.order:
-            error = np.concatenate([reference.position - q, reference.velocity - qd])
-            extra = here - reference.acceleration
-            for i in range(1, self._reach + 1):
-                for j in (-i, i):
-                    motion = self._motion(j, reference, error, extra)
-                    points[j] = self._point(self.model.terms(motion[0], motion[1]), motion[2])
-        delta, rate, inertia = self._expand(points)
+        here = slow_acceleration(terms, slow_torque)
+        points = {0: Point(terms, here)}
+        error = np.concatenate([reference.position - q, reference.velocity - qd])
+        extra = here - reference.acceleration
+        for i in range(1, self._reach + 1):
+            for j in (-i, i):
+                motion = self._motion(j, reference, error, extra)
+                points[j] = Point(self.model.terms(motion[0], motion[1]), motion[2])
+        delta, rate, second = expand(points, self.order)
         self.amplitude[:], self.rate[:] = delta, rate
-        if self.order:
-            self.feedforward[:] = terms.M[: terms.n, terms.n :] @ inertia + terms.C1 @ rate
-            self.feedforward += terms.K1 @ (delta - points[0].delta)
-
-    def _slow_acceleration(self, terms, slow_torque):
-        """The slow subsystem's acceleration (10), in the joint rows of (2) with the modes at rest."""
-        M, n = terms.M, terms.n
-        lift = np.linalg.solve(terms.K2.T, terms.K1.T).T if terms.K1.any() else None
-        if lift is None:
-            return np.linalg.solve(M[:n, :n], slow_torque - terms.f1)
-        return np.linalg.solve(
-            M[:n, :n] - lift @ M[n:, :n], slow_torque - terms.f1 + lift @ terms.f2
-        )
+        self.feedforward[:] = points[0].feedforward(delta, rate, second)
 
     def _motion(self, j, reference, error, extra):
         """Position, velocity, acceleration of the slow motion at a point of the stencil, (3, n)."""
-        motion = reference.near(j * STEP)
-        if self._flow is not None:
-            n = self.model.n_joints
-            later = self._flow[j] @ error
-            kp, kv = self.slow.error_gains()
-            motion[0] -= later[:n]
-            motion[1] -= later[n:]
-            motion[2] += kp * later[:n] + kv * later[n:]
-        elif self.follows_error:
+        motion, t, n = reference.near(j * STEP).copy(), j * STEP, self.model.n_joints
+        if self._flow is None:
             # A law of another kind: what it adds to the reference's acceleration stays for this while.
-            t, n = j * STEP, self.model.n_joints
             motion[0] += -error[:n] - t * error[n:] + 0.5 * t * t * extra
             motion[1] += -error[n:] + t * extra
             motion[2] += extra
+            return motion
+        later = self._flow[j] @ error
+        kp, kv = self.slow.error_gains()
+        motion[0] -= later[:n]
+        motion[1] -= later[n:]
+        motion[2] += kp * later[:n] + kv * later[n:]
         return motion
 
-    def _point(self, terms, acceleration):
-        return _Point(terms, acceleration)
 
-    def _expand(self, points):
-        """Deflection, rate and second derivative at the centre, to the order asked."""
-        level = {i: p.delta for i, p in points.items()}
-        m = self.model.n_modes
-        rate, inertia = np.zeros(m), np.zeros(m)
-        for k in range(1, self.order + 1):
-            reach = max(level)
-            if k % 2:  # the rates of the level before
-                rate = (level[1] - level[-1]) / (2.0 * STEP)
-                continue
-            higher = {}
-            for i in range(1 - reach, reach):
-                speed = (level[i + 1] - level[i - 1]) / (2.0 * STEP)
-                second = (level[i + 1] - 2.0 * level[i] + level[i - 1]) / STEP**2
-                higher[i] = points[i].corrected(speed, second)
-                if i == 0:
-                    inertia = second
-            level = higher
-        return level[0], rate, inertia
-
-
-class _Point:
-    """The modal rows of (2) at one point of the slow motion."""
-
-    def __init__(self, terms, acceleration):
-        n = terms.n
-        self._terms = terms
-        self._factor = lu_factor(terms.K2, check_finite=False)
-        self.delta = -self._solve(terms.M[n:, :n] @ acceleration + terms.f2)
-
-    def _solve(self, force):
-        return lu_solve(self._factor, force, check_finite=False)
-
-    def corrected(self, rate, second):
-        """Deflection that also carries the modes' own inertia and damping."""
-        n = self._terms.n
-        return self.delta - self._solve(self._terms.M[n:, n:] @ second + self._terms.C2 @ rate)
+def slow_acceleration(terms, slow_torque):
+    """The slow subsystem's acceleration (10), from the joint rows of (2) with the modes at rest, shape (n,)."""
+    M, n = terms.M, terms.n
+    if not terms.K1.any():
+        return np.linalg.solve(M[:n, :n], slow_torque - terms.f1)
+    lift = np.linalg.solve(terms.K2.T, terms.K1.T).T
+    right = slow_torque - terms.f1 + lift @ terms.f2
+    return np.linalg.solve(M[:n, :n] - lift @ M[n:, :n], right)

@@ -8,24 +8,20 @@ ask the fast control for a deflection. The slow loop then acts on the whole arm,
 poles move: on the paper's arm from the double pole -2.5 to -1.5 +- 1.5j.
 """
 
-import numpy as np
+from .base import Manifold
+from .expansion import STEP, Point, expand, reach
 
-from .corrected import CorrectedManifold
 
+class ReferenceManifold(Manifold):
+    """Order 2 along the reference; see the module."""
 
-class ReferenceManifold(CorrectedManifold):
-    """The order 2 of `CorrectedManifold`, off the reference; see the module."""
-
-    PARAMETERS = ()
-    follows_error = False
-
-    def __init__(self, model, slow, parameters):
-        super().__init__(model, slow, {"order": 2, **parameters})
+    order = 2
 
     def update(self, q, qd, reference, terms, slow_torque):
-        along = self.model.terms(reference.position, reference.velocity)
-        self._acceleration = reference.acceleration
-        super().update(reference.position, reference.velocity, reference, along, np.zeros(0))
-
-    def _slow_acceleration(self, terms, slow_torque):
-        return self._acceleration
+        points = {}
+        for i in range(-reach(self.order), reach(self.order) + 1):
+            state = reference.near(i * STEP)
+            points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
+        delta, rate, second = expand(points, self.order)
+        self.amplitude[:], self.rate[:] = delta, rate
+        self.feedforward[:] = points[0].feedforward(delta, rate, second)

@@ -2,7 +2,10 @@
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 KP = Parameter(
     "kp",
@@ -35,7 +38,8 @@ class SlowLaw(ABC):
     Parameters
     ----------
     model : ArmModel
-        The arm.
+        The arm. What the law keeps as its `model` is the arm as it believes it to be: the terms that `torque` and
+        the slow manifold get are taken from there.
     parameters : dict
         Checked values of `PARAMETERS`, arrays at full length.
     """
@@ -57,6 +61,19 @@ class SlowLaw(ABC):
         The slow manifold is continued off the reference by them.
         """
         return None
+
+    def nominal(self, terms, acceleration):
+        """What this law gives on its reference, learnt states aside: the rigid arm's torque, shape (n,) [N m].
+
+        Parameters
+        ----------
+        terms : Terms
+            Of (2) on the reference.
+        acceleration : ndarray, shape (n,)
+            The reference's [rad/s^2].
+        """
+        a, B = slow_subsystem(terms)
+        return np.linalg.solve(B, acceleration - a)
 
     def reset(self):
         """A new session begins: forget what was learnt from the samples of the last one."""

@@ -49,6 +49,9 @@ class LinearModelFollowing(SlowLaw):
             self._cached = (terms.M, np.linalg.inv(B))
         return self._cached[1]
 
+    def nominal(self, terms, acceleration):
+        return self.B_inverse(terms) @ acceleration
+
     def warnings(self):
         if any(self.model.arm.gravity):
             return (

@@ -10,3 +10,6 @@ class NoSlowLaw(SlowLaw):
 
     def torque(self, q, qd, reference, terms):
         return np.zeros(self.model.n_joints)
+
+    def nominal(self, terms, acceleration):
+        return np.zeros(self.model.n_joints)

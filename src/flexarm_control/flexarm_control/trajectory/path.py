@@ -68,6 +68,7 @@ class Path:
         order = 2 * len(derivatives)
         self.trajectory_id = trajectory_id
         self.start_ns = 0
+        self.begin_state = np.zeros((3, n))
         self.duration_ns = int(times_ns[-1])
         self._first = [values[0] for values in derivatives]
         self._end = np.zeros((3, n))
@@ -95,6 +96,7 @@ class Path:
     def begin(self, start_ns, reference):
         """Start at a stamp [ns] from a (3, n) reference state; may be called again."""
         self.start_ns = start_ns
+        self.begin_state = np.array(reference)
         self._forget_segment()
         length_ns = int(self._knots_ns[1])
         if length_ns > 0:

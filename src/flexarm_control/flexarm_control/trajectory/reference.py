@@ -170,6 +170,23 @@ class ReferenceGenerator:
         return Verdict(False, jump, 0) if jump else self._accept(trajectory)
 
     @property
+    def path(self):
+        """The `Path` that is followed, or was to its end; None while a position is held."""
+        return self._path
+
+    @property
+    def stamp_ns(self):
+        """The last sampled stamp [ns]."""
+        return self._last_ns
+
+    @property
+    def resting(self):
+        """State (3, n) of a reference that will not move until a new trajectory comes; None while it will."""
+        if self.pending or self.active or self.stopping or self._last_ns is None:
+            return None
+        return self._state.copy()
+
+    @property
     def pending(self):
         """Whether an accepted trajectory has not begun."""
         return self._pending is not None or self._starting is not None

@@ -1,0 +1,1 @@
+"""Feed-forward: the motion that the composite control holds the arm to. One kind per file."""

@@ -1,0 +1,94 @@
+"""What a feed-forward is."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a feed-forward is designed for.
+
+    Attributes
+    ----------
+    period : float
+        Of the samples [s].
+    configuration : ndarray, shape (n,)
+        Joint configuration of the design [rad].
+    """
+
+    period: float
+    configuration: np.ndarray
+
+
+class Feedforward(ABC):
+    """A motion of the whole arm, bending included, near the reference, and the torque that makes it.
+
+    Registered by name in the entry-point group ``flexarm.feedforwards``. The composite control holds the arm
+    to it: its slow law tracks the joints of this motion, its fast law the deflections.
+
+    Parameters
+    ----------
+    model : ArmModel
+    manifold : Manifold
+    settings : Settings
+
+    Attributes
+    ----------
+    position, velocity, acceleration : ndarray, shape (n,)
+        Joints of the motion at the present sample [rad], [rad/s], [rad/s^2].
+    amplitude, rate : ndarray, shape (m,)
+        Its deflections [m, rad] and their rates.
+    torque : ndarray, shape (n,)
+        What makes it [N m].
+    limit : ndarray, shape (n,)
+        Torque limit in force [N m]; infinite: none.
+    """
+
+    def __init__(self, model, manifold, settings):
+        n, m = model.n_joints, model.n_modes
+        self.model, self.manifold, self.settings = model, manifold, settings
+        self.position, self.velocity, self.acceleration = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.amplitude, self.rate, self.torque = np.zeros(m), np.zeros(m), np.zeros(n)
+        self.limit = np.full(n, np.inf)
+
+    def near(self, offset):
+        """State (position, velocity, acceleration), (3, n), at an offset [s]: continued with this acceleration."""
+        out = np.empty((3, self.position.size))
+        out[0] = self.position + offset * (self.velocity + 0.5 * offset * self.acceleration)
+        out[1] = self.velocity + offset * self.acceleration
+        out[2] = self.acceleration
+        return out
+
+    def reset(self):
+        """A new session begins: the next sample is the first."""
+
+    def resume(self, other):
+        """Go on from another feed-forward's motion: a redesign does not begin anew."""
+
+    def take(self, plan):
+        """Follow what `prepare` made, as soon as the reference follows its trajectory."""
+
+    def prepare(self, trajectory, start):
+        """Design work for a trajectory that will begin from a state of rest, (3, n); off the control path.
+
+        Returns None where there is none to do.
+        """
+        return None
+
+    @abstractmethod
+    def update(self, reference, dt):
+        """Move on to the present sample; the control path.
+
+        Parameters
+        ----------
+        reference : ReferenceGenerator
+            At the present stamp.
+        dt : float
+            Time since the last sample [s]; 0: the first one.
+        """
+
+    def warnings(self):
+        """What a person should know of it on this arm; each a sentence."""
+        return ()

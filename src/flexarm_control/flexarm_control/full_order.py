@@ -1,0 +1,239 @@
+r"""The full order closed loop, sampled: the arm with its bending under a composite control, linearised at rest.
+
+The arm (2), linear about rest in a configuration, held by its torque against gravity, moves exactly from sample to
+sample,
+
+.. math:: s_{k+1} = \Phi s_k + \Gamma u_k, \qquad s = (q, \delta, \dot q, \dot\delta),
+
+and the control law is linearised as it is: its own `step` is differenced, so that whatever slow law, manifold and
+fast law there is counts. A fast law with states of its own brings them along, and a delay keeps the torques
+under way. Poles are given as those of continuous time, s = ln(z) / T.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+from scipy.linalg import expm
+
+from flexarm_dynamics.errors import DesignError
+
+#: Steps of the central differences: joints and deflections [rad], [m], and their rates.
+STEP = 1e-6
+#: A pole may grow this fast [1/s] before a design counts as unstable where no margin is asked for: rounding.
+ROUNDING = 1e-6
+
+
+def linear_plant(model, q):
+    """The arm linearised at rest, held against gravity; Coulomb friction, which has no linear part, left out.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q : ndarray, shape (n,)
+        [rad]
+
+    Returns
+    -------
+    A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
+        Of s = (q, delta, qd, delta_d) and the joint torque.
+    """
+    n, m = model.n_joints, model.n_modes
+    size = 2 * (n + m)
+    rest = np.zeros(size)
+    rest[:n], rest[n : n + m] = q, model.static_deflection(q)
+    hold = static_torque(model, q)
+    viscous = model.friction_table()[:, 0]
+
+    def slope(s, u):
+        qd = s[n + m : 2 * n + m]
+        # The model's friction is taken out, and the viscous part put back.
+        return model.derivative(s, hold + u + model.friction(qd) - viscous * qd)
+
+    A, B = np.zeros((size, size)), np.zeros((size, n))
+    for i in range(size):
+        change = np.zeros(size)
+        change[i] = STEP
+        A[:, i] = (slope(rest + change, 0.0) - slope(rest - change, 0.0)) / (2.0 * STEP)
+    A[: n + m] = np.hstack([np.zeros((n + m, n + m)), np.eye(n + m)])
+    for i in range(n):  # exactly linear in the torque: a step of one
+        unit = np.zeros(n)
+        unit[i] = 1.0
+        B[:, i] = 0.5 * (slope(rest, unit) - slope(rest, -unit))
+    return A, B
+
+
+def static_torque(model, q):
+    """Joint torque that holds the arm at rest under its weight, shape (n,) [N m]."""
+    n, m = model.n_joints, model.n_modes
+    delta = model.static_deflection(q)
+    t = model.terms(q, np.zeros(n), delta, np.zeros(m))
+    return t.f1 + t.K1 @ delta
+
+
+def sampled(A, B, period):
+    """Exact transition of a plant over one period of constant input: Phi and Gamma."""
+    size, inputs = B.shape
+    big = np.zeros((size + inputs, size + inputs))
+    big[:size, :size], big[:size, size:] = A, B
+    flow = expm(big * period)
+    return flow[:size, :size], flow[:size, size:]
+
+
+def at_rest(q):
+    """A reference that rests at q."""
+    q = np.array(q, float)
+    state = np.zeros((3, q.size))
+    state[0] = q
+    return SimpleNamespace(
+        position=q,
+        velocity=np.zeros_like(q),
+        acceleration=np.zeros_like(q),
+        near=lambda offset: state.copy(),
+    )
+
+
+def linear_law(law, q):
+    """A composite control linearised at rest: what the slow part does, and what the fast part sees.
+
+    Parameters
+    ----------
+    law : CompositeControl
+    q : ndarray, shape (n,)
+
+    Returns
+    -------
+    U : ndarray, shape (n, 2 (n + m))
+        Slow torque, the manifold's feed-forward included.
+    Z : ndarray, shape (2m, 2 (n + m))
+        z_f of the fast law.
+    """
+    model = law.model
+    n, m = model.n_joints, model.n_modes
+    size, reference = 2 * (n + m), at_rest(q)
+    U, Z = np.zeros((n, size)), np.zeros((2 * m, size))
+    rest = np.zeros(size)
+    rest[:n], rest[n : n + m] = q, model.static_deflection(q)
+    plain = type(law)(model, law.slow, _NoFast(n), law.manifold)
+    for i in range(size):
+        ends = []
+        for sign in (1.0, -1.0):
+            s = rest.copy()
+            s[i] += sign * STEP
+            a, delta, ad, delta_d = np.split(s, [n, n + m, 2 * n + m])
+            plain.step(a, ad, delta, delta_d, reference)
+            ends.append((plain.slow_torque.copy(), plain.deviation.copy()))
+        U[:, i] = (ends[0][0] - ends[1][0]) / (2.0 * STEP)
+        Z[:, i] = (ends[0][1] - ends[1][1]) / (2.0 * STEP)
+    return U, Z
+
+
+class _NoFast:
+    """Stands in for the fast law, whose gain is known."""
+
+    needs_rates = True
+
+    def __init__(self, n):
+        self._zero = np.zeros(n)
+
+    def torque(self, z_f, q):
+        return self._zero
+
+
+def closed_loop(law, q, period, delay=0.0, plant=None):
+    """Transition matrix of the sampled closed loop.
+
+    Parameters
+    ----------
+    law : CompositeControl
+    q : ndarray, shape (n,)
+        Where, at rest [rad].
+    period : float
+        [s]
+    delay : float
+        From the measurement to the torque [s].
+    plant : ArmModel, optional
+        The arm itself, when it is not the law's model; of as many modes.
+
+    Returns
+    -------
+    ndarray
+        Of (s, the fast law's states, torques under way, newest last).
+    """
+    model = law.model
+    A, B = linear_plant(plant or model, np.asarray(q, float))
+    Phi, n = expm(A * period), B.shape[1]
+    U, Z = linear_law(law, q)
+    compensator = law.fast.state_space(period)
+    gain = law.fast.gain(np.asarray(q, float)) if compensator is None else compensator[3]
+    out = U + gain @ Z  # u = out s + C w
+    w = 0 if compensator is None else compensator[0].shape[0]
+    size, whole = A.shape[0], int(delay / period + 1e-9)
+    late = delay - whole * period
+    # u_{k-whole-1} acts until `late`, then u_{k-whole}.
+    begin = expm(A * (period - late)) @ sampled(A, B, late)[1] if late > 1e-12 else 0.0 * B
+    end = sampled(A, B, period - late)[1]
+    under_way = whole + (1 if late > 1e-12 else 0)
+    total = size + w + n * under_way
+    F = np.zeros((total, total))
+    F[:size, :size] = Phi
+    command = np.zeros((n, total))
+    command[:, :size] = out
+    if w:
+        Ac, Bc, Cc, _ = compensator
+        command[:, size : size + w] = Cc
+        F[size : size + w, :size] = Bc @ Z
+        F[size : size + w, size : size + w] = Ac
+
+    def torque(age):
+        """Rows of u_{k - age} in the state."""
+        if age == 0:
+            return command
+        row = np.zeros((n, total))
+        at = total - n * age
+        row[:, at : at + n] = np.eye(n)
+        return row
+
+    F[:size] += end @ torque(whole)
+    if late > 1e-12:
+        F[:size] += begin @ torque(whole + 1)
+    for age in range(under_way, 0, -1):  # oldest first
+        at = total - n * age
+        F[at : at + n] = torque(age - 1)
+    return F
+
+
+def poles(law, q, period, delay=0.0, plant=None):
+    """Poles of the sampled closed loop as those of continuous time [1/s], slowest first."""
+    z = np.linalg.eigvals(closed_loop(law, q, period, delay, plant)).astype(complex)
+    z = z[np.abs(z) > 1e-12]  # dead-beat: a delay's own
+    s = np.log(z) / period
+    return s[np.lexsort((s.imag, -s.real))]
+
+
+def check(law, q, rate, margin=0.0):
+    """Refuse a design whose full-order sampled poles are not left of -margin.
+
+    Parameters
+    ----------
+    law : CompositeControl
+    q : ndarray, shape (n,)
+        Configuration of the design [rad].
+    rate : float
+        Samples per second [Hz].
+    margin : float
+        [1/s]
+
+    Raises
+    ------
+    DesignError
+        Naming the pole.
+    """
+    slowest = poles(law, q, 1.0 / rate)[0]
+    if slowest.real < -margin + ROUNDING:
+        return
+    where = f"{slowest.real:.4g}" + (f" +- {abs(slowest.imag):.4g}j" if slowest.imag else "")
+    raise DesignError(
+        f"the full-order closed loop, sampled at {rate:g} Hz, has a pole at {where} 1/s, not left of"
+        f" -stability_margin = {-margin:g}, at joint configuration {np.round(q, 4).tolist()}: lower the gains"
+        " (slow.kp, slow.kv, fast.q, fast.alpha), take manifold.type corrected, or a higher rate"
+    )

@@ -1,0 +1,85 @@
+"""Derivatives of the slow motion's deflections by central differences: what every manifold's orders are made of."""
+
+import numpy as np
+from scipy.linalg import lu_factor, lu_solve
+
+#: Step of the central differences [s]: truncation 1e-7 and rounding 1e-9 of a motion within a second.
+STEP = 1e-3
+
+
+def reach(order):
+    """Points of the stencil on either side that an order takes."""
+    return (order + 1) // 2
+
+
+class Point:
+    """The modal rows of (2) at one point of the slow motion.
+
+    Parameters
+    ----------
+    terms : Terms
+        Without deflections.
+    acceleration : ndarray, shape (n,)
+        Of the joints [rad/s^2].
+
+    Attributes
+    ----------
+    delta : ndarray, shape (m,)
+        Deflection without the modes' own inertia and damping: order 0.
+    """
+
+    def __init__(self, terms, acceleration):
+        n = terms.n
+        self.terms, self.acceleration = terms, acceleration
+        self._factor = lu_factor(terms.K2, check_finite=False) if terms.f2.size else None
+        self.delta = -self._solve(terms.M[n:, :n] @ acceleration + terms.f2)
+
+    def _solve(self, force):
+        return force if self._factor is None else lu_solve(self._factor, force, check_finite=False)
+
+    def corrected(self, rate, second):
+        """Deflection that also carries the modes' own inertia and damping, shape (m,)."""
+        n = self.terms.n
+        return self.delta - self._solve(self.terms.M[n:, n:] @ second + self.terms.C2 @ rate)
+
+    def feedforward(self, delta, rate, second):
+        """Joint torque of the bending beyond order 0, shape (n,) [N m]."""
+        t, n = self.terms, self.terms.n
+        return t.M[:n, n:] @ second + t.C1 @ rate + t.K1 @ (delta - self.delta)
+
+    def torque(self, delta, rate, second):
+        """Joint torque of the whole motion, shape (n,) [N m]: the joint rows of (2)."""
+        t, n = self.terms, self.terms.n
+        u = t.M[:n, :n] @ self.acceleration + t.M[:n, n:] @ second
+        return u + t.f1 + t.C1 @ rate + t.K1 @ delta
+
+
+def expand(points, order):
+    """Deflection, rate and second derivative at the centre of a stencil.
+
+    Parameters
+    ----------
+    points : dict
+        `Point` by its place, from -reach to reach.
+    order : int
+        In mu.
+
+    Returns
+    -------
+    delta, rate, second : ndarray, shape (m,)
+    """
+    level = {i: p.delta for i, p in points.items()}
+    rate, second = np.zeros_like(level[0]), np.zeros_like(level[0])
+    for k in range(1, order + 1):
+        if k % 2:  # the rates of the level before
+            rate = (level[1] - level[-1]) / (2.0 * STEP)
+            continue
+        wide, higher = max(level), {}
+        for i in range(1 - wide, wide):
+            speed = (level[i + 1] - level[i - 1]) / (2.0 * STEP)
+            bend = (level[i + 1] - 2.0 * level[i] + level[i - 1]) / STEP**2
+            higher[i] = points[i].corrected(speed, bend)
+            if i == 0:
+                second = bend
+        level = higher
+    return level[0], rate, second

@@ -1,0 +1,197 @@
+r"""Model following that learns the payload (Slotine & Li 1987), on the slow subsystem (10).
+
+The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file
+(the centre of mass stays where it is). The regressor Y is what one payload more takes, the difference of two rigid
+arms. With C in Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's
+estimate,
+
+.. math::
+    s &= \dot e + \Lambda e, \qquad \dot q_r = \dot q_{ref} + \Lambda e, \qquad e = q_{ref} - q, \\
+    \bar u &= B_{\hat p}^{-1}(\bar x)\,[\ddot q_r + \Lambda_2 s - a_{\hat p}(\bar x)] + C_{\hat p}(\bar x)\,s, \\
+    \dot{\hat p} &= \gamma\,Y^T s, \qquad Y = \Delta M\,\ddot q_r + \Delta C\,\dot q_r + \Delta g, \qquad
+    0 \le \hat p \le p_{max} \text{ by projection}.
+
+:math:`V = \tfrac12 s^TM_ps + (\hat p - p)^2/2\gamma` has :math:`\dot V = -s^TM_{\hat p}\Lambda_2 s \le 0` (for
+joints of equal rates): s and with it the error vanish, whatever the payload, and :math:`\hat p \to p` where the
+motion excites it. -Lambda and -Lambda_2 are the poles of `kp` and `kv`, :math:`(\sigma + \Lambda)(\sigma +
+\Lambda_2) = \sigma^2 + k_v\sigma + k_p`: with the payload known this is model following (13) but for C s, and
+without for one joint.
+
+The estimate belongs to the law's `model`, so that the slow manifold, too, bends the links as that payload would: else
+the fast control works against every payload but the arm file's, and the estimate goes astray by it.
+
+Nothing leaks: without motion and gravity Y vanishes with s, and the estimate stays. It is kept over trajectories, so
+that the next one starts from what the last one taught, and forgotten when a session begins. While the slow torque is
+beyond a joint's limit, and within `dead_zone`, nothing is learnt: that error is not the payload's.
+
+gamma is normalised by the arm, so that `adaptation_gain` means the same for each: under a steady acceleration A of
+one joint the estimate's error obeys :math:`\ddot{\tilde p} + \Lambda_2\dot{\tilde p} + \Gamma A^2\tilde p = 0`;
+under gravity gamma is lowered so that the weight alone adds no more than :math:`\Lambda_2^2` to the last factor.
+
+Assumes that everything but the payload is known, and that the payload in the arm file is not zero: it is the
+direction in which the estimate looks.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+from .base import KP, KV, SlowLaw
+from .payload_model import PayloadModel
+from .rigid_arm import rigid_arm, torque_limits
+
+#: Configurations over which the adaptation's gain is normalised.
+CONFIGURATIONS = 64
+
+
+class AdaptiveModelFollowing(SlowLaw):
+    """Model following with an estimate of the payload; see the module.
+
+    Attributes
+    ----------
+    payload_scale : float
+        The estimate: payload in parts of the arm file's.
+    model : PayloadModel
+        The arm with that payload; whoever calls `torque` takes the terms from it.
+
+    Raises
+    ------
+    DesignError
+        When the arm file's payload is nothing, or kp and kv ask for oscillating poles.
+    """
+
+    PARAMETERS = (
+        KP,
+        KV,
+        Parameter(
+            "adaptation_gain",
+            "float",
+            2.0,
+            "How fast adaptive model following learns: the square of the estimate's frequency per squared"
+            " acceleration; 0.0: not at all.",
+            unit="s^2",
+            low=0.0,
+            high=1e4,
+        ),
+        Parameter(
+            "payload_scale_max",
+            "float",
+            5.0,
+            "Largest payload that adaptive model following believes in, in parts of the arm file's.",
+            low=1.0,
+            high=1e3,
+        ),
+        Parameter(
+            "dead_zone",
+            "float",
+            0.0,
+            "Adaptive model following learns nothing from a combined error (ds/dt of the sliding surface) below it.",
+            unit="rad/s",
+            low=0.0,
+            high=10.0,
+        ),
+    )
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.kp, self.kv = np.array(self.parameters["kp"]), np.array(self.parameters["kv"])
+        self._rates()
+        load = model.arm.payload
+        if not load.mass and not np.any(load.inertia):
+            raise DesignError(
+                f"payload.mass: 0 in arm {model.arm.name}: adaptive_model_following learns the payload in parts of"
+                " the arm file's; write the mass it is expected to have there"
+            )
+        self.model = PayloadModel(model)
+        self._one = rigid_arm(model.arm)
+        self._two = self._one.with_payload(2.0)
+        self._at_rest = np.zeros(model.n_joints)
+        self.gamma = self._normalised_gain()
+        self._most, self._dead_zone = (
+            self.parameters["payload_scale_max"],
+            self.parameters["dead_zone"],
+        )
+        self._limit = torque_limits(model.arm)
+        self._learning = 0.0
+
+    @property
+    def payload_scale(self):
+        return self.model.scale
+
+    def _rates(self):
+        """Lambda and Lambda_2, (n,) [1/s]."""
+        kp, kv = self.kp, self.kv
+        root = kv**2 - 4.0 * kp
+        if root.min() < 0.0:
+            i = int(np.argmin(root))
+            raise DesignError(
+                f"slow.kv[{i}]: {kv[i]:g} 1/s with slow.kp[{i}] = {kp[i]:g} 1/s^2 makes {self.model.joint_names[i]}"
+                f" oscillate; adaptive_model_following needs real poles: kv of at least {2.0 * kp[i] ** 0.5:g}"
+            )
+        root = np.sqrt(root)
+        self.surface, self.approach = 0.5 * (kv - root), 0.5 * (kv + root)
+
+    def _normalised_gain(self):
+        """gamma of the module [1/(N m s) per rad/s], from the largest regressor over configurations."""
+        inertia = weight = 0.0
+        random = np.random.default_rng(0)
+        for q in random.uniform(-np.pi, np.pi, (CONFIGURATIONS, self.model.n_joints)):
+            M = self._one.mass_matrix(q)
+            extra = self._two.mass_matrix(q) - M
+            heavy = self._difference(q, self._at_rest)
+            inertia = max(inertia, np.linalg.norm(extra @ np.linalg.solve(M, extra), 2))
+            weight = max(weight, heavy @ np.linalg.solve(M, heavy))
+        if not inertia > 0.0:
+            raise DesignError(
+                f"payload: no joint of arm {self.model.arm.name} moves it: adaptive_model_following has nothing to"
+                " learn"
+            )
+        gain = self.parameters["adaptation_gain"]
+        slowest = max(self.approach.min(), 1e-6)
+        return gain / (inertia + gain * weight / slowest**2)
+
+    def _difference(self, q, qd):
+        """Velocity and gravity torque of one payload more, shape (n,) [N m]."""
+        return self._two.forces(q, qd) - self._one.forces(q, qd)
+
+    @staticmethod
+    def _coriolis(forces, q, v, w):
+        """C(q, v) w in Christoffel's form: the symmetric bilinear form of the quadratic C(q, v) v."""
+        return 0.25 * (forces(q, v + w) - forces(q, v - w))
+
+    def error_gains(self):
+        # C s is none of a single joint.
+        return (self.kp, self.kv) if self.model.n_joints == 1 else None
+
+    def regressor(self, q, qd, speed, acceleration):
+        """Y of the module for qd_r and qdd_r: torque that one payload more takes, shape (n,) [N m]."""
+        extra = self._two.mass_matrix(q) - self._one.mass_matrix(q)
+        Y = extra @ acceleration + self._difference(q, self._at_rest)
+        if q.size > 1:
+            Y += self._coriolis(self._difference, q, qd, speed)
+        return Y
+
+    def reset(self):
+        self.model.scale, self._learning = 1.0, 0.0
+
+    def advance(self, dt):
+        scale = self.model.scale + dt * self._learning
+        self.model.scale = min(max(scale, 0.0), self._most)
+
+    def torque(self, q, qd, reference, terms):
+        error, rate = reference.position - q, reference.velocity - qd
+        s = rate + self.surface * error
+        speed = qd + s  # qd_r
+        acceleration = reference.acceleration + self.surface * rate  # qdd_r
+        a, B = slow_subsystem(terms)
+        u = np.linalg.solve(B, acceleration + self.approach * s - a)
+        if q.size > 1:
+            u += self._coriolis(self._one.forces, q, qd, s)
+            u += (self.model.scale - 1.0) * self._coriolis(self._difference, q, qd, s)
+        beyond = (np.abs(u) > self._limit).any()
+        heard = s - np.clip(s, -self._dead_zone, self._dead_zone)
+        Y = self.regressor(q, qd, speed, acceleration)
+        self._learning = 0.0 if beyond else self.gamma * float(Y @ heard)
+        return u

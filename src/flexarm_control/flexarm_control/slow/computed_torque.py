@@ -1,0 +1,122 @@
+r"""Computed torque with an integral, on the slow subsystem (10) of Siciliano & Book (1986).
+
+.. math::
+    \bar u = B^{-1}(x_c)\,[\ddot q_{ref} + k_v\dot e + k_p e + w - a(x_c)], \qquad
+    \dot w = k_i e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
+
+the inverse dynamics of the rigid arm (Coriolis, gravity and friction are in a) under feedback (Luh, Walker & Paul
+1980; Sciavicco & Siciliano, *Modelling and control of robot manipulators*, ch. 6). With ``ki = 0`` and
+``feedforward_at: state`` it is `model_following` (13) itself. It differs in two things:
+
+- the integral w takes away what is left at rest of an error in payload, gravity or friction, where (13) keeps
+  B d / kp for ever. It is stable for ki < kp kv (Routh); w stops at its clamp, and while the slow torque is beyond
+  a joint's limit it does not grow in that direction;
+- x_c, where a and B are taken: the measured state, or with ``feedforward_at: reference`` the reference
+  (q_ref, qd_ref). Then no measured speed goes through Coulomb friction or Coriolis terms, whose noise is not fed
+  back; but they are cancelled to first order in the error only, so that the gains have to carry the rest.
+
+Assumes that a and B are known up to a slowly varying torque; linear error dynamics with ``state`` alone.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+from .base import KP, KV, SlowLaw
+from .rigid_arm import torque_limits
+
+
+class ComputedTorque(SlowLaw):
+    """Inverse dynamics with PID feedback; see the module.
+
+    Attributes
+    ----------
+    integral : ndarray, shape (n,)
+        w [rad/s^2].
+
+    Raises
+    ------
+    DesignError
+        When ki is not below kp kv: the error would grow.
+    """
+
+    PARAMETERS = (
+        KP,
+        KV,
+        Parameter(
+            "ki",
+            "float_array",
+            [0.0],
+            "Integral gain of computed torque, below kp kv; 0.0: none.",
+            unit="1/s^3",
+            low=0.0,
+            high=1e8,
+            length="joints",
+        ),
+        Parameter(
+            "integral_limit",
+            "float_array",
+            [2.0],
+            "Largest acceleration that the integral of computed torque asks for.",
+            unit="rad/s^2",
+            low=0.0,
+            high=1e4,
+            length="joints",
+        ),
+        Parameter(
+            "feedforward_at",
+            "string",
+            "state",
+            "Where computed torque takes inertia, Coriolis, gravity and friction: at the measured state or at the"
+            " reference.",
+            choices=("state", "reference"),
+        ),
+    )
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.kp, self.kv, self.ki, self._most = (
+            np.array(self.parameters[name]) for name in ("kp", "kv", "ki", "integral_limit")
+        )
+        self.at_reference = self.parameters["feedforward_at"] == "reference"
+        self._check_stability()
+        self._limit = torque_limits(model.arm)
+        n = model.n_joints
+        self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
+
+    def _check_stability(self):
+        unstable = (self.ki > 0.0) & (self.ki >= self.kp * self.kv)
+        if unstable.any():
+            i = int(np.argmax(unstable))
+            raise DesignError(
+                f"slow.ki[{i}]: {self.ki[i]:g} 1/s^3 is not below kp kv = {self.kp[i] * self.kv[i]:g} 1/s^3: the"
+                f" error of {self.model.joint_names[i]} would grow; lower slow.ki or raise slow.kp, slow.kv"
+            )
+
+    def error_gains(self):
+        return None if self.at_reference or self.ki.any() else (self.kp, self.kv)
+
+    def reset(self):
+        for state in (self.integral, self._error, self._beyond):
+            state[:] = 0.0
+
+    def advance(self, dt):
+        # Where the torque is at its limit, an error that pushes farther has nothing to gain.
+        grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
+        self.integral += dt * self.ki * grows
+        np.clip(self.integral, -self._most, self._most, out=self.integral)
+
+    def torque(self, q, qd, reference, terms):
+        np.subtract(reference.position, q, out=self._error)
+        v = self.kp * self._error
+        v += self.kv * (reference.velocity - qd)
+        v += reference.acceleration
+        v += self.integral
+        if self.at_reference:
+            terms = self.model.terms(reference.position, reference.velocity)
+        a, B = slow_subsystem(terms)
+        u = np.linalg.solve(B, v - a)
+        self._beyond[:] = np.sign(u) * (np.abs(u) > self._limit)
+        return u

@@ -1,0 +1,48 @@
+"""The arm under another payload than its file's: what a law that learns the payload believes."""
+
+import numpy as np
+
+from flexarm_dynamics.model import Terms
+
+
+class PayloadModel:
+    """A model whose `terms` are those of `scale` payloads; all else is the arm file's.
+
+    In the same mode shapes every term of (2) is affine in the payload's mass and inertia, so that two models give all.
+
+    Parameters
+    ----------
+    model : ArmModel
+
+    Attributes
+    ----------
+    scale : float
+        Payload in parts of the arm file's, set at will [-].
+    """
+
+    def __init__(self, model):
+        self._one, self._two = model, model.with_payload(2.0)
+        self.scale = 1.0
+
+    def __getattr__(self, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._one, name)
+
+    def terms(self, q, qd):
+        """Terms of (2) without deflections, as `ArmModel.terms`."""
+        one, more = self._one.terms(q, qd), self.scale - 1.0
+        if more == 0.0:
+            return one
+        two = self._two.terms(q, qd)
+        return Terms(*(_between(getattr(one, name), getattr(two, name), more) for name in _NAMES))
+
+
+_NAMES = ("M", "f1", "f2", "C1", "C2", "K1", "K2")
+
+
+def _between(one, two, more):
+    out = np.subtract(two, one)
+    out *= more
+    out += one
+    return out
