@@ -7,9 +7,11 @@ import numpy as np
 from flexarm_control.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.arm_controller import START_TOLERANCE, ArmController, Supervisor
 from flexarm_control.arm_observer import observe
+from flexarm_control.composite import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.composite import design, typed
 from flexarm_control.samples import ArmSample
 from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import Arm
 from flexarm_dynamics.errors import FlexarmError, MessageError, ModelError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.integrators import integrate
@@ -27,12 +29,13 @@ class ClosedLoop:
 
     Parameters
     ----------
-    arm : str
-        Arm file of all three: shipped name or path.
+    arm : str or Arm
+        Arm file of all three, shipped name or path; or what was read from one.
     slow, fast, observer : mapping
         ``{"type": …, parameters…}``.
     simulator, controller : mapping, optional
-        Further parameters of the simulator and of the controller.
+        Further parameters of the simulator and of the controller; without `feedforward` and the like in the
+        latter the design is the paper's, unchecked.
     manifold : mapping, optional
         ``{"type": …, parameters…}``; not given: the paper's.
     plant_arm : Arm, optional
@@ -44,6 +47,8 @@ class ClosedLoop:
     ----------
     lost : str
         Why the last run of `follow` ended early; empty if it did not.
+    unprepared : str
+        Why its trajectory went without preview; empty if it did not, or none was asked for.
     """
 
     def __init__(
@@ -58,18 +63,22 @@ class ClosedLoop:
         plant_arm=None,
         delay=0.0,
     ):
-        known = arm_file.load(arm)
+        known = arm if isinstance(arm, Arm) else arm_file.load(arm)
         sizes = {"joints": len(known.joints)}
-        settings = check_all(SIMULATOR_PARAMETERS, {"arm": str(arm), **(simulator or {})}, sizes)
+        settings = check_all(SIMULATOR_PARAMETERS, {"arm": known.name, **(simulator or {})}, sizes)
         settings["arm"] = known
         if plant_arm is not None:
             settings["plant_arm"] = plant_arm
         self.simulator = Simulator(settings)
         model = self.model = self.simulator.nominal
         self.observer = observe(model, *typed(observer, "observer"))
+        given, whole = dict(controller or {}), {p.name for p in DESIGN_PARAMETERS}
+        chosen = {name: given.pop(name) for name in whole & set(given)}
+        if chosen:
+            chosen.setdefault("rate", 1e9 / self.simulator.period_ns)
         declared = (*CONTROLLER_PARAMETERS, START_TOLERANCE)
-        limits = check_all(declared, controller or {}, {"joints": model.n_joints})
-        law = design(model, slow, fast, manifold)
+        limits = check_all(declared, given, {"joints": model.n_joints})
+        law = design(model, slow, fast, manifold, chosen or None)
         self.controller = ArmController(model, law, limits, limits.pop("start_tolerance"))
         n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
         self._measured, self._estimate = ArmSample(n, m, g), ArmSample(n, m)
@@ -77,7 +86,7 @@ class ClosedLoop:
         self._publish_velocity = settings["publish_joint_velocity"]
         self._set_delay(delay)
         self._reach = sum(link.length for link in model.arm.links)
-        self.lost = ""
+        self.lost = self.unprepared = ""
 
     def _set_delay(self, delay):
         if not 0.0 <= delay <= self.LONGEST_DELAY:
@@ -178,7 +187,7 @@ class ClosedLoop:
         """
         self.lost, self._failure = "", None
         self._answer()
-        verdict = self.controller.offer(trajectory)
+        verdict = self.controller.offer(trajectory, self._prepared(trajectory))
         if not verdict.accepted:
             raise MessageError(f"trajectory refused: {verdict.reason}")
         simulator, length = self.simulator, round(duration * 1e9)
@@ -198,6 +207,17 @@ class ClosedLoop:
                 break
         time = 1e-9 * (np.array(stamps) - (stamps[0] if start is None else start))
         return self._record(np.column_stack([time, rows]))
+
+    def _prepared(self, trajectory):
+        """What the feed-forward makes of the trajectory before it is offered; None where it can't."""
+        controller = self.controller
+        self.unprepared = ""
+        if controller.plans:
+            try:
+                return controller.prepare(trajectory, controller.law)
+            except FlexarmError as error:
+                self.unprepared = str(error)
+        return None
 
     def _moved(self, enabled):
         """Advance the plant; False when it left what its model holds for."""

@@ -17,6 +17,7 @@ from flexarm_control.arm_controller import START_TOLERANCE, Supervisor
 from flexarm_control.arm_observer import OBSERVERS
 from flexarm_control.arm_observer import PARAMETERS as OBSERVER_PARAMETERS
 from flexarm_control.composite import FAST, MANIFOLD, SLOW
+from flexarm_control.composite import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.trajectory import specs
 from flexarm_dynamics import arm_file, registry
 from flexarm_dynamics.arm import scaled
@@ -36,7 +37,7 @@ COMPONENTS = {
 }
 #: Parameters of the nodes themselves: they say nothing of the loop.
 OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
-CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE)
+CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS)
 #: What a scenario says itself.
 OF_SCENARIOS = ("plant_arm", "plant_modes", "noise", "seed")
 
@@ -208,23 +209,27 @@ def loop_of(scenario):
         if name.split(".")[0] in COMPONENTS:
             continue
         _check_name(name, values)
-        mine = controller if name in {p.name for p in CONTROLLER} else simulator
-        mine[name] = value
+        if name in {p.name for p in CONTROLLER}:
+            controller[name] = value
+        if name in {p.name for p in SIMULATOR_PARAMETERS}:  # `rate` is both nodes'
+            simulator[name] = value
     simulator |= {"noise": scenario.noise, "seed": scenario.seed}
     simulator["plant_modes"] = scenario.plant_modes
     if scenario.rate is not None:
-        simulator["rate"] = scenario.rate
+        simulator["rate"] = controller["rate"] = scenario.rate
+    controller.setdefault("feedforward", "model")
     if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
     groups = {prefix: _component(prefix, values) for prefix in COMPONENTS}
+    arm = arm_file.load(scenario.arm)
     plant = scaled(
-        arm_file.load(scenario.plant_arm or scenario.arm),
+        arm_file.load(scenario.plant_arm) if scenario.plant_arm else arm,
         scenario.payload_scale,
         scenario.stiffness_scale,
         scenario.damping_scale,
     )
     return ClosedLoop(
-        scenario.arm,
+        arm,
         **groups,
         simulator=simulator,
         controller=controller,
@@ -294,9 +299,9 @@ def run_loop(scenario):
 
 def _check_times(scenario, duration):
     limits = (
-        ("duration", duration),
         ("window", scenario.window),
         ("tolerance", scenario.tolerance),
+        ("duration", duration),
     )
     for name, value in limits:
         if not 0.0 <= value <= 1e5:

@@ -129,7 +129,36 @@ class ArmController:
         """Note a trajectory that was refused before it could be offered."""
         self._trajectory_reason = reason
 
-    def offer(self, trajectory):
+    @property
+    def plans(self):
+        """Whether a trajectory is worth a `prepare` before it is offered."""
+        return self.law.feedforward is not None and self.law.feedforward.plans
+
+    def prepare(self, trajectory, law):
+        """Design work for a trajectory that is about to be offered; off the control path, in any thread.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+        law : CompositeControl
+            The one in force.
+
+        Returns
+        -------
+        object or None
+            For `offer`; None where there is none to do.
+
+        Raises
+        ------
+        DesignError
+            When it can't be done: the trajectory may be offered without.
+        """
+        if law.feedforward is None:
+            return None
+        start = self.reference.resting
+        return None if start is None else law.feedforward.prepare(trajectory, start)
+
+    def offer(self, trajectory, plan=None):
         """Offer a trajectory.
 
         While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
@@ -138,6 +167,8 @@ class ArmController:
         Parameters
         ----------
         trajectory : JointTrajectoryData
+        plan : object, optional
+            What `prepare` made for it.
 
         Returns
         -------
@@ -150,6 +181,8 @@ class ArmController:
             verdict = self.reference.offer(trajectory)
         if verdict.accepted:
             self._trajectory_reason = ""
+            if self.law.feedforward is not None:
+                self.law.feedforward.take(plan, verdict.trajectory_id)
         elif not verdict.repeat:
             self._trajectory_reason = verdict.reason
         return verdict
@@ -175,6 +208,7 @@ class ArmController:
         if verdict == SampleOrder.REPEAT and (self.enabled or self._waiting):
             return self.enabled
         law = self.answered_by = self.law
+        law.limit = self._limit
         if sample.amplitude is None or (sample.rate is None and law.needs_rates):
             self._wait(sample, verdict)
             return False

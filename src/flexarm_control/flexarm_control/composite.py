@@ -8,14 +8,47 @@ import numpy as np
 
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import check_all
+from flexarm_dynamics.parameters import Parameter, check_all
 
+from . import full_order
+from .feedforward.base import Settings
 from .manifold.quasi_steady import QuasiSteady
 
 SLOW, FAST, MANIFOLD = "flexarm.slow_laws", "flexarm.fast_laws", "flexarm.manifolds"
+FEEDFORWARD = "flexarm.feedforwards"
 
 #: Prefix of the parameters of each group.
 PREFIX = {SLOW: "slow.", FAST: "fast.", MANIFOLD: "manifold."}
+
+#: Parameters of the whole design.
+PARAMETERS = (
+    Parameter(
+        "feedforward",
+        "string",
+        "model",
+        "Motion that the arm is held to: none, the reference and the slow manifold; model, the nominal arm"
+        " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
+        " end at rest. Or another of the entry-point group flexarm.feedforwards.",
+    ),
+    Parameter(
+        "rate",
+        "float",
+        1000.0,
+        "Samples per second that the driver or simulator sends: what designs are checked at.",
+        unit="Hz",
+        low=1.0,
+        high=20000.0,
+    ),
+    Parameter(
+        "stability_margin",
+        "float",
+        0.0,
+        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this.",
+        unit="1/s",
+        low=-1e3,
+        high=1e3,
+    ),
+)
 
 
 class CompositeControl:
@@ -50,6 +83,27 @@ class CompositeControl:
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
+
+    @property
+    def limit(self):
+        """Torque limit that the feed-forward keeps to, shape (n,) [N m]."""
+        return None if self.feedforward is None else self.feedforward.limit
+
+    @limit.setter
+    def limit(self, value):
+        if self.feedforward is not None:
+            self.feedforward.limit = value
+
+    def resume(self, other):
+        """Go on from another control's states: a redesign does not begin anew."""
+        for mine, its in (
+            (self.slow, other.slow),
+            (self.fast, other.fast),
+            (self.feedforward, other.feedforward),
+        ):
+            if mine is not None and its is not None:
+                mine.resume(its)
+        self.limit = other.limit
 
     @property
     def needs_rates(self):
@@ -155,7 +209,7 @@ def design_law(group, name, model, values, *known):
     return law(model, *known, check_all(law.PARAMETERS, values, sizes(model), PREFIX[group]))
 
 
-def design(model, slow, fast, manifold=None):
+def design(model, slow, fast, manifold=None, settings=None):
     """Composite control from mappings with the key `type` and the component's parameters.
 
     Parameters
@@ -163,23 +217,38 @@ def design(model, slow, fast, manifold=None):
     model : ArmModel
     slow, fast, manifold : mapping
         ``{"type": "linear_model_following", "kp": [6.25], …}``; no manifold: the paper's.
+    settings : mapping, optional
+        Values of `PARAMETERS`; not given: the paper's design, without feed-forward and unchecked.
 
     Returns
     -------
     CompositeControl
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError
+        Nothing is made then.
     """
 
     def law(group, given, *known):
         name, values = typed(given, PREFIX[group][:-1])
         return design_law(group, name, model, values, *known)
 
-    slow_law = law(SLOW, slow)
-    return CompositeControl(
-        model,
-        slow_law,
-        law(FAST, fast),
-        law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law),
-    )
+    slow_law, fast_law = law(SLOW, slow), law(FAST, fast)
+    surface = law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law)
+    if settings is None:
+        return CompositeControl(model, slow_law, fast_law, surface)
+    chosen = check_all(PARAMETERS, settings)
+    q = np.array(fast_law.parameters.get("configuration", np.zeros(model.n_joints)))
+    control = CompositeControl(model, slow_law, fast_law, surface)
+    free = slow_law.drifts  # joints that nothing holds have no pole left of zero
+    if not free:
+        full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
+    if chosen["feedforward"] == "none" or free:
+        return control
+    kind = registry.find(FEEDFORWARD, chosen["feedforward"])
+    motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
+    return CompositeControl(model, slow_law, fast_law, surface, motion)
 
 
 def typed(given, prefix):

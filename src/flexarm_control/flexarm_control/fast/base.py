@@ -34,6 +34,9 @@ class FastLaw(ABC):
     def reset(self):
         """A new session begins: forget the states that the last one left."""
 
+    def resume(self, other):
+        """Go on from another law's states, which may be of another kind: a redesign does not begin anew."""
+
     def advance(self, dt):
         """Move the law's own states, if it has any, by the time since the last sample.
 

@@ -46,6 +46,9 @@ class Feedforward(ABC):
         Torque limit in force [N m]; infinite: none.
     """
 
+    #: Whether `prepare` has anything to do.
+    plans = False
+
     def __init__(self, model, manifold, settings):
         n, m = model.n_joints, model.n_modes
         self.model, self.manifold, self.settings = model, manifold, settings
@@ -67,8 +70,8 @@ class Feedforward(ABC):
     def resume(self, other):
         """Go on from another feed-forward's motion: a redesign does not begin anew."""
 
-    def take(self, plan):
-        """Follow what `prepare` made, as soon as the reference follows its trajectory."""
+    def take(self, plan, trajectory_id):
+        """Follow what `prepare` made, or nothing, None, as soon as the reference follows its trajectory."""
 
     def prepare(self, trajectory, start):
         """Design work for a trajectory that will begin from a state of rest, (3, n); off the control path.

@@ -18,7 +18,7 @@ doing so twice. The motion then serves `model` in the place of the slow manifold
 takes up what is left, sampling and products of deflections.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline
@@ -26,6 +26,7 @@ from scipy.linalg import eigh
 from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.model import build
 
 from ..trajectory.path import Path
 from ..trajectory.values import SECOND
@@ -93,13 +94,14 @@ class Plan:
 class Preview(ModelFeedforward):
     """The planned motion, while there is one; `model` otherwise. See the module."""
 
+    plans = True
+
     def __init__(self, model, manifold, settings):
         super().__init__(model, manifold, settings)
         self._plan = None
 
-    def take(self, plan):
-        """Follow a plan as soon as the reference follows its trajectory; None: none."""
-        self._plan = plan
+    def take(self, plan, trajectory_id):
+        self._plan = None if plan is None else replace(plan, trajectory_id=trajectory_id)
 
     def resume(self, other):
         super().resume(other)
@@ -135,7 +137,8 @@ class Preview(ModelFeedforward):
         DesignError
             When the trajectory does not go from rest to rest, is too long, or can't be done within the torque limit.
         """
-        return plan(self.model, trajectory, start, self.limit)
+        # A model of its own: the loop goes on with this one meanwhile.
+        return plan(build(self.model.arm), trajectory, start, self.limit)
 
 
 def plan(model, trajectory, start, limit):

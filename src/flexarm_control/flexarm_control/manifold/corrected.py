@@ -18,8 +18,8 @@ is left out is of order mu^(k+1). With the joint rows of (2) the joints then mov
 
 .. math:: u = \bar u + M_{12}\ddot\delta + C_1\dot\delta + K_1(\delta - \delta^{(0)}) .
 
-The derivatives are taken along the slow motion through the present state, central differences over `expansion.STEP`: the
-reference goes on as it is known to, and the tracking error decays as the slow law makes it,
+The derivatives are taken along the slow motion through the present state, by central differences over
+`expansion.STEP`: the reference goes on as it is known to, and the tracking error decays as the slow law makes it,
 :math:`\ddot e = -k_v\dot e - k_p e`, so that the manifold holds off the reference, too, and the slow poles stay
 where they were placed. The derivation, beside a manifold found numerically: docs/control.md.
 """

@@ -11,7 +11,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control import arm_controller, composite, trajectory
 from flexarm_control.arm_controller import ArmController, Supervisor
-from flexarm_control.composite import FAST, SLOW, CompositeControl
+from flexarm_control.composite import FAST, MANIFOLD, PREFIX, SLOW
 from flexarm_control.samples import ArmSample
 from flexarm_dynamics import arm_file, model, registry
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
@@ -35,6 +35,13 @@ FAST_TYPE = Parameter(
     "lqr",
     "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone.",
 )
+MANIFOLD_TYPE = Parameter(
+    "type",
+    "string",
+    "corrected",
+    "Slow manifold that the fast control holds the deflections to, by its name in the entry-point group"
+    " flexarm.manifolds; quasi_steady: the paper's.",
+)
 STATE_TIMEOUT = Parameter(
     "state_timeout",
     "float",
@@ -57,10 +64,13 @@ def parameter_groups():
         return merge(*(law.PARAMETERS for law in registry.importable(group).values()))
 
     common = (*arm_controller.PARAMETERS, arm_controller.START_TOLERANCE, STATE_TIMEOUT)
+    kinds = {SLOW: SLOW_TYPE, FAST: FAST_TYPE, MANIFOLD: MANIFOLD_TYPE}
     return {
-        "": (ARM, *common),
-        "slow.": (replace(SLOW_TYPE, choices=registry.names(SLOW)), *laws(SLOW)),
-        "fast.": (replace(FAST_TYPE, choices=registry.names(FAST)), *laws(FAST)),
+        "": (ARM, *common, *composite.PARAMETERS),
+        **{
+            PREFIX[group]: (replace(kind, choices=registry.names(group)), *laws(group))
+            for group, kind in kinds.items()
+        },
     }
 
 
@@ -77,10 +87,10 @@ class ControllerNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(composite.sizes(self.model))
-        law = CompositeControl(self.model, self._design(SLOW), self._design(FAST))
+        self._good = self._law_parameters()
+        law = self._design(self.model, self._good)
         settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
         self.core = ArmController(self.model, law, settings, parameters["start_tolerance"])
-        self._good = self._law_parameters()
         parameters.on_change(self._changed)
         arm = self.arm
         self._reader = StateReader(arm)
@@ -187,11 +197,27 @@ class ControllerNode(ArmNode):
                 position_high=high,
                 velocity_max=velocity,
             )
-            verdict = self.core.offer(data)
         except TrajectoryError as error:
             self.core.refuse(str(error))
             self.get_logger().warning(f"trajectory refused: {error}")
             return
+        if self.core.plans:
+            self._designer.submit(self._prepare, data, self.core.law)
+        else:
+            self._offer(data)
+
+    def _prepare(self, data, law):
+        """In the design thread: what the feed-forward wants to know before the trajectory is offered."""
+        plan = None
+        try:
+            plan = self.core.prepare(data, law)
+        except Exception as error:
+            what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+            self.get_logger().warning(f"trajectory without preview: {what}{error}")
+        self.executor.create_task(self._offer, data, plan)
+
+    def _offer(self, data, plan=None):
+        verdict = self.core.offer(data, plan)
         if verdict.accepted:
             self.get_logger().info(f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}")
         elif not verdict.repeat:
@@ -200,36 +226,38 @@ class ControllerNode(ArmNode):
     # Design ----------------------------------------------------------------------------------
 
     def _law_parameters(self):
-        return {"slow.": self.parameters.group("slow."), "fast.": self.parameters.group("fast.")}
+        """Parameters of the whole design: by prefix, the top level's under an empty one."""
+        top = self.parameters.group("", {p.name for p in composite.PARAMETERS})
+        return {"": top} | {prefix: self.parameters.group(prefix) for prefix in PREFIX.values()}
 
-    def _design(self, group, values=None):
-        prefix = "slow." if group == SLOW else "fast."
-        values = self.parameters.group(prefix) if values is None else values
-        law = registry.find(group, values["type"])
-        declared = {p.name for p in law.PARAMETERS}
-        chosen = {k: v for k, v in values.items() if k in declared}
-        made = composite.design_law(group, values["type"], self.model, chosen)
-        for warning in made.warnings():
-            self.get_logger().warning(warning)
+    def _design(self, arm_model, values):
+        """The control that parameters describe, each law with those that it declares."""
+        chosen = []
+        for group in (SLOW, FAST, MANIFOLD):
+            given = values[PREFIX[group]]
+            law = registry.find(group, given["type"])
+            declared = {"type", *(p.name for p in law.PARAMETERS)}
+            chosen.append({k: v for k, v in given.items() if k in declared})
+        made = composite.design(arm_model, *chosen, values[""])
+        for part in (made.slow, made.fast, made.feedforward):
+            for warning in part.warnings() if part is not None else ():
+                self.get_logger().warning(warning)
         return made
 
     def _changed(self, names):
         if names & {p.name for p in arm_controller.PARAMETERS}:
             settings = self.parameters.group("", {p.name for p in arm_controller.PARAMETERS})
             self.core.configure(settings)
-        groups = [
-            g for g, p in ((SLOW, "slow."), (FAST, "fast.")) if any(n.startswith(p) for n in names)
-        ]
-        if groups:
-            self._designer.submit(self._redesign, groups, self._law_parameters())
+        whole = {p.name for p in composite.PARAMETERS}
+        if any(n in whole or n.startswith(tuple(PREFIX.values())) for n in names):
+            self._designer.submit(self._redesign, self._law_parameters())
 
-    def _redesign(self, groups, values):
+    def _redesign(self, values):
         """In the design thread: a new law swaps whole, or the parameters go back to what they were."""
         try:
-            law = self.core.law
-            slow = self._design(SLOW, values["slow."]) if SLOW in groups else law.slow
-            fast = self._design(FAST, values["fast."]) if FAST in groups else law.fast
-            self.core.law = CompositeControl(self.model, slow, fast)
+            # A model of its own: the loop goes on with the old one meanwhile.
+            law = self._design(model.build(self.arm), values)
+            self.executor.create_task(self._swap, law)
             self._good = values
         except Exception as error:
             # A law may be anybody's, and this thread would drop its error without a word.
@@ -242,6 +270,11 @@ class ControllerNode(ArmNode):
                 if values[prefix][name] != value
             ]
             self.executor.create_task(self.set_parameters_atomically, old)
+
+    def _swap(self, law):
+        """Between two samples: the new law goes on from where the old one is."""
+        law.resume(self.core.law)
+        self.core.law = law
 
     # Life cycle ------------------------------------------------------------------------------
 
@@ -270,6 +303,8 @@ class ControllerNode(ArmNode):
             "state": core.state.name,
             "slow law": self.parameters["slow.type"],
             "fast law": self.parameters["fast.type"],
+            "slow manifold": self.parameters["manifold.type"],
+            "feed-forward": self.parameters["feedforward"],
             "samples per second": rate,
             "saturated samples": self._saturations,
             "trajectory": core.trajectory_id,

@@ -76,6 +76,24 @@ class AdaptiveModelFollowing(SlowLaw):
             high=1e4,
         ),
         Parameter(
+            "identification_rate",
+            "float",
+            1.0,
+            "x",
+            unit="1/s",
+            low=0.0,
+            high=1e3,
+        ),
+        Parameter(
+            "filter_bandwidth",
+            "float",
+            20.0,
+            "x",
+            unit="rad/s",
+            low=0.1,
+            high=1e3,
+        ),
+        Parameter(
             "payload_scale_max",
             "float",
             5.0,
@@ -115,6 +133,12 @@ class AdaptiveModelFollowing(SlowLaw):
         )
         self._limit = torque_limits(model.arm)
         self._learning = 0.0
+        n = model.n_joints
+        self._now, self._filtered, self._started = np.zeros((3, n)), np.zeros((3, n)), False
+        self._bandwidth, self._identification = (
+            self.parameters["filter_bandwidth"],
+            self.parameters["identification_rate"],
+        )
 
     @property
     def payload_scale(self):
@@ -135,11 +159,12 @@ class AdaptiveModelFollowing(SlowLaw):
 
     def _normalised_gain(self):
         """gamma of the module [1/(N m s) per rad/s], from the largest regressor over configurations."""
-        inertia = weight = 0.0
+        inertia = weight = largest = 0.0
         random = np.random.default_rng(0)
         for q in random.uniform(-np.pi, np.pi, (CONFIGURATIONS, self.model.n_joints)):
             M = self._one.mass_matrix(q)
             extra = self._two.mass_matrix(q) - M
+            largest = max(largest, np.linalg.norm(extra, 2))
             heavy = self._difference(q, self._at_rest)
             inertia = max(inertia, np.linalg.norm(extra @ np.linalg.solve(M, extra), 2))
             weight = max(weight, heavy @ np.linalg.solve(M, heavy))
@@ -148,6 +173,7 @@ class AdaptiveModelFollowing(SlowLaw):
                 f"payload: no joint of arm {self.model.arm.name} moves it: adaptive_model_following has nothing to"
                 " learn"
             )
+        self._threshold = (0.5 * largest) ** 2
         gain = self.parameters["adaptation_gain"]
         slowest = max(self.approach.min(), 1e-6)
         return gain / (inertia + gain * weight / slowest**2)
@@ -174,10 +200,13 @@ class AdaptiveModelFollowing(SlowLaw):
         return Y
 
     def reset(self):
-        self.model.scale, self._learning = 1.0, 0.0
+        self.model.scale, self._learning, self._started = 1.0, 0.0, False
 
     def advance(self, dt):
         scale = self.model.scale + dt * self._learning
+        keep = np.exp(-self._bandwidth * dt)
+        self._filtered *= keep
+        self._filtered += (1.0 - keep) * self._now
         self.model.scale = min(max(scale, 0.0), self._most)
 
     def torque(self, q, qd, reference, terms):
@@ -193,5 +222,16 @@ class AdaptiveModelFollowing(SlowLaw):
         beyond = (np.abs(u) > self._limit).any()
         heard = s - np.clip(s, -self._dead_zone, self._dead_zone)
         Y = self.regressor(q, qd, speed, acceleration)
-        self._learning = 0.0 if beyond else self.gamma * float(Y @ heard)
+        self._now[:] = q, qd, u
+        if not self._started:
+            self._filtered[:], self._started = self._now, True
+        self._learning = 0.0 if beyond else self.gamma * float(Y @ heard) + self._identified(qd)
         return u
+
+    def _identified(self, qd):
+        q, v, u = self._filtered
+        acceleration = self._bandwidth * (qd - v)
+        a, B = slow_subsystem(self.model.terms(q, v))
+        missing = u - np.linalg.solve(B, acceleration - a)
+        W = self.regressor(q, v, v, acceleration)
+        return self._identification * float(W @ missing) / (float(W @ W) + self._threshold)

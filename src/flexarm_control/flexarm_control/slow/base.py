@@ -46,6 +46,8 @@ class SlowLaw(ABC):
 
     #: Declared parameters, named ``slow.<name>`` in the controller node.
     PARAMETERS = ()
+    #: True for a law that leaves the joints free.
+    drifts = False
 
     def __init__(self, model, parameters):
         self.model = model
@@ -77,6 +79,9 @@ class SlowLaw(ABC):
 
     def reset(self):
         """A new session begins: forget what was learnt from the samples of the last one."""
+
+    def resume(self, other):
+        """Go on from another law's states, which may be of another kind: a redesign does not begin anew."""
 
     def advance(self, dt):
         """Move the law's own states, if it has any, by the time since the last sample.

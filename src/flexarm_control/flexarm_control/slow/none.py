@@ -8,6 +8,8 @@ from .base import SlowLaw
 class NoSlowLaw(SlowLaw):
     """u_slow = 0."""
 
+    drifts = True
+
     def torque(self, q, qd, reference, terms):
         return np.zeros(self.model.n_joints)
 
