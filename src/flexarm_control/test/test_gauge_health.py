@@ -205,6 +205,15 @@ def test_one_gauge_that_jumps_does_not_make_the_others_stuck(lab):
             assert not np.delete(health.health, 2).any()
 
 
+def test_two_gauges_at_the_ends_of_their_range_are_no_witnesses_of_motion(lab):
+    health = health_of(lab)
+    for k in range(200):
+        strain = np.full(4, 5 * COUNT)
+        strain[[0, 2]] = 1e-3 if k % 2 else -1e-3
+        health.update(strain)
+        assert_array_equal(health.health, [SATURATED, GOOD, SATURATED, GOOD])
+
+
 def test_slow_motion_within_counts_is_not_stuck(lab):
     """The outer gauge keeps its count for long while the root goes through several."""
     health = health_of(lab, 20)
