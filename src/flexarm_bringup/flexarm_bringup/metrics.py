@@ -170,9 +170,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
             Of arms of one link in a plane: the tip's own deflection y, and `case_study_metrics` where the record
             reaches its window.
     """
-    record = _from(record, 0.0)
-    if not record.time.size:
-        return {}
+    if record.time[-1] >= 0.0:  # else the arm was lost before the motion began
+        record = _from(record, 0.0)
     error = np.abs(record.reference - record.plant_position)
     tip = _path(plant_model, record.plant_position, record.plant_amplitude)
     wanted = _path(model, record.reference, np.zeros((record.time.size, model.n_modes)))

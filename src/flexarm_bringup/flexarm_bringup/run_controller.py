@@ -112,8 +112,8 @@ def run_controller(options):
     scenario = scenario_of(options)
     record, metrics, loop = scenarios.run_loop(scenario)
     plant = loop.simulator.plant_model
-    if scenario.noise and not any(g.noise or g.drift for g in plant.arm.gauges):
-        print(f"--noise: the arm file of {plant.arm.name} states none", file=sys.stderr)
+    for warning in warnings(scenario, loop):
+        print(f"flexarm simulate: {warning}", file=sys.stderr)
     if options.out:
         rows = table(record, loop.model, plant)
         tables.write(column_names(loop.model, plant), rows, options.out)
@@ -129,17 +129,28 @@ def run_controller(options):
         sys.exit(1)
 
 
+def warnings(scenario, loop):
+    """What a person should know of a run that was carried out all the same."""
+    law, gauges = loop.controller.law, loop.simulator.plant_model.arm.gauges
+    for part in (law.slow, law.fast, law.feedforward):
+        if part is not None:
+            yield from part.warnings()
+    if loop.unprepared:
+        yield f"no preview of the trajectory: {loop.unprepared}"
+    if scenario.noise and not any(g.noise or g.drift for g in gauges):
+        yield f"--noise: the arm file of {loop.model.arm.name} states none"
+
+
 # What is printed -------------------------------------------------------------------------------
 
 
 def report(scenario, arm_model, metrics):
     """Lines with the metrics, for reading."""
-    slow, fast, observer = (
-        scenarios.type_of(k, scenario.controller) for k in ("slow", "fast", "observer")
-    )
-    m = metrics
+    values, m = scenario.controller, metrics
+    parts = [f"{k} {scenarios.type_of(k, values)}" for k in scenarios.COMPONENTS]
     lines = [
-        f"{arm_model.arm.name}: slow {slow}, fast {fast}, observer {observer}; {scenario.trajectory}",
+        f"{arm_model.arm.name}: {', '.join(parts)}, feed-forward {values.get('feedforward', 'model')}",
+        f"{scenario.trajectory}",
         f"{m['motion_s']:g} s of motion, {m['simulated_s']:g} s in all; controller {m['state']}",
         "",
         f"{'joint':16}{'peak error':>12}{'rms error':>12}{'peak torque':>13}{'rms torque':>12}",

@@ -127,11 +127,12 @@ def parameters(file, settings=()):
     """
     nodes = parameter_files.load(file)
     of_simulator = {p.name for p in SIMULATOR_PARAMETERS}
-    found = {k: v for k, v in nodes["simulator"].items() if k in of_simulator}
+    found = {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
+    # The rate is the simulator's: what the controller is told of it is for other sources.
+    found |= {k: v for k, v in nodes["simulator"].items() if k in of_simulator}
     for node in ("observer", "controller"):
         own = parameter_files.PREFIXES[node]
         found |= {k: v for k, v in nodes[node].items() if k.split(".")[0] in own}
-    found |= {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
     found = {k: v for k, v in found.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
     chosen = dict(map(_setting, settings))
     found |= chosen
