@@ -21,15 +21,9 @@ A parameter is found only where the motion excites it: friction at rest is not o
 costs milliseconds per linearisation: for records, and for arms sampled slowly; see docs/observers.md.
 """
 
-import copy
-from dataclasses import replace
-
 import numpy as np
 
-from flexarm_dynamics.assembly import assemble, outboard
-from flexarm_dynamics.chain import Chain
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import ArmModel
 from flexarm_dynamics.parameters import Parameter
 
 from .kalman import NOISE, Kalman
@@ -100,7 +94,7 @@ class ExtendedKalman(Kalman):
 
         self._heavier = None
         if values["estimate_payload"]:
-            self._heavier = with_payload(model, 2.0)
+            self._heavier = _twice_loaded(model)
             add(["payload scale [-]"], "payload", [1.0], LARGEST_SCALE)
         self._viscous_at, self._coulomb_at = slice(0, 0), slice(0, 0)
         for column, kind, unit in ((0, "viscous", "N m s/rad"), (1, "coulomb", "N m")):
@@ -187,44 +181,12 @@ class ExtendedKalman(Kalman):
         return discretise(A, dt, density)
 
 
-def with_payload(model, scale):
-    """The same arm with its payload's mass and inertia scaled; mode shapes and modal damping of the original.
-
-    Held shapes keep the modal coordinates what they were, and the equations of motion affine in the scale.
-
-    Raises
-    ------
-    DesignError
-        When the arm has no payload to scale.
-    """
+def _twice_loaded(model):
+    """The arm with twice its payload, in the same mode shapes: the equations of motion are affine in it."""
     payload = model.arm.payload
     if not payload.mass > 0.0:
         raise DesignError(
             f"{model.arm.name}: payload.mass is {payload.mass}, and estimate_payload estimates its scale: give the"
             " arm file the payload that is expected, or set observer.estimate_payload to false"
         )
-    inertia = tuple(tuple(scale * v for v in row) for row in payload.inertia)
-    arm = replace(model.arm, payload=replace(payload, mass=scale * payload.mass, inertia=inertia))
-    if isinstance(model, Chain):
-        return _SameShapes(model, arm)
-    return _same_shapes(model, arm)
-
-
-class _SameShapes(Chain):
-    """A chain with another payload and everything else held."""
-
-    def __init__(self, model, arm):
-        ArmModel.__init__(self, arm)
-        self._compiled, self._shapes = model._compiled, model._shapes
-        loads = outboard(arm)
-        new = assemble(arm, self._shapes, loads)
-        self.data = new._replace(damping=model.data.damping)
-
-
-def _same_shapes(model, arm):
-    """The same of a closed one-link form."""
-    other = copy.copy(model)
-    other.arm = arm
-    other.coefficients = replace(other.derive(), D=model.coefficients.D)
-    other._terms_at_rest = other._constant_terms()
-    return other
+    return model.with_payload(2.0)

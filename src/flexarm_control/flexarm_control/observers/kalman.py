@@ -40,7 +40,7 @@ NOISE = (
         "strain_noise",
         "float",
         0.0,
-        "Noise of every gauge, rms; 0: each as in the arm file, 1e-6 where it states none.",
+        "Noise of every gauge, rms; 0: each as in the arm file, bits included, 1e-6 where it states none.",
         unit="strain",
         low=0.0,
         high=1e-2,
@@ -66,7 +66,7 @@ NOISE = (
     Parameter(
         "torque_noise",
         "float_array",
-        [0.05],
+        [0.01],
         "Unknown torque at each joint: root of the spectral density; an error of rms s that lasts t: s sqrt(2 t).",
         unit="N m s^0.5",
         low=1e-9,
@@ -76,7 +76,7 @@ NOISE = (
     Parameter(
         "modal_force_noise",
         "float",
-        0.01,
+        0.001,
         "Unknown force on every mode: root of the spectral density.",
         unit="N s^0.5, N m s^0.5",
         low=0.0,
@@ -253,7 +253,8 @@ def measurement_covariance(model, parameters):
     if not model.arm.gauges:
         out[n:, n:] = parameters["amplitude_noise"] ** 2 * np.eye(m)
         return out
-    stated = [parameters["strain_noise"] or g.noise or UNSTATED_STRAIN for g in model.arm.gauges]
+    gauges, given = model.arm.gauges, parameters["strain_noise"]
+    stated = [given or g.uncertainty or UNSTATED_STRAIN for g in gauges]
     weighted = StrainMap(model).inverse * np.array(stated)
     out[n:, n:] = weighted @ weighted.T
     return out
