@@ -58,7 +58,7 @@ class OutputFeedback(FastLaw):
         Parameter(
             "observer_pole",
             "float",
-            200.0,
+            100.0,
             "How much faster than an open fast mode the estimate of it decays.",
             unit="1/s",
             low=1.0,
@@ -77,7 +77,7 @@ class OutputFeedback(FastLaw):
 
     needs_rates = False
 
-    #: Designs are kept for this many different time steps; a new one takes about 0.2 ms.
+    #: Designs are kept for this many different time steps; a new one takes about 0.1 ms.
     KEPT = 64
     #: Part of half a period of the fastest mode, beyond which amplitudes do not correct.
     LONGEST = 0.9

@@ -1,0 +1,496 @@
+"""Scheduled gains, placed poles, and feedback of amplitudes alone: what each of these fast laws promises."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.signal import place_poles
+
+from flexarm_control.composite import FAST, design, design_law
+from flexarm_control.fast.scheduled_lqr import GainTable
+from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics.errors import DesignError, ParameterError
+from flexarm_dynamics.model import Terms
+from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
+
+ARMS = ("R", "one_link", "two_link", "long_reach")
+#: A working range of long_reach: shoulder, elbow and wrist away from their stops.
+WORKING = {"low": [0.0, -0.9, 0.4, -1.0], "high": [0.0, 0.3, 1.8, 1.0]}
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """The shipped arms by name."""
+    return {name: model.build(arm_file.load(name)) for name in (*ARMS, "rigid")}
+
+
+@pytest.fixture(scope="module")
+def two_link_scheduled(arms):
+    return design_law(FAST, "scheduled_lqr", arms["two_link"], {"alpha": 1.0, "r": [1.0, 3.0]})
+
+
+@pytest.fixture(scope="module")
+def long_reach_scheduled(arms):
+    return design_law(FAST, "scheduled_lqr", arms["long_reach"], {"alpha": 1.0, **WORKING})
+
+
+def boundary_layer(arm, q):
+    return fast_subsystem(arm.terms(np.asarray(q, float), np.zeros(arm.n_joints)))
+
+
+def made_up_model(couplings, damping):
+    """Joints and two modes of 3 and 7 rad/s; `couplings` (n, 2) in the mass matrix."""
+    couplings = np.atleast_2d(couplings)
+    n = couplings.shape[0]
+    M = np.eye(n + 2)
+    M[:n, n:], M[n:, :n] = couplings, couplings.T
+    terms = Terms(
+        M, np.zeros(n), np.zeros(2), np.zeros((n, 2)), np.diag(damping), np.zeros((n, 2)),
+        np.diag([9.0, 49.0]),
+    )  # fmt: skip
+    return SimpleNamespace(
+        n_joints=n, n_modes=2, mode_names=("slender_mode", "stiff_mode"), terms=lambda q, qd: terms
+    )
+
+
+def test_a_parameter_of_several_fast_laws_is_one_declaration():
+    declared = {}
+    for law in registry.importable(FAST).values():
+        for parameter in law.PARAMETERS:
+            assert declared.setdefault(parameter.name, parameter) == parameter
+    assert {"q", "r", "alpha", "configuration"} <= set(declared)
+
+
+@pytest.mark.parametrize("name", ["lqr", "scheduled_lqr", "pole_placement", "output_feedback"])
+def test_a_rigid_arm_has_nothing_to_damp(arms, name):
+    law = design_law(FAST, name, arms["rigid"], {})
+    law.reset()
+    law.torque(np.zeros(0), np.zeros(2))
+    law.advance(1e-3)
+    assert_array_equal(law.torque(np.zeros(0), np.zeros(2)), [0.0, 0.0])
+    assert law.K_f.shape == (2, 0)
+
+
+def test_a_riccati_solver_that_gives_up_refuses_the_design(arms, monkeypatch):
+    import control
+
+    def fails(*_):
+        raise np.linalg.LinAlgError("no finite solution found")
+
+    monkeypatch.setattr(control, "lqr", fails)
+    with pytest.raises(
+        DesignError, match=r"configuration \[0.0\].*\(20\).*alpha = 5.0: no finite solution found"
+    ):
+        design_law(FAST, "lqr", arms["R"], {})
+
+
+@pytest.mark.parametrize(
+    ("damping", "named"), [([0.1, 12.0], "slender_mode"), ([5.0, 0.1], "stiff_mode")]
+)
+def test_the_mode_that_is_named_is_one_that_has_to_be_faster(damping, named):
+    # the other one is out of reach too, but decays fast enough by itself
+    arm = made_up_model([[0.0, 0.0]], damping)
+    with pytest.raises(DesignError, match=rf"can't reach {named}, which must decay faster"):
+        design_law(FAST, "lqr", arm, {"alpha": 1.0})
+
+
+# --------------------------------------------------------------------------- scheduled_lqr
+
+
+def test_the_joints_that_change_the_boundary_layer_are_found(
+    arms, two_link_scheduled, long_reach_scheduled
+):
+    assert_array_equal(two_link_scheduled.scheduled, [1])
+    assert_array_equal(long_reach_scheduled.scheduled, [1, 2, 3])  # not the yaw
+    assert two_link_scheduled.gains.shape == (5, 2, 8)
+    assert long_reach_scheduled.gains.shape == (125, 4, 20)
+    assert design_law(FAST, "scheduled_lqr", arms["R"], {}).scheduled.size == 0
+
+
+def test_gravity_schedules_the_gain_of_an_arm_in_a_vertical_plane(heavy_arm):
+    law = design_law(FAST, "scheduled_lqr", heavy_arm, {})
+    assert_array_equal(law.scheduled, [0])
+    assert not np.allclose(law.gain([0.0]), law.gain([1.5]), rtol=1e-5)
+
+
+def test_where_no_joint_matters_the_gain_is_that_of_lqr(arms):
+    law = design_law(FAST, "scheduled_lqr", arms["R"], {})
+    fixed = design_law(FAST, "lqr", arms["R"], {})
+    assert_allclose(law.gain([1.2]), fixed.K_f, rtol=1e-12)
+
+
+def test_every_node_solves_the_riccati_equation_20(arms, two_link_scheduled):
+    law, alpha = two_link_scheduled, 1.0
+    R = np.diag(law.parameters["r"])
+    assert_allclose(law.nodes[:, 1], np.linspace(-np.pi, np.pi, 5), atol=1e-15)
+    for q, K in zip(law.nodes, law.gains, strict=True):
+        A2, B2 = boundary_layer(arms["two_link"], q)
+        closed = A2 + alpha * np.eye(8) + B2 @ K
+        assert np.linalg.eigvals(closed).real.max() < 0.0
+        # (20) is this Lyapunov equation of the closed loop, with K = -R^-1 B2' V
+        V = solve_continuous_lyapunov(closed.T, -(np.eye(8) + K.T @ R @ K))
+        assert_allclose(K, -np.linalg.solve(R, B2.T @ V), atol=1e-6 * np.abs(K).max())
+
+
+def test_the_gain_at_a_node_is_the_design_there(two_link_scheduled, long_reach_scheduled):
+    for law in (two_link_scheduled, long_reach_scheduled):
+        for q, K in zip(law.nodes, law.gains, strict=True):
+            assert_allclose(law.gain(q), K, atol=1e-12 * np.abs(K).max())
+
+
+def test_interpolation_reproduces_what_is_linear_in_each_joint():
+    draw = np.random.default_rng(3)
+    low, high = np.array([-1.0, 0.5, 2.0]), np.array([1.0, 0.7, 6.0])
+    c = draw.normal(size=(2, 2, 2, 2, 3))  # of the products of the powers 0 and 1, matrices (2, 3)
+
+    def matrix(x):
+        return np.einsum("i,j,k,ijkab->ab", *[[1.0, v] for v in x], c)
+
+    axes = [np.linspace(a, b, 4) for a, b in zip(low, high, strict=True)]
+    nodes = [(x, y, z) for x in axes[0] for y in axes[1] for z in axes[2]]
+    table = GainTable([0, 2, 3], low, high, 4, [False] * 3, np.array([matrix(x) for x in nodes]))
+    for x in draw.uniform(low - 0.5, high + 0.5, (200, 3)):  # held at its ends beyond them
+        q = np.array([x[0], 99.0, x[1], x[2]])
+        assert_allclose(table(q), matrix(np.clip(x, low, high)), rtol=1e-11, atol=1e-11)
+
+
+def test_the_gain_is_continuous_and_in_the_middle_the_mean(two_link_scheduled):
+    law = two_link_scheduled
+    for i in range(4):
+        middle = law.gain(0.5 * (law.nodes[i] + law.nodes[i + 1]))
+        mean = 0.5 * (law.gains[i] + law.gains[i + 1])
+        assert_allclose(middle, mean, atol=1e-12 * np.abs(mean).max())
+    for place in law.nodes[:, 1]:
+        left, right = law.gain([0.0, place - 1e-9]), law.gain([0.0, place + 1e-9])
+        assert_allclose(left, right, atol=1e-6 * np.abs(left).max())
+
+
+def test_a_joint_with_limits_is_held_at_its_ends_and_one_without_turns_through(
+    two_link_scheduled, long_reach_scheduled
+):
+    inside, outside = (
+        long_reach_scheduled.gain([0, 0.3, 1, 0]),
+        long_reach_scheduled.gain([0, 9, 1, 0]),
+    )
+    assert_array_equal(inside, outside)
+    law = two_link_scheduled
+    K = law.gain([0.0, 0.3])
+    assert_allclose(law.gain([0.0, 0.3 + 4 * np.pi]), K, atol=1e-10 * np.abs(K).max())
+    assert not np.allclose(law.gain([0.0, 2.0]), K, rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["two_link", "long_reach"])
+def test_the_boundary_layer_is_stable_between_the_nodes(
+    arms, two_link_scheduled, long_reach_scheduled, name
+):
+    law = {"two_link": two_link_scheduled, "long_reach": long_reach_scheduled}[name]
+    for q in np.random.default_rng(17).uniform(law.low, law.high, (60, law.low.size)):
+        A2, B2 = boundary_layer(arms[name], q)
+        assert np.linalg.eigvals(A2 + B2 @ law.gain(q)).real.max() < -0.5
+
+
+def test_the_torque_uses_the_gain_of_the_present_configuration(long_reach_scheduled):
+    law, z_f = long_reach_scheduled, np.linspace(-1.0, 1.0, 20)
+    q = np.array([1.0, -0.2, 0.9, 0.1])
+    assert_allclose(law.torque(z_f, q), law.gain(q) @ z_f, rtol=1e-14)
+    assert_allclose(law.K_f, law.gain([0.0, -0.3, 1.1, 0.0]), atol=1e-10)
+
+
+def test_a_range_too_wide_for_its_grid_is_refused_with_where_and_what_pole(arms):
+    with pytest.raises(
+        DesignError, match=r"with 2 points.*a pole at.*configuration \[.*raise fast\.grid"
+    ):
+        design_law(
+            FAST, "scheduled_lqr", arms["long_reach"], {"alpha": 1.0, "grid": 2, "r": [0.01]}
+        )
+
+
+def test_too_many_designs_are_refused_with_the_numbers(arms):
+    with pytest.raises(
+        DesignError,
+        match=r"41 points for each of 3 joints \(shoulder_pitch, elbow_pitch, wrist_pitch\) make 68921"
+        r" designs, more than 20000; lower fast\.grid to 27",
+    ):
+        design_law(FAST, "scheduled_lqr", arms["long_reach"], {"grid": 41})
+
+
+def test_a_joint_may_be_held_out_of_the_grid(arms):
+    held = {"low": [0.0, -0.3, 0.4, 0.2], "high": [0.0, -0.3, 1.8, 0.2], "alpha": 1.0}
+    law = design_law(FAST, "scheduled_lqr", arms["long_reach"], held | {"grid": 3})
+    assert_array_equal(law.scheduled, [2])
+    fixed = {"configuration": [0.0, -0.3, 0.4, 0.2], "alpha": 1.0}
+    lqr = design_law(FAST, "lqr", arms["long_reach"], fixed)
+    assert_allclose(law.gain([3.0, 1.0, 0.4, 1.0]), lqr.K_f, atol=1e-6 * np.abs(lqr.K_f).max())
+
+
+def test_a_range_turned_around_is_refused(arms):
+    with pytest.raises(
+        DesignError, match=r"fast\.low\[1\]: 1 rad of joint2 is above fast\.high\[1\], -1"
+    ):
+        design_law(
+            FAST, "scheduled_lqr", arms["two_link"], {"low": [0.0, 1.0], "high": [0.0, -1.0]}
+        )
+
+
+# --------------------------------------------------------------------------- pole_placement
+
+
+def same_poles(found, wanted, tolerance):
+    """Whether two sets of poles agree, each to a relative tolerance."""
+    found = list(found)
+    for pole in wanted:
+        i = int(np.argmin(np.abs(np.array(found) - pole)))
+        if abs(found.pop(i) - pole) > tolerance * abs(pole):
+            return False
+    return not found
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("damping", [0.05, 0.5])
+def test_every_mode_gets_the_damping_ratio_and_keeps_its_frequency(arms, name, damping):
+    arm = arms[name]
+    law = design_law(FAST, "pole_placement", arm, {"damping": [damping], "configuration": [0.4]})
+    A2, B2 = boundary_layer(arm, np.full(arm.n_joints, 0.4))
+    open_omega, open_zeta = frequencies_and_damping(np.linalg.eigvals(A2))
+    assert np.abs(open_zeta - damping).min() > 1e-3
+    assert_allclose(law.frequencies, open_omega, rtol=1e-12)
+    omega, zeta = frequencies_and_damping(np.linalg.eigvals(A2 + B2 @ law.K_f))
+    assert_allclose(omega, open_omega, rtol=1e-8)
+    assert_allclose(zeta, damping, rtol=1e-8)
+    z_f = np.linspace(1.0, 2.0, 2 * arm.n_modes)
+    assert_array_equal(law.torque(z_f, np.zeros(arm.n_joints)), law.K_f @ z_f)
+
+
+def test_each_mode_has_its_own_damping_and_frequency(arms):
+    values = {"damping": [0.3, 0.7, 0.1, 0.2], "frequency_scale": [1.5, 0.8, 1.0, 1.1]}
+    law = design_law(FAST, "pole_placement", arms["two_link"], values)
+    A2, B2 = boundary_layer(arms["two_link"], [0.0, 0.0])
+    open_omega, _ = frequencies_and_damping(np.linalg.eigvals(A2))
+    omega = open_omega * values["frequency_scale"]
+    zeta = np.array(values["damping"])
+    wanted = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
+    wanted = np.concatenate([wanted, wanted.conj()])
+    assert same_poles(np.linalg.eigvals(A2 + B2 @ law.K_f), wanted, 1e-8)
+    assert same_poles(law.poles, wanted, 1e-12)
+
+
+def test_for_one_torque_the_gain_is_that_of_an_independent_placement(arms):
+    law = design_law(FAST, "pole_placement", arms["R"], {"damping": [0.3, 0.6]})
+    A2, B2 = boundary_layer(arms["R"], [0.0])
+    assert_allclose(law.K_f, -place_poles(A2, B2, law.poles).gain_matrix, rtol=1e-8)
+
+
+def test_damping_zero_leaves_a_mode_as_it_is(arms):
+    arm = arms["long_reach"]
+    law = design_law(FAST, "pole_placement", arm, {"damping": [0.3, 0.2] + [0.0] * 8})
+    A2, B2 = boundary_layer(arm, np.zeros(4))
+    poles = np.linalg.eigvals(A2)
+    poles = poles[np.argsort(np.abs(poles))]
+    closed = np.linalg.eigvals(A2 + B2 @ law.K_f)
+    wanted = np.concatenate([law.poles[:4], poles[4:]])
+    assert same_poles(closed, wanted, 1e-8)
+    assert not same_poles(closed, poles, 1e-2)
+    untouched = design_law(FAST, "pole_placement", arm, {"damping": [0.0]})
+    assert_array_equal(untouched.K_f, np.zeros((4, 20)))
+
+
+@pytest.mark.parametrize(
+    ("reached", "lost"), [((0.2, 0.0), "stiff_mode"), ((0.0, 0.2), "slender_mode")]
+)
+def test_a_mode_that_no_torque_reaches_is_named_unless_it_is_left(reached, lost):
+    arm = made_up_model([reached], damping=[0.1, 0.1])
+    with pytest.raises(DesignError, match=rf"fast\.damping.*can't reach {lost}.*damping 0\.0"):
+        design_law(FAST, "pole_placement", arm, {})
+    left = [0.5, 0.0] if lost == "stiff_mode" else [0.0, 0.5]
+    law = design_law(FAST, "pole_placement", arm, {"damping": left})
+    _, zeta = frequencies_and_damping(np.linalg.eigvals(law.A2 + law.B2 @ law.K_f))
+    assert_allclose(zeta.max(), 0.5, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "couplings", [[[0.3, 0.2]], [[0.3, 0.0], [0.0, 0.3]], np.eye(2) * 0.2 + 0.1]
+)
+def test_real_poles_are_paired_and_placed(couplings):
+    arm = made_up_model(couplings, damping=[9.0, 30.0])
+    law = design_law(FAST, "pole_placement", arm, {"damping": [0.4]})
+    A2, B2 = boundary_layer(arm, np.zeros(arm.n_joints))
+    assert np.isreal(np.linalg.eigvals(A2)).all()
+    omega, zeta = frequencies_and_damping(np.linalg.eigvals(A2 + B2 @ law.K_f))
+    assert_allclose(zeta, 0.4, rtol=1e-8)
+    assert_allclose(omega, frequencies_and_damping(np.linalg.eigvals(A2))[0], rtol=1e-8)
+
+
+def test_a_damping_ratio_out_of_range_or_of_wrong_length_is_refused(arms):
+    with pytest.raises(ParameterError, match=r"fast\.damping\[0\]: 1.2 is above"):
+        design_law(FAST, "pole_placement", arms["R"], {"damping": [1.2]})
+    with pytest.raises(ParameterError, match=r"fast\.damping: 3 values where 2 \(modes\)"):
+        design_law(FAST, "pole_placement", arms["R"], {"damping": [0.1, 0.2, 0.3]})
+
+
+# --------------------------------------------------------------------------- output_feedback
+
+
+def held(arm, q, dt):
+    """Phi and Gamma of (11) under a torque held over dt, from first principles."""
+    A2, B2 = boundary_layer(arm, q)
+    size, n = B2.shape
+    flow = expm(np.block([[A2, B2], [np.zeros((n, size + n))]]) * dt)
+    return flow[:size, :size], flow[:size, size:]
+
+
+def amplitudes(z):
+    """What the law is given: NaN in the place of the rates."""
+    return np.where(np.arange(z.size) < z.size // 2, z, np.nan)
+
+
+@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize(("dt", "pole"), [(1e-3, 100.0), (5e-4, 700.0)])
+def test_the_closed_poles_are_those_of_regulator_and_observer(arms, name, dt, pole):
+    arm = arms[name]
+    law = design_law(FAST, "output_feedback", arm, {"alpha": 2.0, "observer_pole": pole})
+    Phi, Gamma = held(arm, np.zeros(arm.n_joints), dt)
+    A, B, C, D = law.state_space(dt)
+    closed = np.linalg.eigvals(np.block([[Phi + Gamma @ D, Gamma @ C], [B, A]]))
+    regulator = np.linalg.eigvals(Phi + Gamma @ law.K_f)
+    observer = np.exp(-pole * dt) * np.linalg.eigvals(Phi)
+    assert same_poles(closed, np.concatenate([regulator, observer]), 1e-8)
+    assert np.abs(closed).max() < 1.0
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_amplitudes_alone_damp_the_boundary_layer(arms, name):
+    arm, draw = arms[name], np.random.default_rng(5)
+    law = design_law(FAST, "output_feedback", arm, {"alpha": 2.0})
+    # late samples now and then; 1.2 ms still tells the rate of the fastest mode of long_reach
+    steps = draw.choice([1e-3, 0.9e-3, 1.2e-3, 3e-3], p=[0.9, 0.04, 0.04, 0.02], size=3000)
+    flows = {dt: held(arm, np.zeros(arm.n_joints), dt) for dt in np.unique(steps)}
+    m = arm.n_modes
+    stiff = np.abs(np.linalg.eigvals(law.A2)).max()
+    z = np.concatenate([np.zeros(m), draw.normal(size=m)])  # rates that no amplitude shows yet
+    free, start = z.copy(), np.linalg.norm(z)
+    u = law.torque(amplitudes(z), np.zeros(arm.n_joints))
+    for dt in steps:
+        Phi, Gamma = flows[dt]
+        z, free = Phi @ z + Gamma @ u, Phi @ free
+        law.advance(dt)
+        u = law.torque(amplitudes(z), np.zeros(arm.n_joints))
+    assert np.isfinite(u).all()
+    size = np.linalg.norm(z[m:]) + np.linalg.norm(z[:m]) * min(stiff, 10.0)
+    assert size < 0.02 * start
+    assert size < 0.1 * np.linalg.norm(free)
+
+
+def test_the_law_is_its_state_space_sample_by_sample(arms):
+    arm, draw = arms["two_link"], np.random.default_rng(6)
+    law = design_law(FAST, "output_feedback", arm, {"alpha": 0.5, "configuration": [0.8]})
+    A, B, C, D = law.state_space(2e-3)
+    assert_array_equal(B[:, 4:], 0.0)
+    assert_array_equal(D[:, 4:], 0.0)
+    z = draw.normal(size=(50, 8))
+    w = np.concatenate([z[0, :4], np.zeros(4)])
+    for k in range(50):
+        if k:
+            law.advance(2e-3)
+        assert_allclose(law.predicted if k else w, w, rtol=1e-9, atol=1e-12)
+        u = law.torque(amplitudes(z[k]), np.zeros(2))
+        assert_allclose(u, C @ w + D @ z[k], rtol=1e-9, atol=1e-12)
+        w = A @ w + B @ z[k]
+
+
+def test_a_right_estimate_stays_right_whatever_the_time_steps(arms):
+    arm, draw = arms["one_link"], np.random.default_rng(7)
+    law = design_law(FAST, "output_feedback", arm, {})
+    z = np.array([0.01, -0.002, 0.0, 0.0])  # at rest, as the law assumes at first
+    u = law.torque(amplitudes(z), np.zeros(1))
+    for dt in draw.uniform(5e-4, 5e-3, 100):
+        Phi, Gamma = held(arm, [0.0], dt)
+        z = Phi @ z + Gamma @ u
+        law.advance(dt)
+        assert_allclose(law.predicted, z, rtol=1e-8, atol=1e-12)
+        u = law.torque(amplitudes(z), np.zeros(1))
+        assert_allclose(u, law.K_f @ z, rtol=1e-8, atol=1e-10)
+
+
+def test_a_repeated_sample_changes_nothing(arms):
+    laws = [design_law(FAST, "output_feedback", arms["R"], {}) for _ in range(2)]
+    z = amplitudes(np.array([0.01, -0.002, 0.0, 0.0]))
+    for k in range(5):
+        once = laws[0].torque(z * np.cos(k), np.zeros(1))
+        laws[1].torque(z, np.zeros(1))  # even another one, of which nothing may stay
+        again = [laws[1].torque(z * np.cos(k), np.zeros(1)) for _ in range(3)]
+        assert_array_equal(again, [once] * 3)
+        for law in laws:
+            law.advance(1e-3)
+
+
+def test_reset_forgets(arms):
+    law = design_law(FAST, "output_feedback", arms["R"], {})
+    z = amplitudes(np.array([0.01, -0.002, 0.0, 0.0]))
+
+    def run():
+        law.reset()
+        out = [law.torque(z, np.zeros(1))]
+        for k in range(4):
+            law.advance(1e-3)
+            out.append(law.torque(z / (k + 1), np.zeros(1)))
+        return np.array(out)
+
+    first = run()
+    assert_array_equal(run(), first)
+    assert np.ptp(first) > 0.0
+
+
+def test_it_has_states_instead_of_a_gain_and_runs_in_the_composite_without_rates(arms):
+    control = design(arms["R"], {"type": "none"}, {"type": "output_feedback"})
+    assert not control.needs_rates
+    assert control.fast.gain([0.0]) is None
+    reference = SimpleNamespace(
+        position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1)
+    )
+    delta = np.array([0.01, 0.001])
+    for dt in (0.0, 1e-3, 1e-3):
+        u = control.step(np.zeros(1), np.zeros(1), delta, None, reference, dt)
+        assert np.isfinite(u).all()
+        assert u[0] != 0.0
+    assert_array_equal(control.step(np.zeros(1), np.zeros(1), delta, None, reference, 0.0), u)
+
+
+def test_a_period_that_is_too_long_is_refused(arms):
+    arm = arms["R"]  # 87.41 rad/s: half a period is 36 ms
+    with pytest.raises(
+        DesignError, match=r"fast\.period: 0\.035 s.*0\.03235 s.*link1_y_mode2.*sample faster"
+    ):
+        design_law(FAST, "output_feedback", arm, {"period": 0.035})
+    with pytest.raises(DesignError, match=r"0\.035 s between samples"):
+        design_law(FAST, "output_feedback", arm, {}).state_space(0.035)
+    with pytest.raises(DesignError, match=r"poles of up to 5\d\d.* rad/s.*sampled every 0\.006 s"):
+        design_law(FAST, "output_feedback", arms["two_link"], {"period": 0.006})
+
+
+def test_over_a_gap_too_long_to_tell_the_rates_it_predicts_and_gives_up_when_all_are(arms):
+    law = design_law(FAST, "output_feedback", arms["R"], {})
+    z = amplitudes(np.array([0.01, -0.002, 0.0, 0.0]))
+    for _ in range(3):
+        law.torque(z, np.zeros(1))
+        law.advance(0.035)
+        law.torque(z, np.zeros(1))
+        assert_array_equal(law.estimate, law.predicted)
+        law.advance(1e-3)
+        law.torque(z, np.zeros(1))
+        assert np.abs(law.estimate - law.predicted).max() > 0.0
+    with pytest.raises(DesignError, match=r"0\.035 s between samples.*link1_y_mode2"):
+        for _ in range(law.BLIND):
+            law.advance(0.035)
+
+
+@pytest.mark.parametrize("name", ["lqr", "scheduled_lqr", "output_feedback"])
+def test_an_alpha_out_of_reach_names_the_mode(name):
+    arm = made_up_model([[0.2, 0.0]], damping=[0.1, 0.1])
+    limits = SimpleNamespace(position=(-1.0, 1.0))
+    arm.arm = SimpleNamespace(joints=[SimpleNamespace(limits=limits)])
+    with pytest.raises(
+        DesignError, match=r"fast\.alpha: .*can't reach stiff_mode.*lower fast\.alpha"
+    ):
+        design_law(FAST, name, arm, {})
