@@ -41,6 +41,7 @@ from .model import (
     about_axis,
     explicit_stepper,
     rotation,
+    scaled_payload,
 )
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
@@ -60,16 +61,21 @@ class Chain(ArmModel):
     arm : Arm
     compiled : bool
         False: evaluate the kernels as plain Python, for debugging; some hundred times slower.
+    shapes : mapping, optional
+        (link, direction) to `beam.ModeShapes`, where they are not to be those of this arm's own loads.
     """
 
-    def __init__(self, arm, compiled=True):
+    def __init__(self, arm, compiled=True, shapes=None):
         super().__init__(arm)
         self._compiled = compiled
-        self._shapes = {}
         loads = outboard(arm)
-        for link, body in zip(arm.links, loads, strict=True):
-            for direction, flexibility in link.flexible.items():
-                self._shapes[link.name, direction] = shapes_of(link, direction, flexibility, body)
+        if shapes is None:
+            shapes = {
+                (link.name, direction): shapes_of(link, direction, flexibility, body)
+                for link, body in zip(arm.links, loads, strict=True)
+                for direction, flexibility in link.flexible.items()
+            }
+        self._shapes = dict(shapes)
         self.data = assemble(arm, self._shapes, loads)
         self._check_inertia()
 
@@ -128,6 +134,9 @@ class Chain(ArmModel):
             return self._shapes[link, direction]
         except KeyError:
             raise ModelError(f"{link} has no modes in direction {direction}") from None
+
+    def with_payload(self, scale):
+        return type(self)(scaled_payload(self.arm, scale), self._compiled, self._shapes)
 
     def friction_table(self):
         return np.array(

@@ -9,7 +9,7 @@ r"""What every model of an arm offers, and the terms of the equations of motion 
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -134,6 +134,21 @@ class ArmModel(ABC):
         -------
         Stepper
         """
+
+    def with_payload(self, scale):
+        """The same arm in the same mode shapes, with its payload's mass and inertia scaled.
+
+        Parameters
+        ----------
+        scale : float
+            0: no payload; its centre of mass stays where it is.
+
+        Returns
+        -------
+        ArmModel
+            Of the same class.
+        """
+        raise ModelError(f"model {self.arm.model} takes no other payload than its arm file's")
 
     def friction(self, qd):
         """Friction torque of the joints, shape (n,) [N m]: ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
@@ -331,6 +346,13 @@ def explicit_stepper(module, method, data, model):
         return Stepper(model, module.low_storage, module.low_storage_trajectory, arguments, data)
     arguments = (method.A, *coefficients, np.zeros((method.weights.size + 1, size)), net)
     return Stepper(model, module.runge_kutta, module.runge_kutta_trajectory, arguments, data)
+
+
+def scaled_payload(arm, scale):
+    """The arm with its payload's mass and inertia scaled, its centre of mass where it is."""
+    load = arm.payload
+    inertia = tuple(tuple(scale * x for x in row) for row in load.inertia)
+    return replace(arm, payload=replace(load, mass=scale * load.mass, inertia=inertia))
 
 
 def build(arm):

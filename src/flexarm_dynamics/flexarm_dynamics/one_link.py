@@ -31,7 +31,7 @@ from . import beam
 from .errors import ModelError
 from .kernels import integrators, load
 from .kernels import one_link as kernel
-from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
+from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation, scaled_payload
 
 
 @dataclass(frozen=True)
@@ -70,20 +70,30 @@ class OneLinkEquations(ArmModel):
     """Evaluates the one-link equations for whatever coefficients a derivation gives.
 
     Subclasses derive the coefficients: `OneLink` in full, `paper_appendix.PaperAppendix` as print does.
+
+    Parameters
+    ----------
+    arm : Arm
+    shapes : beam.ModeShapes, optional
+        Where they are not to be those of this arm's own payload.
     """
 
-    def __init__(self, arm):
+    def __init__(self, arm, shapes=None):
         super().__init__(arm)
         _check_planar(arm)
         self.link, self.joint = arm.links[0], arm.joints[0]
         self.flexibility = self.link.flexible["y"]
-        self.shapes = shapes_of(self.link, self.flexibility, arm.payload)
+        own = shapes_of(self.link, self.flexibility, arm.payload) if shapes is None else shapes
+        self.shapes = own
         self.phi_tip = self.shapes(1.0)  # [-]
         self.slope_tip = self.shapes(1.0, 1) / self.link.length  # [1/m]
         self.coefficients = self.derive()
         self._rotation = rotation(self.joint.origin_rpy)
         self._gravity = self._rotation.T @ np.asarray(arm.gravity)  # in the joint's frame
         self._terms_at_rest = self._constant_terms()
+
+    def with_payload(self, scale):
+        return type(self)(scaled_payload(self.arm, scale), self.shapes)
 
     def derive(self):
         """Return the `Coefficients` of this derivation."""

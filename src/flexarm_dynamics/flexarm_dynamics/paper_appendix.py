@@ -34,12 +34,12 @@ class PaperAppendix(OneLinkEquations):
     gains (arm P3).
     """
 
-    def __init__(self, arm):
+    def __init__(self, arm, shapes=None):
         if arm.model != "paper_appendix" or not arm.model_options:
             raise ModelError(f"{arm.name}: the arm file has no section paper_appendix")
         if any(arm.gravity):
             raise ModelError("paper_appendix: print has no gravity; use model one_link")
-        super().__init__(arm)
+        super().__init__(arm, shapes)
 
     def derive(self):
         link, payload, shapes = self.link, self.arm.payload, self.shapes
