@@ -54,6 +54,12 @@ def _gauges(options):
     gauges(options)
 
 
+def _observers(options):
+    from .observer_table import observers
+
+    observers(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -121,7 +127,7 @@ def parser():
 
 def _add_arm_commands(commands):
     """What needs an arm file and no ROS."""
-    from . import gauges, inspect_arm, simulate
+    from . import gauges, inspect_arm, observer_table, simulate
 
     command = commands.add_parser(
         "simulate",
@@ -157,6 +163,14 @@ def _add_arm_commands(commands):
     )
     gauges.add_arguments(command)
     command.set_defaults(function=_gauges)
+    command = commands.add_parser(
+        "observers",
+        help="errors of the observers of an arm, by noise, rate and delay",
+        description="Simulates an arm that is shaken, and compares what each observer makes of its samples.",
+        epilog="example: flexarm observers R --rates 1000,250 --delays 0,0.01",
+    )
+    observer_table.add_arguments(command)
+    command.set_defaults(function=_observers)
 
 
 #: Options whose value may begin with a minus.
