@@ -54,6 +54,12 @@ def _gauges(options):
     gauges(options)
 
 
+def _check_driver(options):
+    from .check_driver.command import check_driver
+
+    sys.exit(check_driver(options))
+
+
 def _observers(options):
     from .observer_table import observers
 
@@ -102,6 +108,18 @@ def parser():
     )
     add_arguments(publish)
     publish.set_defaults(function=_publish)
+
+    from .check_driver.command import add_arguments as add_check_arguments
+
+    check = commands.add_parser(
+        "check_driver",
+        help="whether a running driver keeps its contract; with --allow-motion, whether its arm moves rightly",
+        description="Listens to a running driver (or simulator) and judges what it sends; with --allow-motion pushes"
+        " each joint a little and compares with the model of the arm file. Exit code 1 when a check fails.",
+        epilog="example: flexarm check_driver R --rate 200 --allow-motion",
+    )
+    add_check_arguments(check)
+    check.set_defaults(function=_check_driver)
 
     run = commands.add_parser(
         "run",

@@ -1,0 +1,1 @@
+"""A driver to start from: an arm behind a serial line, and a fake one to try it with."""

@@ -1,0 +1,96 @@
+"""The arm's electronics at the end of a serial line: lines in and out, and when they were measured."""
+
+import os
+import select
+import termios
+import tty
+
+from flexarm_dynamics.errors import FlexarmError
+
+from . import protocol
+
+
+class DeviceError(FlexarmError):
+    """The device can't be opened, or is gone."""
+
+
+class Device:
+    """A serial line, such as ``/dev/ttyUSB0`` or the fake device's.
+
+    Parameters
+    ----------
+    port : str
+    joints, gauges : int
+        Numbers in a frame.
+
+    Raises
+    ------
+    DeviceError
+    """
+
+    def __init__(self, port, joints, gauges):
+        self._port, self._sizes = port, (joints, gauges)
+        try:
+            self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            tty.setraw(self._file, termios.TCSANOW)
+            termios.tcflush(self._file, termios.TCIFLUSH)  # what was measured before we came
+        except (OSError, termios.error) as error:
+            raise DeviceError(
+                f"port {port}: {error}: is the device on, and may you open it?"
+            ) from None
+        self._lines = protocol.Lines()
+        self.damaged = 0
+
+    def frames(self, wait):
+        """The frames that have come, after at most `wait` seconds; none is a sign that the device is gone."""
+        try:
+            ready, _, _ = select.select([self._file], [], [], wait)
+            lines = self._lines.feed(os.read(self._file, 65_536)) if ready else []
+        except OSError as error:
+            raise DeviceError(f"port {self._port}: {error}") from None
+        found = [protocol.frame(line, *self._sizes) for line in lines]
+        self.damaged += found.count(None)
+        return [f for f in found if f]
+
+    def torque(self, counts):
+        """Apply torque, in counts of the drive."""
+        self._write(protocol.seal("T", *counts))
+
+    def safe(self):
+        """Take the safe action."""
+        self._write(protocol.seal("X"))
+
+    def _write(self, line):
+        try:
+            os.write(self._file, line)
+        except BlockingIOError:
+            pass  # the device does not read: its own watchdog will act
+        except OSError as error:
+            raise DeviceError(f"port {self._port}: {error}") from None
+
+    def close(self):
+        os.close(self._file)
+
+
+class MeasurementTime:
+    """Times of the device's clock on the host's: the way here takes at least as long as the quickest frame's.
+
+    A frame that was late on the line keeps the time it was measured at, so that stamps have no jitter.
+    """
+
+    #: The clocks drift apart by less than this [-], and stamps are drawn to a quicker frame's by this [-].
+    DRIFT, DRAW = 2e-4, 0.05
+
+    def __init__(self):
+        self._offset = self._last = None
+
+    def stamp(self, device_ns, host_ns):
+        """Host time [ns] of a measurement at `device_ns`, which arrived at `host_ns`."""
+        newest = host_ns - device_ns
+        if self._offset is None:
+            self._offset, self._last = newest, device_ns
+        step = device_ns - self._last
+        self._last = device_ns
+        low, high = self._offset - round(self.DRAW * step), self._offset + round(self.DRIFT * step)
+        self._offset = min(max(newest, low), high)
+        return device_ns + self._offset
