@@ -6,7 +6,7 @@ deflections have the quasi-steady state :math:`\bar\delta` (9). What is left, :m
 
 .. math:: \dot z_f = A_2 z_f - \frac{d}{dt}\begin{bmatrix}\bar\delta\\0\end{bmatrix},\qquad z_f(0) = 0,
 
-with :math:`A_2` at one configuration. It is measured by its energy,
+with :math:`A_2` along the motion, or at one configuration. It is measured by its energy,
 :math:`E = \frac12\delta_f^T K\delta_f + \frac12\dot\delta_f^T H_{22}^{-1}\dot\delta_f` (joints free), which
 counts metres and radians of all modes alike. The fast control is taken as absent: this is what it has to do.
 """
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import (
     fast_subsystem,
     quasi_steady_state,
@@ -72,7 +73,7 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     profile : Profile
         Or what has its methods and duration; from rest to rest.
     configuration : (n,) array_like, optional
-        Where (11) is taken [rad]; where the motion is at half its time if not given.
+        Where (11) is taken [rad]; along the motion if not given.
     points : int
         Of time; the quasi-steady state is taken as linear between them.
 
@@ -85,9 +86,7 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     torque, steady = np.empty_like(q), np.empty((points, model.n_modes))
     for k in range(points):
         torque[k], steady[k] = reduced(model, q[k], qd[k], qdd[k])
-    if configuration is None:
-        configuration = profile.position(0.5 * profile.duration)
-    response = FastResponse(model, configuration, times[1] - times[0])
+    response = FastResponse(model, times[1] - times[0], *path_of(q, qd, configuration))
     deviation = response.deviation(steady)
     return Excitation(times, torque, steady, deviation, response.energy(deviation))
 
@@ -103,37 +102,52 @@ def reduced(model, q, qd, qdd):
     return torque, quasi_steady_state(terms, torque)
 
 
-class FastResponse:
-    """The response of (11) at one configuration to a quasi-steady state that moves, on a grid of time.
+def path_of(q, qd, configuration=None):
+    """Joint angles and rates (k, n) where (11) is taken: the motion's, or one configuration at rest."""
+    if configuration is None:
+        return q, qd
+    return np.asarray(configuration, float)[None], np.zeros((1, q.shape[1]))
 
-    Exact for a state that is linear between the grid's points, whatever the step.
+
+class FastResponse:
+    """The response of (11) to a quasi-steady state that moves, on a grid of time.
+
+    Exact for a state that is linear between the grid's points and an A2 that is constant there.
 
     Parameters
     ----------
     model : ArmModel
-    configuration : (n,) array_like
-        [rad]
     step : float
         Of the grid [s].
+    q, qd : (k, n) arrays
+        Joint angles and rates at the grid's points [rad], [rad/s]; one row stands for all.
     """
 
-    def __init__(self, model, configuration, step):
-        n, m = model.n_joints, model.n_modes
-        self.m, self.step = m, step
+    def __init__(self, model, step, q, qd):
+        self.m = m = model.n_modes
         if not m:
             return
-        terms = model.terms(np.asarray(configuration, float), np.zeros(n))
-        A2, _ = fast_subsystem(terms)
+        # Half way through each step; one that stands for all stays.
+        q, qd = (0.5 * (x[1:] + x[:-1]) if len(x) > 1 else x for x in (q, qd))
+        block = np.zeros((len(q), 4 * m, 4 * m))
+        block[:, : 2 * m, 2 * m :] = np.eye(2 * m)
+        self.root = np.zeros((len(q), 2 * m, 2 * m))  # E = |root z|^2 / 2
+        self.root[:, :m, :m] = np.linalg.cholesky(model.stiffness_matrix()).T
+        for k, state in enumerate(zip(q, qd, strict=True)):
+            terms = model.terms(*state)
+            block[k, : 2 * m, : 2 * m] = fast_subsystem(terms)[0]
+            H22 = terms.partition()[3]
+            self.root[k, m:, m:] = np.linalg.cholesky(np.linalg.inv(0.5 * (H22 + H22.T))).T
         # e^{A h} and its integral over the step, from one exponential.
-        block = np.zeros((4 * m, 4 * m))
-        block[: 2 * m, : 2 * m], block[: 2 * m, 2 * m :] = A2, np.eye(2 * m)
-        both = expm(block * step)
-        self.propagate = both[: 2 * m, : 2 * m]
-        self.drive = -both[: 2 * m, 2 * m : 3 * m] / step
-        H22 = terms.partition()[3]
-        self.root = np.zeros((2 * m, 2 * m))  # E = |root z|^2 / 2
-        self.root[:m, :m] = np.linalg.cholesky(model.stiffness_matrix()).T
-        self.root[m:, m:] = np.linalg.cholesky(np.linalg.inv(0.5 * (H22 + H22.T))).T
+        with np.errstate(all="ignore"):
+            both = expm(block * step)
+        if not np.isfinite(both).all():
+            raise DesignError(
+                f"{model.arm.name}: on this motion the joints get so fast that the links lose their stiffness in"
+                " this model: take a longer duration"
+            )
+        self.propagate = both[:, : 2 * m, : 2 * m]
+        self.drive = -both[:, : 2 * m, 2 * m : 3 * m] / step
 
     def deviation(self, steady):
         """Return z_f at the grid's points.
@@ -149,11 +163,17 @@ class FastResponse:
         """
         out = np.zeros((steady.shape[0], 2 * self.m, *steady.shape[2:]))
         for k, change in enumerate(np.diff(steady, axis=0) if self.m else ()):
-            out[k + 1] = self.propagate @ out[k] + self.drive @ change
+            i = min(k, len(self.propagate) - 1)
+            out[k + 1] = self.propagate[i] @ out[k] + self.drive[i] @ change
         return out
+
+    def weighed(self, deviation):
+        """Deviations (k, 2m, c) such that E is half of their square, (k, 2m, c)."""
+        steps = np.minimum(np.arange(deviation.shape[0]), len(self.root) - 1)
+        return self.root[steps] @ deviation
 
     def energy(self, deviation):
         """Energy of deviations (k, 2m), shape (k,) [J]."""
         if not self.m:
             return np.zeros(deviation.shape[0])
-        return 0.5 * np.sum((deviation @ self.root.T) ** 2, axis=1)
+        return 0.5 * np.sum(self.weighed(deviation[:, :, None]) ** 2, axis=(1, 2))

@@ -71,7 +71,7 @@ def test_what_cant_be_read_is_refused_naming_it(arm_r, text, message):
 
 def test_a_motion_beyond_the_arms_limits_is_refused():
     arm = model.build(arm_file.load("one_link"))
-    with pytest.raises(FlexarmError, match="position of joint joint1 is .* beyond its limit"):
+    with pytest.raises(FlexarmError, match=r"position of joint joint1 is .* beyond its limit"):
         specs.from_spec("quintic:to=4", arm)
-    with pytest.raises(FlexarmError, match="velocity of joint joint1 is .* beyond its limit"):
+    with pytest.raises(FlexarmError, match=r"velocity of joint joint1 is .* beyond its limit"):
         specs.from_spec("quintic:to=3,duration=0.2", arm)
