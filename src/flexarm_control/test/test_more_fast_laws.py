@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import place_poles
 
+from flexarm_control import full_order
 from flexarm_control.composite import FAST, design, design_law
 from flexarm_control.fast.scheduled_lqr import GainTable
 from flexarm_dynamics import arm_file, model, registry
@@ -455,6 +456,24 @@ def test_it_has_states_instead_of_a_gain_and_runs_in_the_composite_without_rates
         assert np.isfinite(u).all()
         assert u[0] != 0.0
     assert_array_equal(control.step(np.zeros(1), np.zeros(1), delta, None, reference, 0.0), u)
+
+
+@pytest.mark.parametrize(
+    ("name", "kp", "kv", "alpha"), [("R", 6.25, 5.0, 5.0), ("two_link", 1.0, 2.0, 1.0)]
+)
+def test_the_default_observer_is_stable_in_the_whole_loop_a_much_faster_one_need_not_be(
+    arms, name, kp, kv, alpha
+):
+    arm = arms[name]
+    q = np.full(arm.n_joints, 0.8)
+    slow = {"type": "linear_model_following", "kp": [kp], "kv": [kv]}
+    fast = {"type": "output_feedback", "alpha": alpha, "configuration": [0.8]}
+    slowest = full_order.poles(design(arm, slow, fast), q, 1e-3)[0].real
+    alone = full_order.poles(design(arm, slow, {"type": "none"}), q, 1e-3)[0].real
+    assert slowest < 2.0 * alone < 0.0
+    if name == "two_link":
+        law = design(arm, slow, fast | {"observer_pole": 200.0})
+        assert full_order.poles(law, q, 1e-3)[0].real > 0.0
 
 
 def test_a_period_that_is_too_long_is_refused(arms):
