@@ -23,14 +23,17 @@ STEP = 1e-6
 ROUNDING = 1e-6
 
 
-def linear_plant(model, q):
-    """The arm linearised at rest, held against gravity; Coulomb friction, which has no linear part, left out.
+def linear_plant(model, q, coulomb=True):
+    """The arm linearised at rest, held against gravity.
 
     Parameters
     ----------
     model : ArmModel
     q : ndarray, shape (n,)
         [rad]
+    coulomb : bool
+        With Coulomb friction as steep as its smoothing makes it at rest, as a law that compensates it believes it
+        to be; False: without, as when the arm moves.
 
     Returns
     -------
@@ -45,9 +48,10 @@ def linear_plant(model, q):
     viscous = model.friction_table()[:, 0]
 
     def slope(s, u):
-        qd = s[n + m : 2 * n + m]
-        # The model's friction is taken out, and the viscous part put back.
-        return model.derivative(s, hold + u + model.friction(qd) - viscous * qd)
+        if not coulomb:  # the model's friction taken out, and the viscous part put back
+            qd = s[n + m : 2 * n + m]
+            u = u + model.friction(qd) - viscous * qd
+        return model.derivative(s, hold + u)
 
     A, B = np.zeros((size, size)), np.zeros((size, n))
     for i in range(size):
@@ -139,7 +143,7 @@ class _NoFast:
         return self._zero
 
 
-def closed_loop(law, q, period, delay=0.0, plant=None):
+def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     """Transition matrix of the sampled closed loop.
 
     Parameters
@@ -153,6 +157,8 @@ def closed_loop(law, q, period, delay=0.0, plant=None):
         From the measurement to the torque [s].
     plant : ArmModel, optional
         The arm itself, when it is not the law's model; of as many modes.
+    gain : float
+        Of the torque on its way to the arm [-].
 
     Returns
     -------
@@ -161,11 +167,12 @@ def closed_loop(law, q, period, delay=0.0, plant=None):
     """
     model = law.model
     A, B = linear_plant(plant or model, np.asarray(q, float))
+    B = gain * B
     Phi, n = expm(A * period), B.shape[1]
     U, Z = linear_law(law, q)
     compensator = law.fast.state_space(period)
-    gain = law.fast.gain(np.asarray(q, float)) if compensator is None else compensator[3]
-    out = U + gain @ Z  # u = out s + C w
+    K = law.fast.gain(np.asarray(q, float)) if compensator is None else compensator[3]
+    out = U + K @ Z  # u = out s + C w
     w = 0 if compensator is None else compensator[0].shape[0]
     size, whole = A.shape[0], int(delay / period + 1e-9)
     late = delay - whole * period
@@ -202,9 +209,9 @@ def closed_loop(law, q, period, delay=0.0, plant=None):
     return F
 
 
-def poles(law, q, period, delay=0.0, plant=None):
+def poles(law, q, period, delay=0.0, plant=None, gain=1.0):
     """Poles of the sampled closed loop as those of continuous time [1/s], slowest first."""
-    z = np.linalg.eigvals(closed_loop(law, q, period, delay, plant)).astype(complex)
+    z = np.linalg.eigvals(closed_loop(law, q, period, delay, plant, gain)).astype(complex)
     z = z[np.abs(z) > 1e-12]  # dead-beat: a delay's own
     s = np.log(z) / period
     return s[np.lexsort((s.imag, -s.real))]

@@ -15,26 +15,41 @@ arm, sample by sample, within its torque limits; the composite control holds the
 the real arm allows.
 
 The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the joint errors e alone, with
-:math:`Q^{1/2} = M_{11}\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`, omega_1 the lowest bending frequency: the
-joints are held about as stiffly as the softest mode is, which is what that mode can still follow.
+:math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`, omega_1 the lowest bending
+frequency with the joints locked: the joints are held about as stiffly as the softest mode is, which is what that mode
+can still follow. Where the arm's inertia changes with its joints, the gain is designed along each trajectory, at its
+receipt, and interpolated; a trajectory that comes while the arm moves is then followed on the slow manifold alone.
 """
 
+from itertools import pairwise
+
 import numpy as np
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import solve_continuous_are
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.fixed_step import METHODS, substeps
+from flexarm_dynamics.model import build
 
 from ..full_order import linear_plant, sampled
+from ..trajectory.path import Path
+from ..trajectory.values import SECOND
 from .base import Feedforward
 
 #: Prescribed degree of stability of the regulator, over the lowest bending frequency.
 DECAY = 0.3
 #: Beyond this joint error the simulated arm begins anew on the reference [rad].
 LOST = 1.0
+#: Between two designs along a trajectory no joint turns farther [rad].
+APART = 0.12
+#: Relative change of the plant with the joints below which one gain serves everywhere.
+NEGLIGIBLE = 1e-6
+#: At rest, and this close to it in every coordinate, the simulated arm is taken to be there.
+THERE = 1e-9
+#: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
+SAME_START = 1e-6
 
 
-def regulator(model, q, period):
+def regulator(model, q):
     """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module.
 
     Parameters
@@ -42,8 +57,6 @@ def regulator(model, q, period):
     model : ArmModel
     q : ndarray, shape (n,)
         [rad]
-    period : float
-        Of the samples [s].
 
     Raises
     ------
@@ -51,20 +64,107 @@ def regulator(model, q, period):
         When the Riccati equation has no stabilising solution.
     """
     n = model.n_joints
-    omega = float(model.frequencies(q)[0]) if model.n_modes else 10.0
-    Phi, Gamma = sampled(*linear_plant(model, q), period)
-    grow = np.exp(DECAY * omega * period)
-    Q = np.zeros(Phi.shape)
+    omega = float(model.frequencies(q, locked=True)[0]) if model.n_modes else 10.0
+    A, B = linear_plant(model, q, coulomb=False)
+    Q = np.zeros(A.shape)
     inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
     Q[:n, :n] = np.diag((inertia * omega**2) ** 2)
     try:
-        P = solve_discrete_are(grow * Phi, grow * Gamma, Q, np.eye(n))
+        P = solve_continuous_are(A + DECAY * omega * np.eye(len(A)), B, Q, np.eye(n))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
             f"feedforward model: no regulator of {model.arm.name} at joint configuration {np.round(q, 4).tolist()}"
             f" ({error}); set feedforward: none"
         ) from None
-    return np.linalg.solve(np.eye(n) + grow**2 * Gamma.T @ P @ Gamma, grow**2 * Gamma.T @ P @ Phi)
+    return B.T @ P
+
+
+class Gains:
+    """Regulators along a trajectory, linear in time between them.
+
+    Parameters
+    ----------
+    times : ndarray, shape (k,)
+        Since the trajectory's start [s].
+    gains : ndarray, shape (k, n, 2 (n + m))
+    """
+
+    def __init__(self, times, gains):
+        self.times, self.gains = times, gains
+
+    def at(self, elapsed):
+        """Gain at a time since the start [s]; held beyond either end."""
+        i = int(np.searchsorted(self.times, elapsed, side="right")) - 1
+        if i < 0:
+            return self.gains[0]
+        if i >= len(self.times) - 1:
+            return self.gains[-1]
+        f = (elapsed - self.times[i]) / (self.times[i + 1] - self.times[i])
+        return (1.0 - f) * self.gains[i] + f * self.gains[i + 1]
+
+
+class Preparation:
+    """What was designed for one trajectory.
+
+    Attributes
+    ----------
+    trajectory_id : int
+        0 until it is accepted.
+    start : ndarray, shape (3, n)
+        State of the reference that it begins from.
+    gains : Gains or None
+    plan : object or None
+        A motion with ``at(elapsed)`` and `duration`, of a feed-forward that plans.
+    """
+
+    def __init__(self, start, gains, plan=None):
+        self.trajectory_id, self.start, self.gains, self.plan = 0, start, gains, plan
+
+
+def path_of(trajectory, start):
+    """The path of a trajectory from a state of rest.
+
+    Raises
+    ------
+    DesignError
+        When it does not begin at rest.
+    """
+    if np.abs(start[1:]).max() > SAME_START:
+        raise DesignError("feedforward: the motion does not begin at rest")
+    fields = (trajectory.positions, trajectory.velocities, trajectory.accelerations)
+    path = Path(trajectory.times_ns, [values for values in fields if values is not None], 1)
+    path.begin(0, start)
+    return path
+
+
+def gains_along(model, path, period):
+    """Regulators along a path, checked in the middle between each two.
+
+    Raises
+    ------
+    DesignError
+        When one is impossible, or does not hold where it is interpolated.
+    """
+    n, state = model.n_joints, np.zeros((3, model.n_joints))
+    grid = np.linspace(0.0, path.duration_ns / SECOND, 400)
+    q = np.empty((grid.size, n))
+    for k, t in enumerate(grid):
+        path.evaluate(min(round(t * SECOND), path.duration_ns - 1), state)
+        q[k] = state[0]
+    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
+    count = int(np.ceil(way[-1] / APART)) + 1
+    at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], count)))
+    gains = np.array([regulator(model, q[k]) for k in at])
+    for i in range(len(at) - 1):
+        middle, K = 0.5 * (q[at[i]] + q[at[i + 1]]), 0.5 * (gains[i] + gains[i + 1])
+        Phi, Gamma = sampled(*linear_plant(model, middle, coulomb=False), period)
+        largest = np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max()
+        if largest >= 1.0:
+            raise DesignError(
+                f"feedforward: the regulator of {model.arm.name} does not hold between joint configurations"
+                f" {np.round(q[at[i]], 3).tolist()} and {np.round(q[at[i + 1]], 3).tolist()} at {1.0 / period:g} Hz"
+            )
+    return Gains(grid[at], gains)
 
 
 class ModelFeedforward(Feedforward):
@@ -73,13 +173,44 @@ class ModelFeedforward(Feedforward):
     def __init__(self, model, manifold, settings):
         super().__init__(model, manifold, settings)
         n, m = model.n_joints, model.n_modes
-        self.K = regulator(model, settings.configuration, settings.period)
         self._advance = model.stepper(METHODS["rk4"])
         self._substeps = substeps(model, settings.period, "rk4")
         self.state, self._error = np.zeros(2 * (n + m)), np.zeros(2 * (n + m))
         parts = np.split(self.state, [n, n + m, 2 * n + m])
         self.position, self.amplitude, self.velocity, self.rate = parts
-        self._first = True
+        #: The gain that serves everywhere; None where it depends on the joints.
+        self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
+        self._prepared, self._first = None, True
+
+    def _same_everywhere(self):
+        """Whether the plant at rest does not change with the joints."""
+        draw, n = np.random.default_rng(0), self.model.n_joints
+        limits = np.array([j.limits.position for j in self.model.arm.joints])
+        low, high = np.clip(limits, -np.pi, np.pi).T
+        terms = [self.model.terms(draw.uniform(low, high), np.zeros(n)) for _ in range(3)]
+        for a, b in pairwise(terms):
+            for x, y in ((a.M, b.M), (a.K1, b.K1), (a.K2, b.K2), (a.f1, b.f1)):
+                if np.abs(x - y).max(initial=0.0) > NEGLIGIBLE * np.abs(x).max(initial=1e-9):
+                    return False
+        return True
+
+    @property
+    def plans(self):
+        return self.K is None
+
+    def prepare(self, trajectory, start):
+        # A model of its own: the loop goes on with this one meanwhile.
+        model = build(self.model.arm)
+        return Preparation(start, gains_along(model, path_of(trajectory, start), self._period))
+
+    @property
+    def _period(self):
+        return self.settings.period
+
+    def take(self, plan, trajectory_id):
+        if plan is not None:
+            plan.trajectory_id = trajectory_id
+        self._prepared = plan
 
     def reset(self):
         self._first = True
@@ -87,24 +218,45 @@ class ModelFeedforward(Feedforward):
     def resume(self, other):
         if isinstance(other, ModelFeedforward):
             self.state[:], self.torque[:] = other.state, other.torque
-            self._first = other._first
+            self._first, self._prepared = other._first, other._prepared
 
-    def wanted(self, reference):
+    def _preparation(self, reference):
+        """What was designed for the trajectory that is followed, and the time since its start; or None."""
+        prepared, path = self._prepared, reference.path
+        if prepared is None or path is None or path.trajectory_id != prepared.trajectory_id:
+            return None, 0.0
+        if np.abs(path.begin_state - prepared.start).max() > SAME_START:
+            return None, 0.0
+        return prepared, (reference.stamp_ns - path.start_ns) / SECOND
+
+    def wanted(self, reference, prepared, elapsed):
         """State (2 (n + m),) and torque (n,) that the regulator holds the simulated arm to."""
         delta, rate, torque = self.manifold.along(reference)
         return np.concatenate([reference.position, delta, reference.velocity, rate]), torque
 
     def update(self, reference, dt):
-        n = self.model.n_joints
         if not self._first and dt > 0.0:  # the torque of the last sample has acted since
-            count = max(1, round(dt / self.settings.period)) * self._substeps
+            count = max(1, round(dt / self._period)) * self._substeps
             self._advance(self.state, self.torque, dt / count, count)
-        state, torque = self.wanted(reference)
-        # Lost: not finite any more, or the reference is where the arm can't go.
-        if self._first or not np.abs(state[:n] - self.position).max() < LOST:
-            self.state[:] = state
-            self._first = False
+        prepared, elapsed = self._preparation(reference)
+        state, torque = self.wanted(reference, prepared, elapsed)
+        K = self.K
+        if K is None and prepared is not None and prepared.gains is not None:
+            K = prepared.gains.at(elapsed)
         np.subtract(state, self.state, out=self._error)
-        np.add(torque, self.K @ self._error, out=self.torque)
+        if self._begins_anew(reference, K):
+            self.state[:] = state
+            self._error[:] = 0.0
+        np.copyto(self.torque, torque)
+        if K is not None:
+            self.torque += K @ self._error
         np.clip(self.torque, -self.limit, self.limit, out=self.torque)
         self.acceleration[:] = reference.acceleration
+
+    def _begins_anew(self, reference, K):
+        """Whether the simulated arm is put where it is wanted."""
+        n, first = self.model.n_joints, self._first
+        self._first = False
+        if first or K is None or not np.abs(self._error[:n]).max() < LOST:  # NaN is lost, too
+            return True
+        return not reference.velocity.any() and np.abs(self._error).max() < THERE

@@ -7,30 +7,30 @@ shift p of the reference, zero with its rates at either end, can be chosen such 
 
 .. math:: M_{22}\ddot\delta + C_2\dot\delta + K_2\delta = -M_{21}(\ddot q_{ref} + \ddot p) - f_2,
 
-are linear in c, so that the smallest largest shift is a linear programme:
+are linear in c to first order, so that the shift of least mean square which does it,
 
 .. math::
-    \min_c \max_t |p(t)| \quad\text{s.t.}\quad \delta(T) = \bar\delta,\; \dot\delta(T) = 0,\;
-    |u(t)| \le u_{max},
+    \min_c \int |p|^2 + \epsilon\,|\ddot p|^2/\omega_1^4\,dt \quad\text{s.t.}\quad
+    \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
-solved once at receipt, off the control path (HiGHS through scipy). What M_21 and f_2 change with p is taken in by
-doing so twice. The motion then serves `model` in the place of the slow manifold: the nominal arm that runs along
-takes up what is left, sampling and products of deflections.
+is one linear system; where its torque is beyond the limit, a linear programme (HiGHS through scipy) finds the
+smallest largest shift within it. All of this is done at receipt, off the control path. What the linearisation neglects
+is integrated with the full equations and taken in by solving again. The motion then serves `model` in the place of
+the slow manifold: the nominal arm that runs along takes up what is left.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicHermiteSpline
+from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline
 from scipy.linalg import eigh
 from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.model import build
 
-from ..trajectory.path import Path
 from ..trajectory.values import SECOND
-from .model import ModelFeedforward
+from .model import ModelFeedforward, Preparation, gains_along, path_of
 
 #: Longest time between two knots of the shift, over the period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -39,19 +39,21 @@ FEWEST, MOST = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
 #: Rounds of linearisation.
-ROUNDS = 2
+ROUNDS = 4
 #: Shift and torque are bounded at so many times.
-GRID = 250
-#: Weight of the shift's largest acceleration, times the duration squared, beside the largest shift.
-SMOOTHNESS = 1e-6
+GRID = 100
+#: The equations are linearised at so many times.
+KNOTS = 80
+#: Step of the differences by which they are [rad], [rad/s].
+SMALL = 1e-6
+#: Weight of the shift's acceleration, over the square of the lowest bending frequency, beside the shift.
+SMOOTHNESS = 0.01
 #: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin [rad].
 STABLE = 1.5
 #: Longest grid step over the period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A longer motion is not planned [samples].
 LONGEST = 20_000
-#: The reference must begin within this of where the plan did [rad], [rad/s], [rad/s^2].
-SAME_START = 1e-6
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,8 @@ class Plan:
 
     Attributes
     ----------
-    trajectory_id : int
-        Of the trajectory it is for; 0 until it is accepted.
-    start : ndarray, shape (3, n)
-        State of the reference that it begins from.
-    duration_ns : int
+    duration : float
+        [s]
     motion : CubicHermiteSpline
         (q, delta, qd, delta_d) over the elapsed time [s].
     torque : ndarray, shape (k, n)
@@ -75,20 +74,18 @@ class Plan:
         Largest shift of a joint from the reference [rad].
     """
 
-    start: np.ndarray
-    duration_ns: int
+    duration: float
     motion: CubicHermiteSpline
     torque: np.ndarray
     step: float
     shift: float
-    trajectory_id: int = 0
 
-    def at(self, elapsed):
-        """State (2 (n + m),) and torque (n,) at a time since the start [s]."""
+    def torque_at(self, elapsed):
+        """Torque (n,) at a time since the start [s]."""
         x = elapsed / self.step
         i = min(int(x), len(self.torque) - 2)
-        f = x - i
-        return self.motion(elapsed), (1.0 - f) * self.torque[i] + f * self.torque[i + 1]
+        f = min(x - i, 1.0)
+        return (1.0 - f) * self.torque[i] + f * self.torque[i + 1]
 
 
 class Preview(ModelFeedforward):
@@ -96,41 +93,8 @@ class Preview(ModelFeedforward):
 
     plans = True
 
-    def __init__(self, model, manifold, settings):
-        super().__init__(model, manifold, settings)
-        self._plan = None
-
-    def take(self, plan, trajectory_id):
-        self._plan = None if plan is None else replace(plan, trajectory_id=trajectory_id)
-
-    def resume(self, other):
-        super().resume(other)
-        self._plan = getattr(other, "_plan", None)
-
-    def wanted(self, reference):
-        plan, path = self._plan, getattr(reference, "path", None)
-        if plan is None or path is None or path.trajectory_id != plan.trajectory_id:
-            return super().wanted(reference)
-        elapsed = reference.stamp_ns - path.start_ns
-        same = np.abs(path.begin_state - plan.start).max() < SAME_START
-        if not same or not 0 <= elapsed < plan.duration_ns:
-            return super().wanted(reference)
-        state, _ = plan.at(elapsed / SECOND)
-        # The torque is held over the coming period: that of its middle.
-        return state, plan.at(elapsed / SECOND + 0.5 * self.settings.period)[1]
-
     def prepare(self, trajectory, start):
         """Plan the motion of a trajectory; off the control path.
-
-        Parameters
-        ----------
-        trajectory : JointTrajectoryData
-        start : ndarray, shape (3, n)
-            State of the reference where it will begin: at rest.
-
-        Returns
-        -------
-        Plan
 
         Raises
         ------
@@ -138,25 +102,24 @@ class Preview(ModelFeedforward):
             When the trajectory does not go from rest to rest, is too long, or can't be done within the torque limit.
         """
         # A model of its own: the loop goes on with this one meanwhile.
-        return plan(build(self.model.arm), trajectory, start, self.limit)
+        model = build(self.model.arm)
+        path = path_of(trajectory, start)
+        gains = None if self.K is not None else gains_along(model, path, self._period)
+        return Preparation(start, gains, _Planner(model, path, start, self.limit).solve())
 
-
-def plan(model, trajectory, start, limit):
-    """See `Preview.prepare`."""
-    fields = (trajectory.positions, trajectory.velocities, trajectory.accelerations)
-    path = Path(trajectory.times_ns, [values for values in fields if values is not None], 1)
-    path.begin(0, start)
-    moving = max(np.abs(start[1:]).max(), 0.0)
-    if moving > SAME_START:
-        raise DesignError("preview: the motion does not begin at rest")
-    return _Planner(model, path, start, limit).solve()
+    def wanted(self, reference, prepared, elapsed):
+        if prepared is None or not 0.0 <= elapsed < prepared.plan.duration:
+            return super().wanted(reference, prepared, elapsed)
+        # The torque is held over the coming period: that of its middle.
+        plan = prepared.plan
+        return plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self._period)
 
 
 class _Planner:
     """One trajectory's linear programme."""
 
     def __init__(self, model, path, start, limit):
-        self.model, self.path, self.start, self.limit = model, path, start, limit
+        self.model, self.start, self.limit = model, start, limit
         n, m = model.n_joints, model.n_modes
         self.duration = path.duration_ns / SECOND
         end = np.zeros((3, n))
@@ -165,6 +128,7 @@ class _Planner:
         # The joints are prescribed here: the modes of the arm with its joints locked.
         squares, shapes = eigh(at_end.K2, at_end.M[n:, n:]) if m else (np.array([100.0]), None)
         omega = np.sqrt(np.maximum(squares, 1e-6))
+        self.omega = omega[0]
         count = KNOTS_PER_PERIOD * self.duration * omega[0] / (2.0 * np.pi)
         count = int(np.clip(np.ceil(count), FEWEST, MOST))
         knots = np.linspace(0.0, self.duration, count + 1)
@@ -198,53 +162,117 @@ class _Planner:
             self._along(c)
             c = c + self._programme(c)
         self._along(c)
-        q, free = self.motion, self._integrate(self.motion[:, 2, :, None])[..., 0]
+        q, free, torque = self.motion, *self._bend()
         state = np.concatenate([q[::2, 0], free[:, 0], q[::2, 1], free[:, 1]], axis=1)
         rates = np.concatenate([q[::2, 1], free[:, 1], q[::2, 2], free[:, 2]], axis=1)
+        if not np.isfinite(state).all():
+            raise DesignError("preview: the arm does not stand this motion: give it more time")
         return Plan(
-            start=self.start.copy(),
-            duration_ns=self.path.duration_ns,
+            duration=self.duration,
             motion=CubicHermiteSpline(self.times[::2], state, rates),
-            torque=self._torque(q[::2, 2, :, None], free[..., None])[..., 0] + self.f1[::2],
+            torque=torque,
             step=self.h,
             shift=float(np.abs(q[:, 0] - self.reference[:, 0]).max()),
         )
 
-    def _along(self, c):
-        """Terms of (2) along the reference shifted by c."""
-        n = self.model.n_joints
-        self.motion = self.reference + np.einsum("dtj,nj->tdn", self.basis, c)
-        terms = [self.model.terms(q[0], q[1]) for q in self.motion]
-        M = np.array([t.M for t in terms])
-        self.M11, self.M12 = M[:, :n, :n], M[:, :n, n:]
-        inverse = np.linalg.inv(M[:, n:, n:])
-        self.drive = -inverse @ M[:, n:, :n]
-        self.spring = -inverse @ np.array([t.K2 for t in terms])
-        self.damper = -inverse @ np.array([t.C2 for t in terms])
-        self.load = -np.einsum("tij,tj->ti", inverse, np.array([t.f2 for t in terms]))
-        self.f1 = np.array([t.f1 for t in terms])
-        self.C1, self.K1 = np.array([t.C1 for t in terms]), np.array([t.K1 for t in terms])
-
-    def _integrate(self, acceleration, loaded=True):
-        """Deflection, rate and their second derivative at whole steps, under joint accelerations.
-
-        Parameters
-        ----------
-        acceleration : ndarray, shape (2 steps + 1, n, columns)
-            [rad/s^2]
-        loaded : bool
-            With f_2 and from the deflection at the start; False: the response from zero alone.
+    def _bend(self):
+        """Deflection, its derivatives and joint torque at whole steps of the motion, products of deflections included.
 
         Returns
         -------
-        ndarray, shape (steps + 1, 3, m, columns)
+        bending : ndarray, shape (steps + 1, 3, m)
+        torque : ndarray, shape (steps + 1, n)
         """
-        m, columns = self.model.n_modes, acceleration.shape[2]
-        force = np.einsum("tmn,tnc->tmc", self.drive, acceleration)
+        n, m, h = self.model.n_joints, self.model.n_modes, self.h
+        out, torque = np.zeros((self.steps + 1, 3, m)), np.zeros((self.steps + 1, n))
+        out[0, 0] = self.model.static_deflection(self.start[0])
+
+        def slope(k, x, v):
+            return self._slope(*self.motion[k], x, v)
+
+        for i in range(self.steps):
+            x, v, k = out[i, 0], out[i, 1], 2 * i
+            a1, torque[i] = slope(k, x, v)
+            out[i, 2] = a1
+            v2 = v + 0.5 * h * a1
+            a2, _ = slope(k + 1, x + 0.5 * h * v, v2)
+            v3 = v + 0.5 * h * a2
+            a3, _ = slope(k + 1, x + 0.5 * h * v2, v3)
+            v4 = v + h * a3
+            a4, _ = slope(k + 2, x + h * v3, v4)
+            out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+            out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+        out[-1, 2], torque[-1] = slope(-1, out[-1, 0], out[-1, 1])
+        return out, torque
+
+    def _along(self, c):
+        """The reference shifted by c, and the equations of motion linearised along it."""
+        self.motion = self.reference + np.einsum("dtj,nj->tdn", self.basis, c)
+
+    def _linearise(self, bending):
+        """Derivatives of the bending's acceleration and of the joint torque along a motion, at all times.
+
+        By deflection and its rate, and by the joints' position, velocity and acceleration: differences of (2) in
+        full, at `KNOTS` times and linear between.
+        """
+        n, m = self.model.n_joints, self.model.n_modes
+        at = np.unique(np.linspace(0, self.times.size - 1, KNOTS).astype(int))
+        x = CubicHermiteSpline(self.times[::2], bending[:, 0], bending[:, 1])
+        v = CubicHermiteSpline(self.times[::2], bending[:, 1], bending[:, 2])
+        found = np.array([self._derivatives(k, x(self.times[k]), v(self.times[k])) for k in at])
+        flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
+        everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
+        # Columns: q, qd, qdd, x, v, and the bending's own acceleration, in the torque alone.
+        columns = np.cumsum([n, n, n, m, m])
+        a, u = everywhere[:, :m], everywhere[:, m:]
+        self.by_joints, self.spring, self.damper, _ = np.split(a, columns[2:], axis=2)
+        self.torque_by_joints, self.K1, self.C1, self.M12 = np.split(u, columns[2:], axis=2)
+
+    def _derivatives(self, k, x, v):
+        q, qd, qdd = self.motion[k]
+        n, m = self.model.n_joints, self.model.n_modes
+        t = self.model.terms(q, qd, x, v)
+        M12 = t.M[:n, n:]
+        out = np.zeros((m + n, 3 * n + 3 * m))
+        out[m:, -m:] = M12
+        out[:m, 2 * n : 3 * n] = -np.linalg.solve(t.M[n:, n:], t.M[n:, :n])
+        out[m:, 2 * n : 3 * n] = t.M[:n, :n]
+        here, u = self._slope(q, qd, qdd, x, v)
+        for part, values in enumerate((q, qd, None, x, v)):
+            if values is None:
+                continue
+            first = (0, n, 0, 3 * n, 3 * n + m)[part]
+            for j in range(values.size):
+                kept, values[j] = values[j], values[j] + SMALL
+                there, u2 = self._slope(q, qd, qdd, x, v)
+                values[j] = kept
+                out[:m, first + j] = (there - here) / SMALL
+                # At fixed acceleration of the bending: that part comes through M12.
+                out[m:, first + j] = (u2 - u - M12 @ (there - here)) / SMALL
+        return out
+
+    def _slope(self, q, qd, qdd, x, v):
+        """Acceleration of the bending, and joint torque, with the joints moved as given: (2), in full."""
+        n = self.model.n_joints
+        t = self.model.terms(q, qd, x, v)
+        force = -t.f2 - t.C2 @ v - t.K2 @ x - t.M[n:, :n] @ qdd
+        a = np.linalg.solve(t.M[n:, n:], force) if force.size else force
+        return a, t.M[:n, :n] @ qdd + t.M[:n, n:] @ a + t.f1 + t.C1 @ v + t.K1 @ x
+
+    def _respond(self):
+        """Linear response of the bending to each coefficient of the shift, at whole steps.
+
+        Returns
+        -------
+        ndarray, shape (steps + 1, 3, m, n count)
+            Deflection, rate and their second derivative; columns joint by joint.
+        """
+        m, n, count = self.model.n_modes, self.model.n_joints, self.basis.shape[2]
+        by = self.by_joints.reshape(-1, m, 3, n)
+        force = np.einsum("tmdn,dtj->tmnj", by, self.basis)
+        columns = n * count
+        force = force.reshape(-1, m, columns)
         out = np.zeros((self.steps + 1, 3, m, columns))
-        if loaded:
-            force += self.load[..., None]
-            out[0, 0] = self.model.static_deflection(self.start[0])[:, None]
         K, D, h = self.spring, self.damper, self.h
 
         def slope(k, x, v):
@@ -264,51 +292,67 @@ class _Planner:
         out[-1, 2] = slope(-1, out[-1, 0], out[-1, 1])
         return out
 
-    def _torque(self, acceleration, bending):
-        """Joint torque of a motion at whole steps, f_1 aside, (steps + 1, n, columns)."""
-        each = slice(None, None, 2)
-        u = np.einsum("tij,tjc->tic", self.M11[each], acceleration)
+    def _torque(self, bending):
+        """Joint torque that goes with `_respond`'s columns, at whole steps, (steps + 1, n, n count)."""
+        each, n, count = slice(None, None, 2), self.model.n_joints, self.basis.shape[2]
+        by = self.torque_by_joints[each].reshape(-1, n, 3, n)
+        u = np.einsum("tidj,dtc->tijc", by, self.basis[:, each]).reshape(-1, n, n * count)
         for matrix, part in ((self.M12, 2), (self.C1, 1), (self.K1, 0)):
             u += np.einsum("tij,tjc->tic", matrix[each], bending[:, part])
         return u
 
     def _programme(self, c):
         """Change of the shift's coefficients, (n, count)."""
+        free, u = self._bend()
+        self._linearise(free)
+        forced = self._respond()
+        end = free[-1]
+        A = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
+        b = -np.concatenate([self.modal @ (end[0] - self.rest), self.modal @ end[1]])
+        # On one scale: deflections are thousandths.
+        scale = 1.0 / np.maximum(np.abs(A).max(axis=1), 1e-30)
+        A, b = A * scale[:, None], b * scale
+        each = slice(None, None, max(1, self.steps // GRID))
+        u, du = u[each], self._torque(forced)[each]
+        change = self._least_squares(c, A, b)
+        if (np.abs(u + du @ change.ravel()) <= self.limit).all():
+            return change
+        return self._linear_programme(c, A, b, u, du)
+
+    def _least_squares(self, c, A, b):
+        """The change after which the mean square of the shift, and of its acceleration, is least."""
         n, count = c.shape
-        free = self._integrate(self.motion[:, 2, :, None])
-        columns = np.zeros((self.times.size, n, n * count))
-        for j in range(n):
-            columns[:, j, j * count : (j + 1) * count] = self.basis[2]
-        forced = self._integrate(columns, loaded=False)
-        end, each = free[-1, :2, :, 0], slice(None, None, max(1, self.steps // GRID))
-        A_eq = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
-        b_eq = -np.concatenate([self.modal @ (end[0] - self.rest), self.modal @ end[1]])
-        u = (self._torque(self.motion[::2, 2, :, None], free)[..., 0] + self.f1[::2])[each]
-        du = self._torque(columns[::2], forced)[each]
+        N, Ndd = self.basis[0], self.basis[2] / self.omega**2
+        weight = N.T @ N + SMOOTHNESS * Ndd.T @ Ndd
+        H = np.kron(np.eye(n), weight / np.abs(weight).max())
+        size, rows = n * count, len(b)
+        kkt = np.block([[H, A.T], [A, np.zeros((rows, rows))]])
+        right = np.concatenate([-H @ c.ravel(), b])
+        return np.linalg.lstsq(kkt, right, rcond=1e-12)[0][:size].reshape(n, count)
+
+    def _linear_programme(self, c, A, b, u, du):
+        """The change after which the largest shift is least, within the torque limit."""
+        n, count = c.shape
+        each = slice(None, None, max(1, self.steps // GRID))
         rows, bounds = [], []
-        limited = np.isfinite(self.limit)
         for sign in (1.0, -1.0):
-            for part, weight in ((0, [1.0, 0.0]), (2, [0.0, 1.0])):
+            for part, column in ((0, 0), (2, 1)):
                 N = self.basis[part][::2][each]
                 for j in range(n):
                     row = np.zeros((N.shape[0], n * count + 2))
                     row[:, j * count : (j + 1) * count] = sign * N
-                    row[:, -2:] = -np.array(weight)
+                    row[:, n * count + column] = -1.0
                     rows.append(row)
                     bounds.append(-sign * N @ c[j])
-            for j in np.flatnonzero(limited):
+            for j in np.flatnonzero(np.isfinite(self.limit)):
                 rows.append(np.hstack([sign * du[:, j], np.zeros((len(du), 2))]))
                 bounds.append(self.limit[j] - sign * u[:, j])
-        # Among equal shifts the smoother one.
-        cost = np.concatenate([np.zeros(n * count), [1.0, SMOOTHNESS * self.duration**2]])
-        # On one scale: deflections are thousandths.
-        scale = 1.0 / np.maximum(np.abs(A_eq).max(axis=1), 1e-30)
         result = linprog(
-            cost,
+            np.concatenate([np.zeros(n * count), [1.0, 0.1 * np.sqrt(SMOOTHNESS) / self.omega**2]]),
             np.vstack(rows),
             np.concatenate(bounds),
-            np.hstack([A_eq * scale[:, None], np.zeros((A_eq.shape[0], 2))]),
-            b_eq * scale,
+            np.hstack([A, np.zeros((len(b), 2))]),
+            b,
             bounds=[(None, None)] * (n * count) + [(0.0, None)] * 2,
             method="highs",
         )
