@@ -1,4 +1,4 @@
-"""The table of docs/trajectories.md: what each family of motions leaves of vibration. `python docs/trajectories.py`
+"""The tables of docs/trajectories.md: what shapers and motions leave of vibration. `python docs/trajectories.py`
 
 The arm gets the slow torque (10) of the motion and nothing else, no feedback: the full model, integrated, from rest.
 """
@@ -40,7 +40,18 @@ def motions(arm, start, end, duration):
     yield "least-exciting", least_exciting(arm, start, end, duration).profile
 
 
+def shaper_table():
+    """Residual vibration of the shapers where the mode is not where it was taken to be."""
+    offs = (0.0, 0.05, 0.1, 0.2, 0.3)
+    print("| mode off by | " + " | ".join(f"{100 * off:g} %" for off in offs) + " |")
+    print("|---" * (len(offs) + 1) + "|")
+    for kind, make in shapers.SHAPERS.items():
+        left = [100.0 * make(1.0, 0.0).residual(1.0 + off, 0.0) for off in offs]
+        print(f"| {kind} | " + " | ".join(f"{v:.1f} %" for v in left) + " |")
+
+
 def main():
+    shaper_table()
     for name, start, end, durations in (
         ("R", [0.0], [np.pi / 2], (1.0, 2.0)),
         ("two_link", [0.0, 0.2], [0.8, 1.0], (1.5, 3.0)),

@@ -1,18 +1,33 @@
-"""Publishes the paper's profile or a quintic: ``ros2 run flexarm_bringup publish_trajectory``."""
+"""Publishes a motion, or writes it to a file: ``ros2 run flexarm_bringup publish_trajectory``."""
 
 import argparse
 import math
 import sys
 import time
 
-from flexarm_control import profiles
-from flexarm_dynamics import arm_file
+import numpy as np
+
+from flexarm_control.trajectory import files, specs
+from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+
+#: Points of the message; quintics between them follow the first two exactly, or nearly so, with few.
+POINTS = {"paper": 101, "quintic": 101}
+#: Settings of the families as options: what they are for messages; None: as they are written.
+_LISTS = {
+    "from": "angles",
+    "to": "angles",
+    "tip": "coordinates",
+    "via": "coordinates",
+    "torque-limit": "torques",
+    "velocity-limit": "speeds",
+}
+_PLAIN = ("duration", "smoothness", "shaper", "shape-modes")
 
 
 def add_arguments(parser):
     """Arguments of the command, without ROS."""
-    parser.add_argument("profile", choices=("paper", "quintic"), help="which motion")
+    parser.add_argument("profile", choices=tuple(specs.FAMILIES), help="which motion")
     parser.add_argument("--arm", default="R", help="arm file, for the joint names (default R)")
     parser.add_argument(
         "--from",
@@ -20,13 +35,44 @@ def add_arguments(parser):
         help="joint angles where the motion starts, comma separated [rad] (default: where the reference is)",
     )
     parser.add_argument(
-        "--to",
-        default=str(math.pi / 2),
-        help="joint angles where it ends, comma separated [rad] (default 90 deg)",
+        "--to", help="joint angles where it ends, comma separated [rad] (default 90 deg)"
     )
+    parser.add_argument("--tip", metavar="x,y,z", help="line, arc: where the tip ends [m]")
+    parser.add_argument("--via", metavar="x,y,z", help="arc: a point on the way [m]")
     parser.add_argument("--duration", type=float, default=2.0, help="[s] (default 2)")
     parser.add_argument(
-        "--points", type=int, default=101, help="points of the message (default 101)"
+        "--smoothness",
+        type=int,
+        help="smooth, line, arc: derivatives that vanish at the ends, from 2 (default 3)",
+    )
+    parser.add_argument(
+        "--torque-limit",
+        help="least-exciting: largest slow torque, one or one per joint [N m] (default: the arm file's)",
+    )
+    parser.add_argument(
+        "--velocity-limit",
+        help="least-exciting: largest speed, one or one per joint [rad/s] (default: the arm file's)",
+    )
+    parser.add_argument("--shaper", choices=("zv", "zvd"), help="shape the motion; it gets longer")
+    parser.add_argument(
+        "--shape-modes",
+        type=int,
+        help=f"how many of the lowest modes the shaper is for (default {specs.SHAPE_MODES}, or all there are)",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        help=f"points of the message (default 101 for paper and quintic, else {specs.POINTS})",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say what the motion is and excites, publish nothing; it starts at zero unless --from is given",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        help="write it to a .csv or .yaml file for later, publish nothing; starts as --dry-run does",
     )
     parser.add_argument("--topic", default="joint_trajectory", help="topic to publish on")
     parser.add_argument(
@@ -34,26 +80,97 @@ def add_arguments(parser):
     )
 
 
-def _angles(text, count, what):
+def _list(text, count, name):
+    what, spread = _LISTS[name], count != 3 or _LISTS[name] != "coordinates"
     try:
         values = [float(v) for v in text.split(",")]
     except ValueError:
-        raise TrajectoryError(f"--{what} {text!r}: write numbers, comma separated") from None
-    values = values * count if len(values) == 1 else values
+        raise TrajectoryError(f"--{name} {text!r}: write numbers, comma separated") from None
+    values = values * count if spread and len(values) == 1 else values
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise TrajectoryError(f"--{what} {text!r}: {count} finite angles are wanted, one per joint")
+        each = "x,y,z" if what == "coordinates" else "one per joint"
+        raise TrajectoryError(f"--{name} {text!r}: {count} finite {what} are wanted, {each}")
     return values
 
 
-def profile_of(options, reference):
-    """The motion that the options describe, from `reference` unless they say from where."""
-    count = len(reference)
-    start = _angles(options.start, count, "from") if options.start else list(reference)
-    end = _angles(options.to, count, "to")
-    if options.profile == "quintic":
-        return profiles.quintic(start, end, options.duration)
-    travel = [b - a for a, b in zip(start, end, strict=True)]
-    return profiles.paper_profile(options.duration, travel, start)
+def settings_of(options, count):
+    """What the options set, as `specs.motion` takes it, for `count` joints."""
+    given = {key: getattr(options, key.replace("-", "_"), None) for key in (*_LISTS, *_PLAIN)}
+    given["from"] = options.start
+    out = {key: str(given[key]) for key in _PLAIN if given[key] is not None}
+    for key, what in _LISTS.items():
+        if given[key] is not None:
+            values = _list(given[key], 3 if what == "coordinates" else count, key)
+            out[key] = ";".join(map(repr, values))
+    return out
+
+
+def profile_of(options, reference, arm=None):
+    """The motion that the options describe, from `reference` unless they say from where.
+
+    Parameters
+    ----------
+    options : Namespace
+    reference : sequence of n float
+        [rad]
+    arm : ArmModel, optional
+        Built from the options where it is needed and not given.
+    """
+    settings = settings_of(options, len(reference))
+    if arm is None and specs.needs_model(options.profile, settings):
+        arm = model.build(arm_file.load(options.arm))
+    return specs.motion(options.profile, settings, arm, list(reference))
+
+
+def points_of(options):
+    """How many points the message has."""
+    return POINTS.get(options.profile, specs.POINTS) if options.points is None else options.points
+
+
+def prepare(options):
+    """Write the motion to a file, say what it is and excites, or both; without ROS.
+
+    Raises
+    ------
+    FlexarmError
+        When there is no such motion, or it is beyond the arm's limits.
+    """
+    arm = model.build(arm_file.load(options.arm))
+    profile = profile_of(options, np.zeros(arm.n_joints), arm)
+    trajectory = specs.sampled(profile, arm, points_of(options))
+    if options.dry_run:
+        print(description(options.profile, profile, arm))
+    if options.out:
+        files.write(options.out, trajectory)
+        print(f"{options.out}: {len(trajectory.times_ns)} points, {profile.duration:g} s")
+
+
+def description(name, profile, arm):
+    """Peaks of a motion and of its slow torque, and the vibrations that it leaves without fast control."""
+    from flexarm_control import excitation
+
+    excited = excitation.along(arm, profile)
+    speed = np.abs(profile.velocity(excited.times)).max(axis=0)
+    lines = [f"{name}: {profile.duration:.6g} s"]
+    for i, joint in enumerate(arm.arm.joints):
+        limits = joint.limits
+        lines.append(
+            f"  {joint.name}: {profile.start[i]:.4g} to {profile.start[i] + profile.angle[i]:.4g} rad, at most"
+            f" {speed[i]:.4g} rad/s{_of(limits.velocity)}, slow torque {excited.peak_torque[i]:.4g} N m"
+            f"{_of(limits.torque)}"
+        )
+        if excited.peak_torque[i] > limits.torque:
+            lines[-1] += ": it will be clipped; give it more time"
+    if arm.n_modes:
+        lines.append(
+            f"  vibration about the quasi-steady state, without fast control: {excited.transient:.3g} J on"
+            f" average, {excited.residual:.3g} J left at the end"
+        )
+    return "\n".join(lines)
+
+
+def _of(limit):
+    return f" of {limit:g}" if math.isfinite(limit) else ""
 
 
 class _Conversation:
@@ -97,15 +214,24 @@ class _Conversation:
 def publish(options, ros_args=None):
     """Publish once, with stamp 0 (now), to a controller that is there; say what became of it.
 
+    With ``--dry-run`` or ``--out`` nothing is published: `prepare`.
+
     Raises
     ------
     FlexarmError
         When there is no controller, or it refuses the trajectory.
     """
+    if options.dry_run or options.out:
+        prepare(options)
+        return
     from .lockstep import trajectory_message
 
-    names = arm_file.load(options.arm).joint_names
-    profile_of(options, [0.0] * len(names))  # says what is wrong with the options before it waits
+    arm = arm_file.load(options.arm)
+    names = arm.joint_names
+    settings = settings_of(options, len(names))
+    built = model.build(arm) if specs.needs_model(options.profile, settings) else None
+    if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
+        profile_of(options, [0.0] * len(names), built)  # wrong options are said before it waits
     line = _Conversation(options, ros_args)
     try:
         line.wait_for(
@@ -114,10 +240,9 @@ def publish(options, ros_args=None):
             f" {options.timeout:g} s: start simulator, observer and controller, on this ROS_DOMAIN_ID",
         )
         before = line.state
-        message = trajectory_message(
-            names, profile_of(options, before.reference_position), options.points
-        )
-        if options.profile == "quintic" and not options.start:
+        profile = profile_of(options, before.reference_position, built)
+        message = trajectory_message(names, profile, points_of(options))
+        if options.profile == "quintic" and not options.start and not options.shaper:
             # The controller's own quintic to the last point begins at its reference, moving or not.
             message.points = message.points[-1:]
         line.publisher.publish(message)
@@ -135,7 +260,7 @@ def publish(options, ros_args=None):
             raise FlexarmError(f"refused: {line.state.rejected_reason}")
         print(
             f"{options.profile}: accepted as trajectory {line.state.accepted_trajectory_id},"
-            f" {len(message.points)} points, {options.duration:g} s"
+            f" {len(message.points)} points, {profile.duration:g} s"
         )
     finally:
         line.close()

@@ -9,7 +9,10 @@ from numpy.testing import assert_allclose
 
 from flexarm_bringup import cli, publish_trajectory
 from flexarm_bringup.progress import Progress
-from flexarm_dynamics.errors import TrajectoryError
+from flexarm_control import profiles, shapers
+from flexarm_control.trajectory import files
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 
 COMMANDS = ("demo", "publish", "run", "parameters")
 
@@ -148,6 +151,75 @@ def test_one_angle_stands_for_all_joints_and_a_list_for_each():
 def test_an_unusable_option_is_refused_naming_it(kind, words, message):
     with pytest.raises(TrajectoryError, match=message):
         profile(kind, *words)
+
+
+def test_smooth_and_shaped_motions_are_their_families_and_shapers():
+    motion = profile("smooth", "--to", "1.0", "--duration", "1.5", "--smoothness", "5")
+    expected = profiles.smooth(0.0, 1.0, 1.5, 5)
+    assert_allclose(motion.acceleration(0.4), expected.acceleration(0.4), rtol=1e-14)
+    arm = model.build(arm_file.load("R"))
+    shaped = profile("quintic", "--to", "1.0", "--shaper", "zvd", "--shape-modes", "1")
+    shaper = shapers.for_arm(arm, [1.0], "zvd", 1)
+    assert shaped.duration == pytest.approx(2.0 + shaper.duration, rel=1e-14)
+    expected = shaper.apply(profiles.quintic(0.0, 1.0, 2.0))
+    assert_allclose(shaped.position(1.1), expected.position(1.1), rtol=1e-14)
+
+
+def test_a_line_leads_the_tip_from_where_the_reference_is():
+    arm = model.build(arm_file.load("two_link"))
+    words = ("line", "--arm", "two_link", "--tip=0.3,0.5,0", "--duration", "2")
+    motion = profile(*words, reference=(0.2, 1.2))
+    assert_allclose(motion.position(0.0), [0.2, 1.2], atol=1e-12)
+    tip = arm.tip_position(motion.position(2.0), np.zeros(4))
+    assert_allclose(tip, [0.3, 0.5, 0.0], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["smooth", "--smoothness", "1"], "smoothness is 1: give an integer from 2"),
+        (["quintic", "--smoothness", "3"], "quintic has no smoothness"),
+        (["quintic", "--torque-limit", "3"], "quintic has no torque-limit"),
+        (["paper", "--shape-modes", "1"], "shape-modes without shaper"),
+        (
+            ["paper", "--shaper", "zv", "--shape-modes", "3"],
+            "R: a shaper of 3 modes; the arm has 2",
+        ),
+        (["line"], "line wants tip"),
+        (["line", "--tip", "1,2"], r"--tip '1,2': 3 finite coordinates are wanted, x,y,z"),
+        (["line", "--tip", "1"], r"--tip '1': 3 finite coordinates are wanted"),
+        (["line", "--tip", "1,0,0", "--to", "1"], "line has no to: it takes tip"),
+        (["line", "--tip", "3,0,0"], "R: the tip can't follow its path|the tip is already at"),
+        (["least-exciting", "--torque-limit", "-1"], r"torque_limit\[0\] is -1"),
+    ],
+)
+def test_families_that_cant_be_are_refused_naming_the_option(words, message):
+    with pytest.raises(FlexarmError, match=message):
+        profile(*words)
+
+
+def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, capsys):
+    path = tmp_path / "motion.yaml"
+    words = ["publish", "smooth", "--to", "-0.5", "--out", str(path), "--dry-run"]
+    assert exit_code(words) == 0
+    out = capsys.readouterr().out
+    assert "smooth: 2 s" in out and "401 points" in out
+    assert "joint1: 0 to -0.5 rad, at most 0.5469 rad/s" in out  # 35/16 of the mean
+    assert "J left at the end" in out
+    read = files.read(path, ["joint1"])
+    expected = profiles.sample(profiles.smooth(0.0, -0.5, 2.0, 3), 401)
+    assert_allclose(read.positions, expected.positions, rtol=1e-15)
+    assert_allclose(read.accelerations, expected.accelerations, rtol=1e-15)
+
+
+def test_a_torque_that_will_be_clipped_is_said(capsys):
+    assert exit_code(["publish", "paper", "--duration", "1", "--dry-run"]) == 0
+    assert "of 13.5582: it will be clipped" in capsys.readouterr().out
+
+
+def test_a_file_of_another_kind_is_refused(capsys):
+    assert exit_code(["publish", "paper", "--out", "motion.txt"]) == 1
+    assert "motion.txt: a trajectory's file ends in .csv" in capsys.readouterr().err
 
 
 # --------------------------------------------------------------------------- progress

@@ -143,8 +143,8 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
     with the beta function B and the regularised incomplete beta function I: the polynomial of degree
     2 k + 1 that is C^k with rest on both sides, so of least degree. k = 2 is the quintic, k = 3 the
     septic, and so on, e.g. Biagiotti & Melchiorri (2008), section 2.1.7; this form keeps its digits
-    where the power series of a high k cancels. The more derivatives, the faster the motion's spectrum
-    falls (as omega^-(k+2)), and the higher its peaks: speed 1 / (4^k B(k+1, k+1)) of the mean.
+    where the power series of a high k cancels. The more derivatives, the faster the spectrum of the
+    acceleration falls (as omega^-k), and the higher its peaks: the speed's is 1 / (4^k B(k+1, k+1)) of the mean.
 
     Parameters
     ----------
