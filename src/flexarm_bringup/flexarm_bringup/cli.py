@@ -66,6 +66,12 @@ def _observers(options):
     observers(options)
 
 
+def _analyze(options):
+    from .analysis.command import analyze
+
+    analyze(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -97,6 +103,7 @@ def parser():
     demo.set_defaults(function=_demo)
 
     _add_arm_commands(commands)
+    _add_analyze(commands)
 
     from .publish_trajectory import add_arguments
 
@@ -189,6 +196,19 @@ def _add_arm_commands(commands):
     )
     observer_table.add_arguments(command)
     command.set_defaults(function=_observers)
+
+
+def _add_analyze(commands):
+    from .analysis import command
+
+    analyze = commands.add_parser(
+        "analyze",
+        help="time scales, a bound on mu, margins, domain of attraction and Monte Carlo of a design",
+        description="What can be said of an arm and a controller before the arm moves; some of it by short runs.",
+        epilog="example: flexarm analyze R paper_composite --out results/analysis --monte-carlo 100",
+    )
+    command.add_arguments(analyze)
+    analyze.set_defaults(function=_analyze)
 
 
 #: Options whose value may begin with a minus.

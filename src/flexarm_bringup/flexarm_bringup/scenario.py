@@ -20,7 +20,7 @@ from flexarm_control.composite import FAST, MANIFOLD, SLOW
 from flexarm_control.composite import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.trajectory import specs
 from flexarm_dynamics import arm_file, registry
-from flexarm_dynamics.arm import scaled
+from flexarm_dynamics.arm import Arm, scaled
 from flexarm_dynamics.errors import ParameterError, TrajectoryError
 from flexarm_sim.simulator import PARAMETERS as SIMULATOR_PARAMETERS
 
@@ -48,8 +48,9 @@ class Scenario:
 
     Attributes
     ----------
-    arm : str
-        Arm file, as observer and controller know it: shipped name or path.
+    arm : str or Arm
+        Arm file, as observer and controller know it: shipped name or path. An arm that was read goes to other
+        processes, too, but not through JSON.
     controller : dict
         Parameters of the loop by their names in a parameter file, flat: ``{"slow.type": "model_following",
         "slow.kp": [6.25], "observer.type": "luenberger", "torque_limit": [5.0], "rate": 500.0, …}``; see
@@ -222,7 +223,7 @@ def loop_of(scenario):
     if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
     groups = {prefix: _component(prefix, values) for prefix in COMPONENTS}
-    arm = arm_file.load(scenario.arm)
+    arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
     plant = scaled(
         arm_file.load(scenario.plant_arm) if scenario.plant_arm else arm,
         scenario.payload_scale,
