@@ -20,9 +20,9 @@ without for one joint.
 The estimate belongs to the law's `model`, so that the slow manifold, too, bends the links as that payload would: else
 the fast control works against every payload but the arm file's, and the estimate goes astray by it.
 
-Nothing leaks: without motion and gravity Y vanishes with s, and the estimate stays. It is kept over trajectories, so
+Nothing leaks: where the arm rests without gravity Y vanishes and the estimate stays. It is kept over trajectories, so
 that the next one starts from what the last one taught, and forgotten when a session begins. While the slow torque is
-beyond a joint's limit, and within `dead_zone`, nothing is learnt: that error is not the payload's.
+beyond a joint's limit nothing is learnt, nor from s within `dead_zone`: these errors are not the payload's.
 
 gamma is normalised by the arm, so that `adaptation_gain` means the same for each: under a steady acceleration A of
 one joint the estimate's error obeys :math:`\ddot{\tilde p} + \Lambda_2\dot{\tilde p} + \Gamma A^2\tilde p = 0`;
@@ -53,6 +53,8 @@ class AdaptiveModelFollowing(SlowLaw):
     ----------
     payload_scale : float
         The estimate: payload in parts of the arm file's.
+    learning : float
+        Rate of the estimate at the last sample [1/s].
     model : PayloadModel
         The arm with that payload; whoever calls `torque` takes the terms from it.
 
@@ -68,30 +70,12 @@ class AdaptiveModelFollowing(SlowLaw):
         Parameter(
             "adaptation_gain",
             "float",
-            2.0,
+            0.3,
             "How fast adaptive model following learns: the square of the estimate's frequency per squared"
             " acceleration; 0.0: not at all.",
             unit="s^2",
             low=0.0,
             high=1e4,
-        ),
-        Parameter(
-            "identification_rate",
-            "float",
-            1.0,
-            "x",
-            unit="1/s",
-            low=0.0,
-            high=1e3,
-        ),
-        Parameter(
-            "filter_bandwidth",
-            "float",
-            20.0,
-            "x",
-            unit="rad/s",
-            low=0.1,
-            high=1e3,
         ),
         Parameter(
             "payload_scale_max",
@@ -104,8 +88,8 @@ class AdaptiveModelFollowing(SlowLaw):
         Parameter(
             "dead_zone",
             "float",
-            0.0,
-            "Adaptive model following learns nothing from a combined error (ds/dt of the sliding surface) below it.",
+            0.02,
+            "Adaptive model following learns nothing from a combined error s below it: what bending and noise leave.",
             unit="rad/s",
             low=0.0,
             high=10.0,
@@ -132,13 +116,7 @@ class AdaptiveModelFollowing(SlowLaw):
             self.parameters["dead_zone"],
         )
         self._limit = torque_limits(model.arm)
-        self._learning = 0.0
-        n = model.n_joints
-        self._now, self._filtered, self._started = np.zeros((3, n)), np.zeros((3, n)), False
-        self._bandwidth, self._identification = (
-            self.parameters["filter_bandwidth"],
-            self.parameters["identification_rate"],
-        )
+        self.learning = 0.0
 
     @property
     def payload_scale(self):
@@ -159,12 +137,11 @@ class AdaptiveModelFollowing(SlowLaw):
 
     def _normalised_gain(self):
         """gamma of the module [1/(N m s) per rad/s], from the largest regressor over configurations."""
-        inertia = weight = largest = 0.0
+        inertia = weight = 0.0
         random = np.random.default_rng(0)
         for q in random.uniform(-np.pi, np.pi, (CONFIGURATIONS, self.model.n_joints)):
             M = self._one.mass_matrix(q)
             extra = self._two.mass_matrix(q) - M
-            largest = max(largest, np.linalg.norm(extra, 2))
             heavy = self._difference(q, self._at_rest)
             inertia = max(inertia, np.linalg.norm(extra @ np.linalg.solve(M, extra), 2))
             weight = max(weight, heavy @ np.linalg.solve(M, heavy))
@@ -173,7 +150,6 @@ class AdaptiveModelFollowing(SlowLaw):
                 f"payload: no joint of arm {self.model.arm.name} moves it: adaptive_model_following has nothing to"
                 " learn"
             )
-        self._threshold = (0.5 * largest) ** 2
         gain = self.parameters["adaptation_gain"]
         slowest = max(self.approach.min(), 1e-6)
         return gain / (inertia + gain * weight / slowest**2)
@@ -200,13 +176,14 @@ class AdaptiveModelFollowing(SlowLaw):
         return Y
 
     def reset(self):
-        self.model.scale, self._learning, self._started = 1.0, 0.0, False
+        self.model.scale, self.learning = 1.0, 0.0
+
+    def resume(self, other):
+        if isinstance(other, AdaptiveModelFollowing):
+            self.model.scale = min(other.payload_scale, self._most)
 
     def advance(self, dt):
-        scale = self.model.scale + dt * self._learning
-        keep = np.exp(-self._bandwidth * dt)
-        self._filtered *= keep
-        self._filtered += (1.0 - keep) * self._now
+        scale = self.model.scale + dt * self.learning
         self.model.scale = min(max(scale, 0.0), self._most)
 
     def torque(self, q, qd, reference, terms):
@@ -222,16 +199,5 @@ class AdaptiveModelFollowing(SlowLaw):
         beyond = (np.abs(u) > self._limit).any()
         heard = s - np.clip(s, -self._dead_zone, self._dead_zone)
         Y = self.regressor(q, qd, speed, acceleration)
-        self._now[:] = q, qd, u
-        if not self._started:
-            self._filtered[:], self._started = self._now, True
-        self._learning = 0.0 if beyond else self.gamma * float(Y @ heard) + self._identified(qd)
+        self.learning = 0.0 if beyond else self.gamma * float(Y @ heard)
         return u
-
-    def _identified(self, qd):
-        q, v, u = self._filtered
-        acceleration = self._bandwidth * (qd - v)
-        a, B = slow_subsystem(self.model.terms(q, v))
-        missing = u - np.linalg.solve(B, acceleration - a)
-        W = self.regressor(q, v, v, acceleration)
-        return self._identification * float(W @ missing) / (float(W @ W) + self._threshold)

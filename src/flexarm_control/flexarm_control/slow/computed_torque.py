@@ -102,6 +102,11 @@ class ComputedTorque(SlowLaw):
         for state in (self.integral, self._error, self._beyond):
             state[:] = 0.0
 
+    def resume(self, other):
+        if isinstance(other, ComputedTorque):
+            np.clip(other.integral, -self._most, self._most, out=self.integral)
+            self.integral *= self.ki > 0.0
+
     def advance(self, dt):
         # Where the torque is at its limit, an error that pushes farther has nothing to gain.
         grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
