@@ -25,6 +25,7 @@ setup(
         "console_scripts": [
             "flexarm = flexarm_bringup.cli:entry",
             "publish_trajectory = flexarm_bringup.publish_trajectory:entry",
+            "ros2_control_adapter = flexarm_bringup.adapters:start_ros2_control_adapter",
         ],
     },
 )

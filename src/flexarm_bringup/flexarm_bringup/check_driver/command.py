@@ -199,12 +199,23 @@ class Examination:
         return True
 
     def move(self, angle):
-        """Push every joint; then see what the driver does without torque and with wrong ones."""
+        """Push every joint; then see what the driver does without torque and with wrong ones.
+
+        Raises
+        ------
+        FlexarmError
+            When somebody else sends torque.
+        """
         if np.ptp(self.samples.position, axis=0).max() > 0.1 * angle:
             text = "the arm is in motion before it is pushed: bring it to rest, try again"
             self.findings.append(Finding("response", Verdict.FAIL, text))
             return
+        # Now, and not at the start: others have to be discovered first.
+        if not self.line.alone():
+            raise FlexarmError("a controller sends joint_torque: stop it before the arm is pushed")
         for joint in range(len(self.arm.joints)):
+            if joint:
+                self._rest()
             push = self._push(joint, angle)
         if not self._failed("response", "torque reported"):
             self._stop(push)
@@ -228,7 +239,6 @@ class Examination:
         found = self._samples(heard)
         sent = moving.sent_torque(found, sequences, torques)
         self.findings += moving.check_push(self.model, push, found, sent, self.tolerances)
-        self._rest()
         return push
 
     def _stop(self, push):
@@ -241,7 +251,7 @@ class Examination:
             last[:] = message.sequence, torque
 
         heard = self.line.listen(2.0 * JOLT, answer)
-        heard += self.line.listen(10.0 * self.tolerances.torque_timeout + 0.2)
+        heard += self.line.listen(5.0 * self.tolerances.torque_timeout + 0.2)
         self.findings.append(
             moving.check_stop(self._samples(heard), *last, push.joint, self.tolerances)
         )
