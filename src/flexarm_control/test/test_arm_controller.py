@@ -68,8 +68,12 @@ class Scripted:
 
     def __init__(self, *torques):
         self.torques = list(torques)
+        self.needs_rates, self.limit, self.feedforward = True, None, None
 
-    def step(self, q, qd, delta, delta_d, reference):
+    def reset(self):
+        pass
+
+    def step(self, q, qd, delta, delta_d, reference, dt):
         value = self.torques.pop(0)
         if isinstance(value, BaseException):
             raise value

@@ -99,7 +99,7 @@ def test_an_unknown_law_is_refused_with_what_there_is_and_a_guess(arm_r):
     ):
         design_law(SLOW, "pid", arm_r, {})
     with pytest.raises(UnknownComponentError, match="filtered_derivative, kalman, luenberger"):
-        design_observer("kalman", arm_r, {})
+        design_observer("kalmann", arm_r, {})
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from .expansion import STEP, Point, expand, reach
+from .expansion import Point, expand, reach, step
 
 #: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
 SMALL = 1e-5
@@ -80,7 +80,7 @@ class Manifold(ABC):
         """
         points = {}
         for i in range(-reach(self.order), reach(self.order) + 1):
-            state = reference.near(i * STEP)
+            state = reference.near(i * step(self.order))
             points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
         delta, rate, second = expand(points, self.order)
         return delta, rate, points[0].torque(delta, rate, second)

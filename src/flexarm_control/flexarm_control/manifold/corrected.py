@@ -19,7 +19,7 @@ is left out is of order mu^(k+1). With the joint rows of (2) the joints then mov
 .. math:: u = \bar u + M_{12}\ddot\delta + C_1\dot\delta + K_1(\delta - \delta^{(0)}) .
 
 The derivatives are taken along the slow motion through the present state, by central differences over
-`expansion.STEP`: the reference goes on as it is known to, and the tracking error decays as the slow law makes it,
+`expansion.step`: the reference goes on as it is known to, and the tracking error decays as the slow law makes it,
 :math:`\ddot e = -k_v\dot e - k_p e`, so that the manifold holds off the reference, too, and the slow poles stay
 where they were placed. The derivation, beside a manifold found numerically: docs/control.md.
 """
@@ -30,7 +30,7 @@ from scipy.linalg import expm
 from flexarm_dynamics.parameters import Parameter
 
 from .base import Manifold
-from .expansion import STEP, Point, expand, reach
+from .expansion import Point, expand, reach, step
 
 
 class CorrectedManifold(Manifold):
@@ -51,7 +51,7 @@ class CorrectedManifold(Manifold):
     def __init__(self, model, slow, parameters):
         super().__init__(model, slow, parameters)
         self.order = self.parameters["order"]
-        self._reach = reach(self.order)
+        self._reach, self._step = reach(self.order), step(self.order)
         self._flow = self._error_flow()
 
     def _error_flow(self):
@@ -62,7 +62,7 @@ class CorrectedManifold(Manifold):
         kp, kv = gains
         n = self.model.n_joints
         A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(kp), -np.diag(kv)]])
-        return {i: expm(A * i * STEP) for i in range(-self._reach, self._reach + 1)}
+        return {i: expm(A * i * self._step) for i in range(-self._reach, self._reach + 1)}
 
     def update(self, q, qd, reference, terms, slow_torque):
         here = slow_acceleration(terms, slow_torque)
@@ -79,7 +79,7 @@ class CorrectedManifold(Manifold):
 
     def _motion(self, j, reference, error, extra):
         """Position, velocity, acceleration of the slow motion at a point of the stencil, (3, n)."""
-        motion, t, n = reference.near(j * STEP).copy(), j * STEP, self.model.n_joints
+        motion, t, n = reference.near(j * self._step).copy(), j * self._step, self.model.n_joints
         if self._flow is None:
             # A law of another kind: what it adds to the reference's acceleration stays for this while.
             motion[0] += -error[:n] - t * error[n:] + 0.5 * t * t * extra

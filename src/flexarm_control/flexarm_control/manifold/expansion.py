@@ -3,8 +3,14 @@
 import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 
-#: Step of the central differences [s]: truncation 1e-7 and rounding 1e-9 of a motion within a second.
-STEP = 1e-3
+
+def step(order):
+    """Step of the central differences [s].
+
+    Of a motion within a second they are off by 1e-6 at most, and rounding by less. From order 3 on differences are
+    taken of differences: there a longer step keeps rounding down.
+    """
+    return 1e-3 if order <= 2 else 4e-3
 
 
 def reach(order):
@@ -68,16 +74,16 @@ def expand(points, order):
     -------
     delta, rate, second : ndarray, shape (m,)
     """
-    level = {i: p.delta for i, p in points.items()}
+    level, h = {i: p.delta for i, p in points.items()}, step(order)
     rate, second = np.zeros_like(level[0]), np.zeros_like(level[0])
     for k in range(1, order + 1):
         if k % 2:  # the rates of the level before
-            rate = (level[1] - level[-1]) / (2.0 * STEP)
+            rate = (level[1] - level[-1]) / (2.0 * h)
             continue
         wide, higher = max(level), {}
         for i in range(1 - wide, wide):
-            speed = (level[i + 1] - level[i - 1]) / (2.0 * STEP)
-            bend = (level[i + 1] - 2.0 * level[i] + level[i - 1]) / STEP**2
+            speed = (level[i + 1] - level[i - 1]) / (2.0 * h)
+            bend = (level[i + 1] - 2.0 * level[i] + level[i - 1]) / h**2
             higher[i] = points[i].corrected(speed, bend)
             if i == 0:
                 second = bend

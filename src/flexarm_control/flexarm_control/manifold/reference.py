@@ -9,7 +9,7 @@ poles move: on the paper's arm from the double pole -2.5 to -1.5 +- 1.5j.
 """
 
 from .base import Manifold
-from .expansion import STEP, Point, expand, reach
+from .expansion import Point, expand, reach, step
 
 
 class ReferenceManifold(Manifold):
@@ -20,7 +20,7 @@ class ReferenceManifold(Manifold):
     def update(self, q, qd, reference, terms, slow_torque):
         points = {}
         for i in range(-reach(self.order), reach(self.order) + 1):
-            state = reference.near(i * STEP)
+            state = reference.near(i * step(self.order))
             points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
         delta, rate, second = expand(points, self.order)
         self.amplitude[:], self.rate[:] = delta, rate
