@@ -100,6 +100,15 @@ def test_below_the_bound_the_composite_lyapunov_function_falls(paper, seed):
         assert np.linalg.eigvalsh(units @ fall @ units).max() < 0.0
 
 
+def test_for_one_slow_and_one_fast_state_the_bound_is_the_limit():
+    a, b, c, f, r = 2.0, 3.0, 0.7, 5.0, 1.1
+    scalar = bound.Blocks(*(np.array([[v]]) for v in (-a, b, c, -f, r)))
+    found = bound.constants(scalar, np.eye(1), 4.0 * np.eye(1))
+    assert_allclose(found["factor"], f / (r + b * c / a))  # where the determinant changes sign
+    assert_allclose(found["d"], found["beta1"] / (found["beta1"] + found["beta2"]))
+    assert_allclose(bound.stable_factor(scalar), found["factor"], rtol=1e-4)
+
+
 @pytest.mark.parametrize("which", ["paper", "default"])
 def test_the_bound_is_positive_and_below_what_the_loop_bears(which, request):
     subject = request.getfixturevalue(which)
@@ -180,6 +189,13 @@ def test_the_arm_comes_back_unless_the_torque_is_too_small(paper):
     limited = paper.scenario.controller | {"torque_limit": [0.1]}
     weak = subjects.of(replace(paper.scenario, controller=limited))
     assert not attraction.comes_back(weak, off, straight, 2.0)
+
+
+def test_a_small_bend_straightens_under_the_default_controller(default):
+    shape = attraction.lowest_shape(default)
+    watched = attraction.DECAYS / default.decay()
+    assert attraction.comes_back(default, np.zeros(1), 0.05 * shape, watched)
+    assert not attraction.comes_back(default, np.zeros(1), 0.05 * shape, 0.3)  # not yet
 
 
 def test_the_lowest_shape_moves_the_tip_by_a_metre_per_metre(paper):
