@@ -72,6 +72,18 @@ def _analyze(options):
     analyze(options)
 
 
+def _identify(options):
+    from .identification.command import identify
+
+    identify(options)
+
+
+def _excite(options):
+    from .identification.excite import excite
+
+    excite(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -127,6 +139,8 @@ def parser():
     )
     add_check_arguments(check)
     check.set_defaults(function=_check_driver)
+
+    _add_identification(commands)
 
     run = commands.add_parser(
         "run",
@@ -209,6 +223,28 @@ def _add_analyze(commands):
     )
     command.add_arguments(analyze)
     analyze.set_defaults(function=_analyze)
+
+
+def _add_identification(commands):
+    from .identification import command, excite
+
+    identify = commands.add_parser(
+        "identify",
+        help="find an arm's parameters, with intervals, from a recorded motion",
+        description="Fits the arm file's model to a bag or CSV file: stiffness, damping, inertias, payload, friction,"
+        " gauges, each with its 95 % interval; writes an arm file with them.",
+        epilog="example: flexarm identify results/sweep my_arm.yaml --out identified.yaml --plot fit.png",
+    )
+    command.add_arguments(identify)
+    identify.set_defaults(function=_identify)
+    shake = commands.add_parser(
+        "excite",
+        help="shake a running arm to identify it by, and record a bag",
+        description="Runs the node `excite` on a running driver or simulator; records while its torque is applied.",
+        epilog="example: flexarm excite my_arm.yaml --kind sweep --amplitude 2 --out results/sweep --allow-motion",
+    )
+    excite.add_arguments(shake)
+    shake.set_defaults(function=_excite)
 
 
 #: Options whose value may begin with a minus.

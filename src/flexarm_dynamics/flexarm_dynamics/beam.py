@@ -207,6 +207,7 @@ def _loaded_matrix(beta, mass, inertia, moment):
     )
 
 
+@lru_cache(maxsize=256)
 def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_offset=0.0):
     r"""Exact modes of the clamped beam that carries a rigid body at its tip.
 

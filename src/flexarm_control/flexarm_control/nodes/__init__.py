@@ -11,3 +11,8 @@ def start_observer():
 def start_controller():
     """Entry point of ``ros2 run flexarm_control controller``."""
     start("flexarm_control.nodes.controller")
+
+
+def start_excite():
+    """Entry point of ``ros2 run flexarm_control excite``."""
+    start("flexarm_control.nodes.excite")

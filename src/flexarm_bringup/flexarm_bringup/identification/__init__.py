@@ -1,0 +1,1 @@
+"""Finds an arm's parameters from how it moved: ``flexarm identify`` (docs/identification.md)."""

@@ -1,0 +1,188 @@
+r"""Torques that shake an arm so that its motion tells its parameters: pulse, ring-down, sweep; and what stops them.
+
+Of amplitude A, joint by joint, each with a time of rest after it, in which the arm rings freely:
+
+- pulse: :math:`A` for half of the duration, then :math:`-A`: the rigid arm comes to rest again;
+- ring_down: :math:`A\sin(2\pi f t)`, some periods at the first bending frequency f with the joints free;
+- sweep: :math:`A\,w(t)\sin 2\pi(f_0 t + (f_1 - f_0)t^2/2T)`, from f_0 to f_1, faded in and out by w.
+
+Beside it acts what holds the arm's weight where it stood, and, where asked for, a soft spring and damper about that
+place: :math:`-B^{-1}_{jj}(\omega_h^2\,\Delta q + 1.4\,\omega_h\,\dot q)`. The recorded torque is the sum: a fit needs
+to know no more.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.parameters import Parameter, check_all
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+KINDS = ("ring_down", "sweep", "pulse")
+PARAMETERS = (
+    Parameter(
+        "kind",
+        "string",
+        "sweep",
+        "What the torque is over time: a sweep of frequencies, a pulse forth and back, or some periods at the first"
+        " bending frequency.",
+        choices=KINDS,
+    ),
+    Parameter(
+        "joint",
+        "string",
+        "",
+        "Joint that is shaken; empty: one after the other.",
+    ),
+    Parameter(
+        "amplitude",
+        "float",
+        0.0,
+        "Amplitude of the torque; at most the joint's limit. 0: a fifth of that.",
+        unit="N m",
+        low=0.0,
+        high=1e6,
+    ),
+    Parameter(
+        "duration",
+        "float",
+        0.0,
+        "Of the shaking of one joint; 0: by the kind and the slowest mode.",
+        unit="s",
+        low=0.0,
+        high=600.0,
+    ),
+    Parameter(
+        "rest",
+        "float",
+        2.0,
+        "Time in which the arm rings freely, after each joint.",
+        unit="s",
+        low=0.0,
+        high=600.0,
+    ),
+    Parameter(
+        "frequency_low",
+        "float",
+        0.0,
+        "Where a sweep begins; 0: at a quarter of the lowest bending frequency.",
+        unit="Hz",
+        low=0.0,
+        high=10000.0,
+    ),
+    Parameter(
+        "frequency_high",
+        "float",
+        0.0,
+        "Where a sweep ends; 0: at 1.3 times the highest bending frequency of the arm file.",
+        unit="Hz",
+        low=0.0,
+        high=10000.0,
+    ),
+)
+#: Share of a sweep over which it fades in, and out [-].
+FADE = 0.05
+#: Periods of a ring-down's push.
+PUSHES = 3
+#: Least duration of a sweep [s], and in periods of the slowest mode.
+SHORTEST, SWEEP_PERIODS = 4.0, 12.0
+
+
+class ExcitationTorque:
+    """A torque over time.
+
+    Parameters
+    ----------
+    model : ArmModel
+    settings : mapping
+        Values of `PARAMETERS`; what is missing takes its default.
+    position : ndarray, shape (n,), optional
+        Where the arm stands [rad]; zero if not given.
+
+    Attributes
+    ----------
+    duration : float
+        Of the whole [s].
+    hold : ndarray, shape (n,)
+        What holds the arm's weight [N m].
+
+    Raises
+    ------
+    ParameterError, DesignError
+        For a joint that is not there, an amplitude beyond its limit, and a sweep that ends where it begins.
+    """
+
+    def __init__(self, model, settings: Mapping, position=None):
+        n = model.n_joints
+        self.settings = s = check_all(PARAMETERS, settings)
+        position = np.zeros(n) if position is None else np.asarray(position, float)
+        a, B = slow_subsystem(model.terms(position, np.zeros(n)))
+        self.hold = -np.linalg.solve(B, a)
+        #: Inertia that each joint moves alone [kg m^2].
+        self.inertia = 1.0 / np.diag(B)
+        self.joints = _joints(model, s["joint"])
+        self.amplitude = np.array(
+            [_amplitude(model.arm.joints[j], s["amplitude"], self.hold[j]) for j in self.joints]
+        )
+        modes = model.frequencies(position) / (2.0 * np.pi) if model.n_modes else np.array([1.0])
+        self.low = s["frequency_low"] or 0.25 * modes[0]
+        self.high = s["frequency_high"] or 1.3 * modes[-1]
+        self.first = modes[0]
+        if s["kind"] == "sweep" and not self.high > self.low:
+            raise DesignError(
+                f"sweep from frequency_low {self.low:g} Hz to frequency_high {self.high:g} Hz: the end must be above"
+            )
+        default = {
+            "sweep": max(SHORTEST, SWEEP_PERIODS / modes[0]),
+            "pulse": 0.5 / modes[0],
+            "ring_down": PUSHES / modes[0],
+        }
+        self.shaking = s["duration"] or default[s["kind"]]
+        self.duration = len(self.joints) * (self.shaking + s["rest"])
+
+    def torque(self, time):
+        """Torque at a time from the start, shape (n,) [N m]."""
+        out = self.hold.copy()
+        span = self.shaking + self.settings["rest"]
+        k = int(time // span)
+        if time >= 0.0 and k < len(self.joints):
+            out[self.joints[k]] += self.amplitude[k] * self._shape(time - k * span)
+        return out
+
+    def _shape(self, t):
+        """Torque of one joint, of its amplitude [-]."""
+        T, kind = self.shaking, self.settings["kind"]
+        if t >= T:
+            return 0.0
+        if kind == "pulse":
+            return 1.0 if t < 0.5 * T else -1.0
+        if kind == "ring_down":
+            return np.sin(2.0 * np.pi * self.first * t)
+        window = min(1.0, t / (FADE * T), (T - t) / (FADE * T))
+        return window * np.sin(2.0 * np.pi * t * (self.low + 0.5 * (self.high - self.low) * t / T))
+
+
+def _joints(model, name):
+    if not name:
+        return list(range(model.n_joints))
+    if name not in model.joint_names:
+        raise DesignError(f"joint: {name!r} is none of {', '.join(model.joint_names)}")
+    return [model.joint_names.index(name)]
+
+
+def _amplitude(joint, wanted, hold):
+    """Amplitude of a joint, within what its limit leaves beside the weight [N m]."""
+    left = joint.limits.torque - abs(hold)
+    if not wanted:
+        if not np.isfinite(left):
+            raise DesignError(
+                f"amplitude: give one [N m]: the arm file has no torque limit for {joint.name}"
+            )
+        wanted = 0.2 * left
+    if not 0.0 < wanted <= left:
+        raise DesignError(
+            f"amplitude {wanted:g} N m: {joint.name} may have {joint.limits.torque:g} N m and needs"
+            f" {abs(hold):.3g} N m of it to hold the arm's weight"
+        )
+    return wanted

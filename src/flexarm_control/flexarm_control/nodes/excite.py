@@ -1,0 +1,140 @@
+"""Excitation node: `arm_state` in, `joint_torque` out, as the controller does, to find the arm's parameters by."""
+
+import os
+
+from rclpy.duration import Duration
+
+from flexarm_control import excitation_run
+from flexarm_control.excitation_run import ExcitationRun, Stage
+from flexarm_control.samples import ArmSample
+from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_msgs.msg import ArmState, JointTorque
+from flexarm_ros import qos
+from flexarm_ros.messages import StateReader, TorqueWriter
+from flexarm_ros.node import ARM, ERROR, OK, ArmNode, run
+from flexarm_ros.start import leave
+
+PARAMETERS = (
+    Parameter(
+        "state_timeout",
+        "float",
+        0.5,
+        "Without a state for so long the excitation stops.",
+        unit="s",
+        low=0.01,
+        high=3600.0,
+        read_only=True,
+    ),
+    Parameter(
+        "readers",
+        "int",
+        1,
+        "No state is answered before so many read joint_torque: the driver, and a recorder.",
+        low=0,
+        high=100,
+        read_only=True,
+    ),
+)
+
+#: How long the last torque, DISABLED, is waited for to arrive.
+LAST_WORD = Duration(seconds=0.2)
+
+
+class ExciteNode(ArmNode):
+    """Messages to arrays, one call of `ExcitationRun`, arrays to messages."""
+
+    def __init__(self):
+        super().__init__("excite", {"": (ARM, *excitation_run.PARAMETERS, *PARAMETERS)})
+
+    def build(self):
+        parameters = self.parameters
+        self.arm = arm_file.load(parameters["arm"])
+        names = {p.name for p in excitation_run.PARAMETERS}
+        self.core = ExcitationRun(model.build(self.arm), parameters.group("", names))
+        self._reader, self._sample = StateReader(self.arm), ArmSample(len(self.arm.joints))
+        self._torque = TorqueWriter(self.arm, int.from_bytes(os.urandom(4), "little"))
+        self._ticks, self._seen, self._told = 0, False, False
+        self._heard = False
+        options = qos.overridable()
+        self._torque_pub = self.make_publisher(
+            JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
+        )
+        self.make_line(
+            self.make_subscription(
+                ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+            )
+        )
+        self.make_timer(parameters["state_timeout"] / 5.0, self._watch)
+
+    def _on_state(self, msg):
+        if not self.active:
+            return
+        self._ticks, self._seen = 0, True
+        if not self._heard:
+            readers = self._torque_pub.get_subscription_count()
+            if readers < self.parameters["readers"]:
+                return
+            self._heard = True
+        try:
+            self._reader.read(msg, self._sample)
+            enabled = self.core.step(self._sample)
+        except MessageError as error:
+            self.core.stop(str(error))
+            enabled = False
+        self._torque_pub.publish(self._torque.answer(self._sample, enabled, self.core.torque))
+        self._tell()
+
+    def _tell(self):
+        """Say once how it ended."""
+        if self._told or self.core.stage in (Stage.SETTLING, Stage.SHAKING):
+            return
+        self._told = True
+        if self.core.stage is Stage.DONE:
+            self.get_logger().info("excitation complete; torque disabled")
+        else:
+            self.get_logger().error(f"excitation stopped: {self.core.reason}")
+
+    def _watch(self):
+        """Steady clock: the states have stopped."""
+        self._ticks += 1
+        # Before it shakes there is no torque to take back.
+        if self._ticks < 6 or not self._seen or self.core.stage is not Stage.SHAKING:
+            return
+        self._seen = False
+        self._end(
+            f"no arm_state for {self.parameters['state_timeout']:g} s: is the driver running?"
+        )
+
+    def _end(self, reason):
+        self.core.stop(reason)
+        self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+        self._tell()
+
+    def start(self):
+        kind = self.parameters["kind"]
+        self.get_logger().info(
+            f"arm {self.arm.name}: {kind} of {self.core.duration:.3g} s after rest"
+        )
+
+    def stop(self):
+        self._end("the node was stopped")
+        # A node that ends takes with it what has not been read yet.
+        self._torque_pub.wait_for_all_acked(LAST_WORD)
+
+    def diagnose(self):
+        core = self.core
+        values = {"stage": core.stage.value, "kind": self.parameters["kind"]}
+        if core.stage is Stage.STOPPED:
+            return ERROR, core.reason, values
+        return OK, core.stage.value, values
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_control excite``."""
+    leave(run(ExciteNode, args))
+
+
+if __name__ == "__main__":
+    main()
