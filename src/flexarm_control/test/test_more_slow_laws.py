@@ -510,6 +510,25 @@ def test_the_estimate_finds_the_payload_and_the_error_falls(swing):
     assert third < 0.1 * first
 
 
+def test_lyapunovs_function_falls_as_the_combined_error_alone_makes_it(rigid, long_reach):
+    for arm in (rigid, rigid_arm(long_reach.arm)):
+        law = adaptive(arm, dead_zone=0.0, kp=[6.0], kv=[5.0])
+        law._limit[:] = np.inf
+        law.model.scale, p = 1.7, 2.6
+        plant, believed = arm.with_payload(p), arm.with_payload(1.7)
+        for seed in range(5):
+            q, qd, ref = some_state(arm.n_joints, seed)
+            ref.velocity = qd + np.random.default_rng(seed).uniform(-2, 2, arm.n_joints)
+            qdd = acceleration_of(plant, torque_at(law, q, qd, ref), q, qd)
+            rate = ref.velocity - qd
+            s, sd = rate + 2.0 * (ref.position - q), ref.acceleration - qdd + 2.0 * rate
+            h = 1e-6
+            Md = (plant.mass_matrix(q + h * qd) - plant.mass_matrix(q - h * qd)) / (2 * h)
+            Vd = s @ plant.mass_matrix(q) @ sd + 0.5 * s @ Md @ s
+            Vd += (1.7 - p) * law.learning / law.gamma
+            assert_allclose(Vd, -3.0 * s @ believed.mass_matrix(q) @ s, rtol=1e-6)
+
+
 def test_lyapunovs_function_never_grows(swing, rigid):
     law, profile, times, x = swing
     stiff, V = rigid_arm(rigid.arm).with_payload(2.0), []
