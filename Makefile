@@ -2,6 +2,7 @@
 PYTHON ?= python3
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
+COMPARE_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
 ifneq ($(origin PYTHON),file)
@@ -12,7 +13,7 @@ export FLEXARM_ROOT := $(CURDIR)
 TESTS := $(wildcard src/*/test tests)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test bench lint clean distclean
+.PHONY: help build demo test bench compare lint clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -20,6 +21,7 @@ help:
 	@echo 'make demo       build, then run the case study'
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
+	@echo 'make compare    build, then tune rivals on the same arms, and compare; COMPARE_ARGS=--quick'
 	@echo 'make lint       check style (ruff)'
 	@echo 'make clean      remove what was built, results and caches; .venv stays'
 	@echo 'make distclean  clean, and remove .venv'
@@ -40,6 +42,11 @@ test: build
 # Its peers are no business of the other targets.
 bench: build
 	@. tools/env.sh && python -m pip install -q --disable-pip-version-check -r requirements/bench.txt && python -m benchmarks $(BENCH_ARGS)
+
+# The tables of docs/comparison.md, of a whole run alone.
+COMPARE_OUT := --json docs/comparison.json --write docs/comparison.md
+compare: build
+	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check

@@ -72,6 +72,12 @@ def _analyze(options):
     analyze(options)
 
 
+def _compare(options):
+    from .comparison.command import compare
+
+    compare(options)
+
+
 def _identify(options):
     from .identification.command import identify
 
@@ -116,6 +122,7 @@ def parser():
 
     _add_arm_commands(commands)
     _add_analyze(commands)
+    _add_compare(commands)
 
     from .publish_trajectory import add_arguments
 
@@ -223,6 +230,19 @@ def _add_analyze(commands):
     )
     command.add_arguments(analyze)
     analyze.set_defaults(function=_analyze)
+
+
+def _add_compare(commands):
+    from .comparison import command
+
+    compare = commands.add_parser(
+        "compare",
+        help="composite control beside joint PID, input shaping, LQR and rigid adaptive control, all tuned alike",
+        description="Runs every controller on the same arms, motions, limits and sensors, and writes a table.",
+        epilog="example: flexarm compare --arms R --json results/compare.json",
+    )
+    command.add_arguments(compare)
+    compare.set_defaults(function=_compare)
 
 
 def _add_identification(commands):

@@ -1,0 +1,1 @@
+"""Composite control beside its rivals on the same arms, motions, limits, sensors and observers: ``flexarm compare``."""

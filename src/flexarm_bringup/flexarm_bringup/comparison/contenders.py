@@ -1,0 +1,268 @@
+"""Who is compared: the shipped composite control and its rivals, with the numbers of each that are tuned.
+
+Every contender has its own sensible first guess and wide ranges. A joint's PID gains are written by the inertia m_i
+that it turns in the motion's end: p = m w^2, d = 2 zeta m w, i = kappa m w^3, so that one bandwidth w (and for
+several joints the ratio of the last joint's to the first's) is tuned, not a gain each.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flexarm_control import shapers
+from flexarm_control.trajectory import specs
+from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.singular_perturbation import frequencies_and_damping
+
+from . import subjects
+from .rivals import FullStateLqr, JointPid
+from .tuning import Free
+
+#: Largest part of a joint's torque that the integral may hold.
+INTEGRAL_SHARE = 0.3
+#: Modes that a shaper is for, and the damping ratio above which one needs none.
+SHAPED, DAMPED = 2, 0.5
+#: Shortest profile that is shaped, in parts of the motion's duration.
+SHORTEST = 0.4
+
+#: Rigid control that the full-order check refuses is run all the same [1/s].
+ANYHOW = -1e3
+
+#: Where a law of its own answers: the composite control that is built around it does nothing.
+IDLE = {
+    "slow.type": "none",
+    "fast.type": "none",
+    "manifold.type": "quasi_steady",
+    "feedforward": "none",
+}
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One contender with its numbers, ready to be run.
+
+    Attributes
+    ----------
+    controller : dict
+        Flat parameters, as `Scenario.controller`.
+    law : callable or None
+        Of the arm's model: a law that answers instead of the composite control.
+    motion : callable or None
+        Of the arm's model: the trajectory that is sent instead of the motion.
+    """
+
+    controller: dict = field(default_factory=dict)
+    law: Callable | None = None
+    motion: Callable | None = None
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A name, what may be tuned, and what is made of it.
+
+    Attributes
+    ----------
+    name : str
+    free : callable
+        Of a `Subject`: tuple of `Free`.
+    setup : callable
+        Of a `Subject` and the values: `Setup`; raises a FlexarmError where there is no such design.
+    """
+
+    name: str
+    free: Callable
+    setup: Callable
+
+
+# The composite control ---------------------------------------------------------------------------
+
+
+def _shipped_setup(subject, values):
+    return Setup(subject.values())
+
+
+def _preview_setup(subject, values):
+    return Setup(subject.values() | {"feedforward": "preview"})
+
+
+def _composite_free(subject):
+    alpha = float(_alpha(subject.values()))
+    return (
+        Free("slow poles, times", 0.3, 3.0, 1.0, log=True),
+        Free("fast.q, times", 1e-2, 1e2, 1.0, log=True),
+        Free("fast.alpha [1/s]", 0.0, max(2.0 * alpha, 2.0), alpha),
+    )
+
+
+def _alpha(values):
+    return values.get("fast.alpha", 5.0)
+
+
+def _composite_setup(subject, values):
+    speed, weight, alpha = values
+    shipped = subject.values()
+    kp = np.array(shipped.get("slow.kp", [6.25]))
+    kv = np.array(shipped.get("slow.kv", [5.0]))
+    q = np.array(shipped.get("fast.q", [1.0]))
+    tuned = {
+        "slow.kp": (speed**2 * kp).tolist(),
+        "slow.kv": (speed * kv).tolist(),
+        "fast.q": (weight * q).tolist(),
+        "fast.alpha": alpha,
+    }
+    return Setup(shipped | tuned)
+
+
+# PID ---------------------------------------------------------------------------------------------
+
+
+def _pid_free(subject):
+    ratio = (Free("w_last/w_first", 0.2, 20.0, 1.0, log=True),)
+    return (
+        Free("w [rad/s]", 0.3, 60.0, 4.0, log=True),
+        Free("zeta", 0.1, 5.0, 1.0, log=True),
+        Free("kappa", 0.0, 0.3, 0.02),
+        Free("velocity/d", 0.0, 1.0, 0.0),
+        Free("acceleration/m", 0.0, 1.5, 1.0),
+        *(ratio if subjects.model_of(subject.arm).n_joints > 1 else ()),
+    )
+
+
+def pid_gains(subject, values):
+    """Gains of `JointPid` from the numbers that are tuned."""
+    w, zeta, kappa, velocity, acceleration, *ratio = values
+    arm = subjects.model_of(subject.arm)
+    n = arm.n_joints
+    inertia = np.diag(arm.terms(subjects.ends_of(subject)[1], np.zeros(n)).M)[:n]
+    w = w * (ratio[0] if ratio else 1.0) ** np.linspace(0.0, 1.0, n)
+    limit = np.array([joint.limits.torque for joint in arm.arm.joints])
+    d = 2.0 * zeta * w * inertia
+    return {
+        "p": w**2 * inertia,
+        "i": kappa * w**3 * inertia,
+        "d": d,
+        "i_clamp": INTEGRAL_SHARE * limit,
+        "velocity": velocity * d,
+        "acceleration": acceleration * inertia,
+    }
+
+
+def _observer(subject):
+    """The observer that the shipped controller has: everyone hears the same."""
+    return {k: v for k, v in subject.values().items() if k.startswith("observer.")}
+
+
+def _pid_setup(subject, values):
+    gains = pid_gains(subject, values)
+    return Setup(IDLE | _observer(subject), lambda model: JointPid(model, gains))
+
+
+# PID with a shaper -------------------------------------------------------------------------------
+
+
+def _shaped_free(subject):
+    return (Free("shaper's time taken from the motion, share", 0.0, 1.0, 0.0), *_pid_free(subject))
+
+
+def _shaped_setup(kind):
+    def setup(subject, values):
+        share, *rest = values
+        gains = pid_gains(subject, rest)
+        motion = shaped_motion(subject, gains, kind, share)
+        return Setup(
+            IDLE | _observer(subject), lambda model: JointPid(model, gains), lambda model: motion
+        )
+
+    return setup
+
+
+def shaper_for(subject, gains, kind):
+    """Shaper of the lowest modes that ring under the PID law, at the motion's end.
+
+    Raises
+    ------
+    DesignError
+        When none rings, or the law alone is unstable.
+    """
+    end = subjects.ends_of(subject)[1]
+    poles = JointPid(subjects.model_of(subject.arm), gains).poles(end)
+    omega, zeta = frequencies_and_damping(poles)
+    if poles.real.max() > 0.0:
+        raise DesignError(f"{subject.arm}: the joints' PID alone is unstable")
+    rings = zeta < DAMPED
+    if not rings.any():
+        raise DesignError(f"{subject.arm}: nothing rings under the joints' PID: no shaper")
+    return shapers.for_modes(kind, omega[rings][:SHAPED], np.maximum(zeta[rings][:SHAPED], 0.0))
+
+
+def shaped_motion(subject, gains, kind, share):
+    """The motion shaped; of its profile `share` times the shaper's length is taken, so that it ends as much earlier."""
+    shaper = shaper_for(subject, gains, kind)
+    whole = subject.duration
+    profile = subjects.profile_of(subject, max(whole - share * shaper.duration, SHORTEST * whole))
+    return specs.sampled(shaper.apply(profile), subjects.model_of(subject.arm))
+
+
+# Full-state LQR ----------------------------------------------------------------------------------
+
+
+def _lqr_free(subject):
+    return (
+        Free("joint error [rad]", 1e-4, 10.0, 0.1, log=True),
+        Free("joint rate [rad/s]", 1e-2, 1e3, 10.0, log=True),
+        Free("modal rate [m/s]", 1e-3, 1e2, 1.0, log=True),
+        Free("acceleration, share", 0.0, 1.5, 1.0),
+    )
+
+
+def _lqr_setup(subject, values):
+    *sizes, share = values
+    end = subjects.ends_of(subject)[1]
+    return Setup(
+        IDLE | _observer(subject),
+        lambda model: FullStateLqr(model, end, subject.rate, sizes, share),
+    )
+
+
+# Adaptive rigid control --------------------------------------------------------------------------
+
+
+def _adaptive_free(subject):
+    return (
+        Free("kp [1/s^2]", 0.1, 100.0, 6.25, log=True),
+        Free("kv/(2 sqrt kp)", 1.0, 3.0, 1.0),
+        Free("adaptation_gain [s^2]", 1e-2, 20.0, 2.0, log=True),
+    )
+
+
+def _adaptive_setup(subject, values):
+    kp, damping, gain = values
+    law = {
+        "slow.type": "adaptive_model_following",
+        "slow.kp": [kp],
+        # A trace above: a double pole that rounding makes complex is refused.
+        "slow.kv": [2.0 * damping * kp**0.5 * (1.0 + 1e-9)],
+        "slow.adaptation_gain": gain,
+        "stability_margin": ANYHOW,
+    }
+    return Setup(IDLE | law | _observer(subject))
+
+
+SHIPPED, PREVIEW, TUNED = (f"composite ({kind})" for kind in ("shipped", "preview", "tuned"))
+#: Those that are no rivals.
+OWN = (SHIPPED, PREVIEW, TUNED)
+PID = "joint PID"
+CONTENDERS = {
+    c.name: c
+    for c in (
+        Contender(SHIPPED, lambda subject: (), _shipped_setup),
+        Contender(PREVIEW, lambda subject: (), _preview_setup),
+        Contender(TUNED, _composite_free, _composite_setup),
+        Contender(PID, _pid_free, _pid_setup),
+        Contender("joint PID, ZV shaper", _shaped_free, _shaped_setup("zv")),
+        Contender("joint PID, ZVD shaper", _shaped_free, _shaped_setup("zvd")),
+        Contender("full-state LQR", _lqr_free, _lqr_setup),
+        Contender("adaptive rigid", _adaptive_free, _adaptive_setup),
+    )
+}
