@@ -154,6 +154,16 @@ def test_the_weight_of_an_arm_is_held_while_it_is_pushed():
     assert np.abs(push.hold).max() > 1.0
 
 
+def test_a_push_during_which_the_safe_action_came_is_replayed_with_it():
+    b = Bench("R")
+    b.sim.reset()
+    push, count = b.push, b.moved.size
+    b.moved = b.record(count, lambda t: None if 0.45 < t < 0.6 else push.torque(t))
+    b.sent = moving.sent_torque(b.moved, b.answered, b.torques)
+    assert np.ptp(b.moved.position) < 0.9 * push.angle
+    assert "moves 1 times as far as its model" in b.findings()["response"].text
+
+
 def test_velocity_need_not_be_published_nor_torque_known(bench):
     found = bench.findings(
         lambda s: replace(s, velocity=None, torque=np.full_like(s.torque, np.nan))
@@ -275,7 +285,7 @@ def changed(field, function):
         (changed("velocity", np.degrees), "velocity", "velocity is in degrees per second"),
         (changed("velocity", np.negative), "velocity", "one of the two has the wrong sign"),
         (changed("strain", lambda e: 1e6 * e), "strain response", "check its scale"),
-        (changed("strain", np.negative), "strain response", "gauge root reads -1 times"),
+        (changed("strain", np.negative), "strain response", "what its model does: wrong sign"),
         (
             changed("strain", lambda e: e[:, ::-1]),
             "gauge order",
