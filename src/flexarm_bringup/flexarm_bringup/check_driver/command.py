@@ -207,7 +207,7 @@ class Examination:
             When somebody else sends torque.
         """
         if np.ptp(self.samples.position, axis=0).max() > 0.1 * angle:
-            text = "the arm is in motion before it is pushed: bring it to rest, try again"
+            text = "the arm moves before it is pushed: bring it to rest where its brakes hold it, try again"
             self.findings.append(Finding("response", Verdict.FAIL, text))
             return
         # Now, and not at the start: others have to be discovered first.
