@@ -269,11 +269,11 @@ class ArmObserver:
 
     def _check(self, sample):
         arm = self.model.arm
-        check_finite(sample.position, arm.joint_names, "joint_position")
+        check_finite(sample.position, self.model.joint_names, "joint_position")
         if sample.velocity_known:
-            check_finite(sample.velocity, arm.joint_names, "joint_velocity")
+            check_finite(sample.velocity, self.model.joint_names, "joint_velocity")
         if sample.amplitude is not None:
-            check_finite(sample.amplitude, arm.mode_names, "modal_amplitude")
+            check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
         elif sample.strain is None:
             raise MessageError("neither strain nor modal_amplitude is given: one of them is needed")
         else:
@@ -282,7 +282,7 @@ class ArmObserver:
                     f"strain is given, but the arm file of {arm.name} has no gauges to map it"
                 )
         if sample.rate is not None:
-            check_finite(sample.rate, arm.mode_names, "modal_rate")
+            check_finite(sample.rate, self.model.mode_names, "modal_rate")
 
     def _joint_velocity(self, sample, dt):
         """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""

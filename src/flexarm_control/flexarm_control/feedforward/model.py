@@ -181,6 +181,7 @@ class ModelFeedforward(Feedforward):
         #: The gain that serves everywhere; None where it depends on the joints.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
         self._prepared, self._first = None, True
+        self._held = None  # position, and what `wanted` made of it, while the reference rests
 
     def _same_everywhere(self):
         """Whether the plant at rest does not change with the joints."""
@@ -231,8 +232,15 @@ class ModelFeedforward(Feedforward):
 
     def wanted(self, reference, prepared, elapsed):
         """State (2 (n + m),) and torque (n,) that the regulator holds the simulated arm to."""
+        if reference.velocity.any() or reference.acceleration.any():
+            self._held = None
+        elif self._held is not None and np.array_equal(self._held[0], reference.position):
+            return self._held[1:]
         delta, rate, torque = self.manifold.along(reference)
-        return np.concatenate([reference.position, delta, reference.velocity, rate]), torque
+        state = np.concatenate([reference.position, delta, reference.velocity, rate])
+        if not (reference.velocity.any() or reference.acceleration.any()):
+            self._held = reference.position.copy(), state, torque
+        return state, torque
 
     def update(self, reference, dt):
         if not self._first and dt > 0.0:  # the torque of the last sample has acted since

@@ -1,7 +1,7 @@
 """Derivatives of the slow motion's deflections by central differences: what every manifold's orders are made of."""
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg.lapack import dgetrf, dgetrs
 
 
 def step(order):
@@ -37,11 +37,12 @@ class Point:
     def __init__(self, terms, acceleration):
         n = terms.n
         self.terms, self.acceleration = terms, acceleration
-        self._factor = lu_factor(terms.K2, check_finite=False) if terms.f2.size else None
+        # LAPACK itself: what scipy.linalg checks around it costs ten times as much as a few modes do.
+        self._factor = dgetrf(terms.K2)[:2] if terms.f2.size else None
         self.delta = -self._solve(terms.M[n:, :n] @ acceleration + terms.f2)
 
     def _solve(self, force):
-        return force if self._factor is None else lu_solve(self._factor, force, check_finite=False)
+        return force if self._factor is None else dgetrs(*self._factor, force)[0]
 
     def corrected(self, rate, second):
         """Deflection that also carries the modes' own inertia and damping, shape (m,)."""

@@ -1,0 +1,37 @@
+"""The default control of the three nodes on the paper's arm, in lockstep at 1 kHz, by its figures."""
+
+import pytest
+
+from flexarm_bringup import closed_loop, lockstep, metrics, recorder
+from flexarm_bringup.processes import Processes, own_domain
+from flexarm_control import profiles
+from flexarm_dynamics import arm_file
+from flexarm_dynamics.model import build
+from flexarm_dynamics.units import POUND_FORCE_FOOT
+
+
+@pytest.mark.parametrize(
+    ("feedforward", "error", "residual"), [("model", 0.2, 1e-5), ("preview", 0.03, 2e-6)]
+)
+def test_nodes_track_like_a_rigid_arm_and_do_not_ring(tmp_path, feedforward, error, residual):
+    start = closed_loop.TRAJECTORY_START_NS
+    with own_domain() as domain, Processes(domain, tmp_path) as processes:
+        common = {"arm": "R", "state_timeout": 60.0}
+        limit = {"torque_limit": [3.2 * POUND_FORCE_FOOT], "feedforward": feedforward}
+        for name, parameters in (
+            ("simulator", {"lockstep": True, "publish_rates": True}),
+            ("observer", {"observer.type": "true_rates"}),
+            ("controller", limit),
+        ):
+            keep = recorder.keep_for_recording(name)
+            processes.start_node(name, {**common, **parameters, **keep})
+        with lockstep.LockstepRun(processes) as line:
+            message = lockstep.trajectory_message(("joint1",), profiles.paper_profile(), 101, start)
+            samples, _ = line.run(message, 8.0, lambda fraction: None)
+        codes = processes.stop()
+    assert not any(codes.values())
+    record = recorder.to_record(recorder.decode(samples), start)
+    found = metrics.case_study_metrics(record, build(arm_file.load("R")), until=8.0)
+    assert found["peak_joint_error_deg"] <= error
+    assert found["residual_tip_rms_ft"] <= residual
+    assert found["peak_torque_lbf_ft"]["total"] <= 3.2
