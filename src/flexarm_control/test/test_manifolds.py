@@ -99,7 +99,7 @@ def test_at_rest_every_manifold_is_the_static_deflection(arm):
 def test_along_the_reference_is_the_manifold_without_a_tracking_error(arm):
     reference = Sine(arm.n_joints).at(0.9)
     surface = manifold(arm, "corrected", order=2)
-    terms, torque = updated(surface, reference.position, reference.velocity, reference)
+    _, torque = updated(surface, reference.position, reference.velocity, reference)
     delta, rate, whole = surface.along(reference)
     assert_allclose(delta, surface.amplitude, atol=1e-8 * np.abs(delta).max())
     assert_allclose(rate, surface.rate, atol=1e-5 * np.abs(rate).max())
@@ -116,7 +116,7 @@ def slow_eigenspace(order, stiffness):
     L, U = surface.error_response(np.zeros(1))
     n, m = 1, model.n_modes
     terms = model.terms(np.zeros(1), np.zeros(1))
-    a, B = slow_subsystem(terms)
+    _, B = slow_subsystem(terms)
     H, K, C = terms.H, terms.K2, terms.C2
     size = n + m
     # The arm under the slow law and the manifold's feed-forward: u = -B^-1 (kp q + kv qd) + U x.

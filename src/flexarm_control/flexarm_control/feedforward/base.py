@@ -22,7 +22,7 @@ class Settings:
     configuration: np.ndarray
 
 
-class Feedforward(ABC):  # most kinds leave most of it as it is
+class Feedforward(ABC):
     """A motion of the whole arm, bending included, near the reference, and the torque that makes it.
 
     Registered by name in the entry-point group ``flexarm.feedforwards``. The composite control holds the arm
@@ -64,13 +64,13 @@ class Feedforward(ABC):  # most kinds leave most of it as it is
         out[2] = self.acceleration
         return out
 
-    def reset(self):  # noqa: B027
+    def reset(self):
         """A new session begins: the next sample is the first."""
 
-    def resume(self, other):  # noqa: B027
+    def resume(self, other):
         """Go on from another feed-forward's motion: a redesign does not begin anew."""
 
-    def take(self, plan, trajectory_id):  # noqa: B027
+    def take(self, plan, trajectory_id):
         """Follow what `prepare` made, or nothing, None, as soon as the reference follows its trajectory."""
 
     def prepare(self, trajectory, start):
