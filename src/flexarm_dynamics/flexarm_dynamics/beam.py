@@ -188,7 +188,10 @@ def from_frequencies(frequencies, length, mass_per_length, stiffness):
 
 
 def _loaded_matrix(beta, mass, inertia, moment):
-    """Tip conditions on (c, d); rows scaled by beta^2 and beta^3. All loads dimensionless."""
+    """Tip conditions on (c, d), shape (2, 2); rows scaled by beta^2 and beta^3. All loads dimensionless.
+
+    For wave numbers (k, 1) shape (2, k, 2).
+    """
     unit = np.array([1.0, 1.0])
     edge = np.exp(-beta)
     # Columns: the shape for (c, d) = (1, 0) and (0, 1).
@@ -256,8 +259,8 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     def determinant(beta):
         m = _loaded_matrix(beta, mass, inertia, moment)
         # Unit rows: roots stay where they are, and no load, however heavy, drowns the sign.
-        m = m / np.linalg.norm(m, axis=1, keepdims=True)
-        return m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]
+        m = m / np.linalg.norm(m, axis=-1, keepdims=True)
+        return m[0, ..., 0] * m[1, ..., 1] - m[0, ..., 1] * m[1, ..., 0]
 
     roots = []
     # Heavy loads bring two roots near zero, at least a factor of 1.9 apart.
@@ -265,7 +268,7 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     grid = np.append(
         np.geomspace(1e-3, step, 16, endpoint=False), np.arange(step, (modes + 1.5) * np.pi, step)
     )
-    values = [determinant(b) for b in grid]
+    values = determinant(grid[:, None])
     for k in range(grid.size - 1):
         if values[k] * values[k + 1] < 0.0 and len(roots) < modes:
             roots.append(brentq(determinant, grid[k], grid[k + 1], xtol=1e-15, rtol=8.9e-16))

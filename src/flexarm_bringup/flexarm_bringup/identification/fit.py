@@ -16,8 +16,8 @@ The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
 .. math:: P = A^{-1} S A^{-1}, \quad A = J^T J, \quad
           S = \sum_{|l|\le L}\left(1 - \tfrac{|l|}{L + 1}\right)\sum_k s_k s_{k+l}^T
 
-(Newey and West 1987), which for white residuals is the usual :math:`\sigma^2 (J^TJ)^{-1}`; of both the larger
-variance is taken. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
+(Newey and West 1987; L by Andrews 1991 from the most coloured channel), which for white residuals is the usual
+:math:`\sigma^2 (J^TJ)^{-1}`; of both the larger variance is taken. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
 
 What the motion does not determine keeps the file's value: a parameter whose interval is wider than a share of its
 value, the worst one first, and the rest fitted again.
@@ -38,7 +38,7 @@ NORMAL = 1.959964
 #: Difference step of the Jacobian, of a quantity's scale [-].
 STEP = 1e-7
 #: Parts of the motion that are fitted one after the other: periods of the slowest mode, and how they grow.
-FIRST_PERIODS, GROWTH = 1.0, 1.7
+FIRST_PERIODS, GROWTH = 1.0, 2.0
 #: In the parts, a quantity is held to the file's value with this deviation, of its scale [-].
 PRIOR = 0.5
 #: Quantities stay within these multiples of their scale [-].
@@ -47,8 +47,10 @@ MOST = 30.0
 LEAST = 1e-9
 #: A residual that is prior to any fit is worth so much where no noise is stated, of the signal [-].
 ASSUMED = 1e-3
-#: Newey and West's bandwidth [samples].
-LAG_POWER, LAG_FACTOR = 1.0 / 3.0, 2.0
+#: Least bandwidth of the covariance is this times the third root of the samples [-].
+LAG_FACTOR = 1.0
+#: Correlation of a residual with the one before that counts at most [-].
+MOST_COLOUR = 0.97
 #: The model does not explain the motion when a channel's residual is so much of the signal's deviation [-].
 POOR = 0.05
 #: Stiffnesses that are tried where the first fit is poor, times the file's [-].
@@ -237,7 +239,8 @@ class Problem:
         """Fit longer and longer parts, then the whole; other stiffnesses where that ends badly."""
         self._fit_from(1.0)
         best = self._kept()
-        for factor in TRIED if self.poor() and self.predictor.m else ():
+        stiff = any(q.kind == "EI" for q, free in zip(self.found, self.free, strict=True) if free)
+        for factor in TRIED if self.poor() and stiff else ():
             self._fit_from(factor)
             if (now := self._kept())[3] < best[3]:
                 best = now
@@ -262,13 +265,13 @@ class Problem:
         self.values = np.where(stiff, factor * self.file, self.file)
         self.initial, self.noise = self.predictor.guess(self.arm), self._prior_noise()
         for samples in self.parts():
-            self._solve(samples, prior=True, tolerance=1e-4, most=12)
+            self._solve(samples, prior=True, tolerance=1e-2, most=8)
         self.refine()
 
     def refine(self):
         """Fit the whole, with the noise that the residuals show."""
         whole = len(self.measured)
-        for tolerance in (1e-6, 1e-10):
+        for tolerance in (1e-4, 1e-7):
             self._solve(whole, prior=False, tolerance=tolerance, most=40)
             self._measure_noise()
 
@@ -344,7 +347,7 @@ class Problem:
         bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)
         white = bread
         scores = np.einsum("kcx,kc->kx", J, r)
-        lags = int(LAG_FACTOR * whole**LAG_POWER)
+        lags = min(bandwidth(r), whole // 4)
         meat = scores.T @ scores
         for lag in range(1, lags + 1):
             gamma = scores[lag:].T @ scores[:-lag]
@@ -436,3 +439,15 @@ class Problem:
             np.where(self.weight > 0.0, self.measured, np.nan), self.noise, self.held,
             tuple(self.left_out), tuple(self.warnings),
         )  # fmt: skip
+
+
+def bandwidth(r):
+    r"""Lags L of the covariance for residuals (s, c): :math:`1.1447\,(\alpha s)^{1/3}` with
+    :math:`\alpha = 4\rho^2/(1 - \rho^2)^2` of the channel with the largest correlation :math:`\rho` from one
+    sample to the next.
+    """
+    power = np.maximum(np.sum(r**2, axis=0), 1e-300)
+    rho = np.clip(np.max(np.abs(np.sum(r[1:] * r[:-1], axis=0)) / power), 0.0, MOST_COLOUR)
+    alpha = 4.0 * rho**2 / (1.0 - rho**2) ** 2
+    third = len(r) ** (1.0 / 3.0)
+    return int(np.ceil(max(1.1447 * alpha ** (1.0 / 3.0), LAG_FACTOR) * third))

@@ -1,0 +1,83 @@
+"""``flexarm excite`` on the simulator in lockstep, and ``flexarm identify`` on the bag that it wrote."""
+
+import json
+
+import pytest
+
+from flexarm_bringup import cli
+from flexarm_bringup.processes import executable
+from flexarm_dynamics import arm_file
+from flexarm_msgs.msg import JointTorque
+
+RATE = 100.0
+#: What the file that is given says wrongly.
+TRUTH, GIVEN = "EI_y: 11.81904468463035", "EI_y: 14.0"
+
+
+def excite(bench, arm, bag, *words):
+    """Run ``flexarm excite``; exit code and what it said."""
+    command = [
+        executable("flexarm_bringup", "flexarm"),
+        "excite",
+        str(arm),
+        "--out",
+        str(bag),
+        *words,
+    ]
+    process = bench.processes.start("excite", command)
+    bench.wait_for("the excitation to end", lambda: process.poll() is not None, 2 * bench.PATIENCE)
+    bench.processes.running.pop("excite")
+    return process.returncode, bench.log("excite")
+
+
+@pytest.fixture
+def arms(tmp_path):
+    """An arm with friction, an encoder and noise, and a file of it with the wrong stiffness and friction."""
+    text = arm_file.find("one_link").read_text().replace("model: chain ", "model: one_link ")
+    text = text.replace("full_scale: 5.0e-3", "full_scale: 5.0e-3, noise: 5.0e-7")
+    text = text.replace("encoder_counts: 0 ", "encoder_counts: 65536 ")
+    truth, given = tmp_path / "truth.yaml", tmp_path / "given.yaml"
+    truth.write_text(text.replace("viscous: 0.0", "viscous: 0.2"))
+    assert TRUTH in text and "viscous: 0.0" in text
+    given.write_text(text.replace(TRUTH, GIVEN).replace("viscous: 0.0", "viscous: 0.1"))
+    return truth, given
+
+
+def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys):
+    truth, given = arms
+    own = {"arm": str(truth), "rate": RATE, "lockstep": True, "pause_at": -1.0, "noise": True}
+    bench.start("simulator", own)
+    torques = bench.tap(JointTorque, "joint_torque")
+    bag = tmp_path / "bag"
+    words = ["--amplitude", "6", "--duration", "3", "--rest", "1", "--kind", "sweep"]
+    code, said = excite(bench, given, bag, *words, "--allow-motion")
+    assert code == 0, said
+    # Three seconds and one, while the torque was on; after that it was off.
+    assert "400 states in" in said
+    assert torques.messages[-1].mode == JointTorque.DISABLED
+    options = cli.parser().parse_args(["identify", str(bag), str(given), "--json"])
+    options.function(options)
+    result = json.loads(capsys.readouterr().out)
+    assert result["samples"] > 390 and not result["warnings"]
+    found = {r["name"]: r for r in result["parameters"]}
+    truth = {
+        "joints[0].hub_inertia": 1.3558179483314003,
+        "joints[0].friction.viscous": 0.2,
+        "links[0].EI_y": 11.81904468463035,
+        "links[0].flexible.y.damping[0]": 0.005,
+        "payload.mass": 0.04524109910533972,
+        "gauges[0].gain": 1.0,
+        "gauges[1].gain": 1.0,
+    }
+    for name, value in truth.items():
+        row = found[name]
+        # One noise is one draw: half as much again as the interval.
+        assert abs(row["value"] - value) < 1.5 * row["half_width"], name
+        assert row["half_width"] < 0.1 * value, name
+    # The arm still rings: a low strain limit ends it before it has begun.
+    code, said = excite(
+        bench, given, tmp_path / "other", *words, "--allow-motion", "--strain-limit", "1e-5"
+    )
+    assert code == 1 and "beyond its limit 1e-05; take a smaller amplitude" in said
+    assert not (tmp_path / "other").exists()
+    assert torques.messages[-1].mode == JointTorque.DISABLED
