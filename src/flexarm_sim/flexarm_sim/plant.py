@@ -12,6 +12,8 @@ from . import integrators
 DAMP_RATE = 10.0
 #: A brake's smoothing speed is raised until the explicit integrator stays stable: rate * substep.
 BRAKE_RATE_PER_STEP = 1.0
+#: The safe action is integrated in more substeps where it damps faster than this: rate * substep.
+DAMP_RATE_PER_STEP = 2.0
 
 
 class Plant:
@@ -42,6 +44,7 @@ class Plant:
         self._friction = model.friction_table()
         self._safe = self._friction + self._safe_friction()
         self._safe[:, 2] = self._brake_smoothing()
+        self._safe_substeps = self.substeps * self._refinement(integrator)
         self._no_torque = np.zeros(n)
 
     def reset(self, position=None, delta=None):
@@ -56,14 +59,14 @@ class Plant:
 
     def advance(self, torque, share=1.0):
         """One period, or a share of it, under constant torque, shape (n,) [N m]."""
-        self._run(torque, self._friction, share)
+        self._run(torque, self._friction, share, self.substeps)
 
     def advance_safely(self, share=1.0):
         """One period, or a share of it, without drive torque, under each joint's safe action."""
-        self._run(self._no_torque, self._safe, share)
+        self._run(self._no_torque, self._safe, share, self._safe_substeps)
 
-    def _run(self, torque, friction, share):
-        count = max(1, math.ceil(share * self.substeps))  # no longer ones than of a whole period
+    def _run(self, torque, friction, share, substeps):
+        count = max(1, math.ceil(share * substeps))  # no longer ones than of a whole period
         self._advance(self.state, torque, share * self.period / count, count, friction)
         if not np.isfinite(self.state).all():
             raise ModelError(
@@ -83,6 +86,19 @@ class Plant:
                 table[i, 0] = DAMP_RATE * inertia[i]
                 table[i, 1] = self._brake_torque(joint, inertia[i])
         return table
+
+    def _refinement(self, integrator):
+        """By how many substeps each of an explicit method is divided, to bear the safe action's damping.
+
+        A joint before a flexible link turns with little inertia while the link bends: it may be damped faster
+        than the highest mode, for which substeps are chosen, swings.
+        """
+        if integrators.METHODS[integrator] is None:
+            return 1
+        n = self.model.n_joints
+        damped = self._terms().H[:n, :n] @ np.diag(self._safe[:, 0])
+        fastest = np.abs(np.linalg.eigvals(damped)).max()
+        return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
 
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:
