@@ -66,7 +66,7 @@ def test_pid_clamps_and_forgets_its_integral(two):
 
 def test_pid_carries_the_weight_of_the_straight_arm():
     arm = subjects.model_of("long_reach")
-    law = JointPid(arm, contenders.pid_gains(LONG, [1.0, 1.0, 0.0, 0.0, 0.0, 1.0]))
+    law = JointPid(arm, contenders.pid_gains(LONG, [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]))
     q = subjects.ends_of(LONG)[0]
     zero = np.zeros(arm.n_modes)
     u = law.step(q, 0.0 * q, zero, zero, at_rest(q))
@@ -76,11 +76,11 @@ def test_pid_carries_the_weight_of_the_straight_arm():
 
 
 def test_pid_gains_are_those_of_the_inertia_that_a_joint_turns(two):
-    gains = contenders.pid_gains(TWO, [4.0, 0.5, 0.1, 0.5, 1.0, 2.0])
+    gains = contenders.pid_gains(TWO, [4.0, 0.5, 0.1, 0.5, 1.0, 2.0, 3.0])
     M = two.terms(subjects.ends_of(TWO)[1], np.zeros(2)).M
     w = np.array([4.0, 8.0])
     assert_allclose(gains["p"], np.diag(M)[:2] * w**2)
-    assert_allclose(gains["d"], np.diag(M)[:2] * w)
+    assert_allclose(gains["d"], np.diag(M)[:2] * w * [1.0, 3.0])
     assert_allclose(gains["velocity"], 0.5 * gains["d"])
 
 
@@ -113,13 +113,16 @@ def test_no_shaper_where_nothing_rings(monkeypatch):
 
 
 @pytest.mark.parametrize("subject", [R, TWO], ids=lambda s: s.arm)
-def test_lqr_stabilises_the_sampled_arm(subject):
+@pytest.mark.parametrize("decay", [0.0, 1.5])
+def test_lqr_stabilises_the_sampled_arm(subject, decay):
     arm, end = subjects.model_of(subject.arm), subjects.ends_of(subject)[1]
-    K = lqr_gain(arm, end, subject.rate, [0.1, 10.0, 1.0])
+    K = lqr_gain(arm, end, subject.rate, [0.1, 10.0, 1.0], decay)
     Phi, Gamma = sampled(*linear_plant(arm, end, coulomb=False), 1.0 / subject.rate)
     open_loop = np.abs(np.linalg.eigvals(Phi)).max()
     assert open_loop > 1.0 - 1e-9  # the joints drift
-    assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < 1.0 - 1e-5
+    assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < np.exp(
+        -decay / subject.rate
+    ) - 1e-5 * (decay == 0.0)
 
 
 def test_lqr_asks_for_no_more_than_the_rigid_torque_on_the_bent_arm(two):
@@ -159,6 +162,19 @@ def test_tuning_improves_within_its_budget_and_repeats():
 
 def test_a_converged_search_goes_on_from_the_next_best():
     assert len(tune(bowl, BOWL, 400, seed=0)[2]) == 400
+
+
+def test_what_can_be_judged_without_simulation_is_judged_first():
+    plain, screened = (tune(bowl, BOWL, 9, seed=1, screen=s)[2] for s in (None, bowl))
+    assert len(screened) == 9
+    assert max(screened[1:3]) < 0.3 < min(plain[1:3])
+
+
+def test_the_screen_of_pid_is_the_sampled_loop():
+    """A damping that the sampled elbow does not stand is told from one that it does."""
+    screen = contenders.CONTENDERS[contenders.PID].screen
+    soft, hard = (screen(TWO, [1.5, z, 0.0, 0.0, 1.0, 1.0, 1.0]) for z in (0.01, 5.0))
+    assert soft < 0.0 < hard
 
 
 def test_a_budget_of_one_is_the_first_guess():
@@ -316,6 +332,9 @@ def test_tables_of_stored_rows(tmp_path, capsys):
 def test_a_rival_that_is_better_in_both_is_named():
     verdicts = report.verdicts(stored(residual=2.0)["subjects"][0])
     assert verdicts[-1].endswith("alike to full-state LQR.")
+    half = stored(residual=2.0)["subjects"][0]
+    half["contenders"]["full-state LQR"]["row"]["rms_tip_mm"] = 9.0
+    assert report.verdicts(half)[-1].startswith("No rival beats")
     late = report.verdicts(stored(settling=None)["subjects"][0])
     assert late[0] == "The shipped controller does not settle within 2 s."
 

@@ -8,6 +8,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
@@ -171,9 +172,12 @@ def contend(subject, name, seed):
         except FlexarmError as error:
             return {"refused": str(error), "cost": 1e4}
 
+    screen = contender.screen and partial(contender.screen, subject)
     values, history = [], []
     if free:
-        values, _, history = tune(lambda values: result(values)["cost"], free, subject.budget, seed)
+        values, _, history = tune(
+            lambda values: result(values)["cost"], free, subject.budget, seed, screen
+        )
     row = result(values)
     return {
         "row": row,

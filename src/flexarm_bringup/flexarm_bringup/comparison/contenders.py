@@ -1,22 +1,25 @@
 """Who is compared: the shipped composite control and its rivals, with the numbers of each that are tuned.
 
-Every contender has its own sensible first guess and wide ranges. A joint's PID gains are written by the inertia m_i
-that it turns in the motion's end: p = m w^2, d = 2 zeta m w, i = kappa m w^3, so that one bandwidth w (and for
-several joints the ratio of the last joint's to the first's) is tuned, not a gain each.
+Every rival's first guess has the bandwidth of the shipped controller's slow poles, on ranges that are wide. A joint's
+PID gains are written by the inertia m_i that it turns in the motion's end: p = m w^2, d = 2 zeta m w, i = kappa m w^3,
+so that one bandwidth w (and for several joints the ratio of the last joint's to the first's, and of their damping) is
+tuned, not a gain each.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
 from flexarm_control import shapers
+from flexarm_control.full_order import linear_plant, sampled
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 
 from . import subjects
-from .rivals import FullStateLqr, JointPid
+from .rivals import FullStateLqr, JointPid, lqr_gain, slowest
 from .tuning import Free
 
 #: Largest part of a joint's torque that the integral may hold.
@@ -68,11 +71,14 @@ class Contender:
         Of a `Subject`: tuple of `Free`.
     setup : callable
         Of a `Subject` and the values: `Setup`; raises a FlexarmError where there is no such design.
+    screen : callable or None
+        Of a `Subject` and the values: what `tuning.tune` looks at before it simulates.
     """
 
     name: str
     free: Callable
     setup: Callable
+    screen: Callable | None = None
 
 
 # The composite control ---------------------------------------------------------------------------
@@ -114,13 +120,32 @@ def _composite_setup(subject, values):
     return Setup(shipped | tuned)
 
 
+def bandwidth(subject):
+    """Of the shipped controller's slow poles: what the rivals begin with [rad/s]."""
+    return float(max(subject.values().get("slow.kp", [6.25]))) ** 0.5
+
+
+def _limits(arm):
+    return np.array([joint.limits.torque for joint in arm.arm.joints])
+
+
+def _inertia(subject):
+    """What each joint turns in the motion's end, the arm rigid, (n,) [kg m^2]."""
+    arm = subjects.model_of(subject.arm)
+    n = arm.n_joints
+    return np.diag(arm.terms(subjects.ends_of(subject)[1], np.zeros(n)).M)[:n]
+
+
 # PID ---------------------------------------------------------------------------------------------
 
 
 def _pid_free(subject):
-    ratio = (Free("w_last/w_first", 0.2, 20.0, 1.0, log=True),)
+    ratio = (
+        Free("w_last/w_first", 0.2, 20.0, 1.0, log=True),
+        Free("zeta_last/zeta_first", 1e-2, 10.0, 1.0, log=True),
+    )
     return (
-        Free("w [rad/s]", 0.3, 60.0, 4.0, log=True),
+        Free("w [rad/s]", 0.3, 60.0, bandwidth(subject), log=True),
         Free("zeta", 0.1, 5.0, 1.0, log=True),
         Free("kappa", 0.0, 0.3, 0.02),
         Free("velocity/d", 0.0, 1.0, 0.0),
@@ -133,10 +158,10 @@ def pid_gains(subject, values):
     """Gains of `JointPid` from the numbers that are tuned."""
     w, zeta, kappa, velocity, acceleration, *ratio = values
     arm = subjects.model_of(subject.arm)
-    n = arm.n_joints
-    inertia = np.diag(arm.terms(subjects.ends_of(subject)[1], np.zeros(n)).M)[:n]
-    w = w * (ratio[0] if ratio else 1.0) ** np.linspace(0.0, 1.0, n)
-    limit = np.array([joint.limits.torque for joint in arm.arm.joints])
+    inertia, limit = _inertia(subject), _limits(arm)
+    share = np.linspace(0.0, 1.0, arm.n_joints)
+    faster, stiffer = ratio or (1.0, 1.0)
+    w, zeta = w * faster**share, zeta * stiffer**share
     d = 2.0 * zeta * w * inertia
     return {
         "p": w**2 * inertia,
@@ -151,6 +176,20 @@ def pid_gains(subject, values):
 def _observer(subject):
     """The observer that the shipped controller has: everyone hears the same."""
     return {k: v for k, v in subject.values().items() if k.startswith("observer.")}
+
+
+@lru_cache
+def _plants(subject):
+    """The sampled arm, linear at rest, in the motion's beginning and end."""
+    arm = subjects.model_of(subject.arm)
+    ends = subjects.ends_of(subject)
+    return [sampled(*linear_plant(arm, q, coulomb=False), 1.0 / subject.rate) for q in ends]
+
+
+def _pid_screen(subject, values):
+    """Slowest pole: joints and bending come to rest within its time [1/s]."""
+    law = JointPid(subjects.model_of(subject.arm), pid_gains(subject, values))
+    return slowest(_plants(subject), law.K, 1.0 / subject.rate)
 
 
 def _pid_setup(subject, values):
@@ -175,6 +214,10 @@ def _shaped_setup(kind):
         )
 
     return setup
+
+
+def _shaped_screen(subject, values):
+    return _pid_screen(subject, values[1:])
 
 
 def shaper_for(subject, gains, kind):
@@ -208,21 +251,34 @@ def shaped_motion(subject, gains, kind, share):
 
 
 def _lqr_free(subject):
+    # As large as the error of which a PD law of the same bandwidth makes the largest torque.
+    w, limit = bandwidth(subject), _limits(subjects.model_of(subject.arm))
+    error = float(np.clip((limit / _inertia(subject)).min() / w**2, 1e-2, 100.0))
     return (
-        Free("joint error [rad]", 1e-4, 10.0, 0.1, log=True),
-        Free("joint rate [rad/s]", 1e-2, 1e3, 10.0, log=True),
+        Free("joint error [rad]", 1e-3, 1e3, error, log=True),
+        Free("joint rate [rad/s]", 1e-2, 1e3, 0.5 * error * w, log=True),
         Free("modal rate [m/s]", 1e-3, 1e2, 1.0, log=True),
+        Free("alpha [1/s]", 0.0, 8.0, 0.5 * w),
         Free("acceleration, share", 0.0, 1.5, 1.0),
     )
 
 
 def _lqr_setup(subject, values):
-    *sizes, share = values
+    *sizes, decay, share = values
     end = subjects.ends_of(subject)[1]
     return Setup(
         IDLE | _observer(subject),
-        lambda model: FullStateLqr(model, end, subject.rate, sizes, share),
+        lambda model: FullStateLqr(model, end, subject.rate, sizes, decay, share),
     )
+
+
+def _lqr_screen(subject, values):
+    end = subjects.ends_of(subject)[1]
+    try:
+        K = lqr_gain(subjects.model_of(subject.arm), end, subject.rate, values[:3], values[3])
+    except DesignError:
+        return float("inf")
+    return slowest(_plants(subject), K, 1.0 / subject.rate)
 
 
 # Adaptive rigid control --------------------------------------------------------------------------
@@ -230,7 +286,7 @@ def _lqr_setup(subject, values):
 
 def _adaptive_free(subject):
     return (
-        Free("kp [1/s^2]", 0.1, 100.0, 6.25, log=True),
+        Free("kp [1/s^2]", 0.1, 100.0, bandwidth(subject) ** 2, log=True),
         Free("kv/(2 sqrt kp)", 1.0, 3.0, 1.0),
         Free("adaptation_gain [s^2]", 1e-2, 20.0, 2.0, log=True),
     )
@@ -259,10 +315,10 @@ CONTENDERS = {
         Contender(SHIPPED, lambda subject: (), _shipped_setup),
         Contender(PREVIEW, lambda subject: (), _preview_setup),
         Contender(TUNED, _composite_free, _composite_setup),
-        Contender(PID, _pid_free, _pid_setup),
-        Contender("joint PID, ZV shaper", _shaped_free, _shaped_setup("zv")),
-        Contender("joint PID, ZVD shaper", _shaped_free, _shaped_setup("zvd")),
-        Contender("full-state LQR", _lqr_free, _lqr_setup),
+        Contender(PID, _pid_free, _pid_setup, _pid_screen),
+        Contender("joint PID, ZV shaper", _shaped_free, _shaped_setup("zv"), _shaped_screen),
+        Contender("joint PID, ZVD shaper", _shaped_free, _shaped_setup("zvd"), _shaped_screen),
+        Contender("full-state LQR", _lqr_free, _lqr_setup, _lqr_screen),
         Contender("adaptive rigid", _adaptive_free, _adaptive_setup),
     )
 }

@@ -11,7 +11,7 @@ arm under gravity could start without.
 `FullStateLqr`, optimal on the whole arm with its bending, linear at rest in one configuration, in discrete time:
 
 .. math:: u = u_{rigid}(q_{ref},\dot q_{ref},\ddot q_{ref}) + K\,(s_{ref} - s), \qquad
-    \min\sum_k s_k^TQs_k + u_k^TRu_k, \qquad s = (q, \delta, \dot q, \dot\delta),
+    \min\sum_k e^{2\alpha t_k}(s_k^TQs_k + u_k^TRu_k), \qquad s = (q, \delta, \dot q, \dot\delta),
 
 about the reference: its joints, the deflections that its inertia forces and weight bend the arm by, and the torque of
 the rigid arm's inverse dynamics.
@@ -93,13 +93,18 @@ class JointPid(Rival):
         u += k["velocity"] * reference.velocity + k["acceleration"] * reference.acceleration
         return u + self.model.terms(reference.position, self._still).f1
 
-    def poles(self, q):
-        """Poles of the arm under this law at rest in q, integral left out [1/s]."""
+    @property
+    def K(self):
+        """Feedback of s, integral left out, shape (n, 2 (n + m)): u = -K s."""
         n, m = self.model.n_joints, self.model.n_modes
-        A, B = linear_plant(self.model, np.asarray(q, float), coulomb=False)
         K = np.zeros((n, 2 * (n + m)))
         K[:, :n], K[:, n + m : 2 * n + m] = np.diag(self.gains["p"]), np.diag(self.gains["d"])
-        return np.linalg.eigvals(A - B @ K)
+        return K
+
+    def poles(self, q):
+        """Poles of the arm under this law at rest in q, in continuous time [1/s]."""
+        A, B = linear_plant(self.model, np.asarray(q, float), coulomb=False)
+        return np.linalg.eigvals(A - B @ self.K)
 
 
 class FullStateLqr(Rival):
@@ -114,6 +119,8 @@ class FullStateLqr(Rival):
         [Hz]
     sizes : sequence of float
         What is as bad as the largest torque: joint error [rad], joint rate [rad/s], modal rate [m/s, rad/s].
+    decay : float
+        alpha, the prescribed degree of stability [1/s].
     feedforward : float
         Share of the rigid arm's torque for the reference's acceleration [-].
 
@@ -123,9 +130,9 @@ class FullStateLqr(Rival):
         When the Riccati equation has no stabilising solution.
     """
 
-    def __init__(self, model, q, rate, sizes, feedforward=1.0):
+    def __init__(self, model, q, rate, sizes, decay=0.0, feedforward=1.0):
         super().__init__(model)
-        self.K, self._share = lqr_gain(model, q, rate, sizes), feedforward
+        self.K, self._share = lqr_gain(model, q, rate, sizes, decay), feedforward
 
     def _torque(self, s, reference, dt):
         n, m, model = self.model.n_joints, self.model.n_modes, self.model
@@ -140,10 +147,18 @@ class FullStateLqr(Rival):
         return np.linalg.solve(B, acceleration - a) + self.K @ (wanted - s)
 
 
-def lqr_gain(model, q, rate, sizes):
+def slowest(plants, K, period):
+    """Real part of the slowest pole of sampled plants (Phi, Gamma) under u = -K s, the worst of all [1/s]."""
+    radius = max(np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() for Phi, Gamma in plants)
+    return float(np.log(radius) / period)
+
+
+def lqr_gain(model, q, rate, sizes, decay=0.0):
     """K of `FullStateLqr`, shape (n, 2 (n + m)); raises DesignError."""
     n, m = model.n_joints, model.n_modes
     Phi, Gamma = sampled(*linear_plant(model, np.asarray(q, float), coulomb=False), 1.0 / rate)
+    grown = np.exp(decay / rate)
+    Phi, Gamma = grown * Phi, grown * Gamma
     joint, speed, modal = (1.0 / size**2 for size in sizes)
     Q = np.diag(np.repeat([joint, 0.0, speed, modal], [n, m, n, m]))
     largest = np.array([joint.limits.torque for joint in model.arm.joints])

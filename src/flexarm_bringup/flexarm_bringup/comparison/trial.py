@@ -15,6 +15,8 @@ from . import subjects
 TRACKING, RESIDUAL, SETTLING = 1e-2, 1e-3, 1.0
 #: Cost of a run that loses the arm, more where it loses it earlier; of a design that is refused.
 LOST, REFUSED = 1e3, 1e4
+#: A joint so far off its reference has lost the arm [rad].
+OFF = 0.7
 
 
 def run(subject, setup, noisy=False, seed=0):
@@ -46,6 +48,7 @@ def _run(subject, setup, noisy, seed):
         arm, setup.controller, noise=noisy, seed=seed, rate=subject.rate, window=subject.window
     )
     loop = scenarios.loop_of(scenario)
+    loop.LARGEST_ERROR = OFF
     controller = loop.controller
     if setup.law is not None:
         controller.law = setup.law(loop.model)
