@@ -49,7 +49,8 @@ def start_active_alone(bench):
 
 
 def start_in_mid_run(bench):
-    bench.start_loop({**LOCKSTEP, "pause_at": -1.0}, arm="R")
+    # A loaded machine may hold the line up for longer than the timeout.
+    bench.start_loop({**LOCKSTEP, "pause_at": -1.0}, controller={"state_timeout": 60.0}, arm="R")
     Arm(bench).wait_until(1_100_000_000)
 
 

@@ -244,7 +244,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     free = slow_law.drifts  # joints that nothing holds have no pole left of zero
     if not free:
         full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
-    if chosen["feedforward"] == "none" or free:
+    if chosen["feedforward"] == "none" or free or slow_law.learns:
         return control
     kind = registry.find(FEEDFORWARD, chosen["feedforward"])
     motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))

@@ -64,6 +64,7 @@ class AdaptiveModelFollowing(SlowLaw):
         When the arm file's payload is nothing, or kp and kv ask for oscillating poles.
     """
 
+    learns = True
     PARAMETERS = (
         KP,
         KV,

@@ -48,6 +48,9 @@ class SlowLaw(ABC):
     PARAMETERS = ()
     #: True for a law that leaves the joints free.
     drifts = False
+    #: True for a law whose `model` changes with what it learns: the slow manifold follows it, a simulation of the
+    #: arm file's arm would not, so that such a law goes without feed-forward.
+    learns = False
 
     def __init__(self, model, parameters):
         self.model = model
