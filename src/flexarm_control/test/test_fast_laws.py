@@ -119,7 +119,9 @@ def test_u_f_is_exactly_zero_on_the_manifold_and_linear_beside_it(arm_r):
     assert_array_equal(law.torque(np.zeros(4), np.zeros(1)), [0.0])
     z_f = np.array([1e-3, -2e-4, 0.02, 0.01])
     assert_allclose(law.torque(z_f, np.zeros(1)), [law.K_f[0] @ z_f], rtol=1e-14)
-    assert_allclose(law.torque(-2.0 * z_f, np.zeros(1)), -2.0 * law.torque(z_f, np.zeros(1)), rtol=1e-14)
+    assert_allclose(
+        law.torque(-2.0 * z_f, np.zeros(1)), -2.0 * law.torque(z_f, np.zeros(1)), rtol=1e-14
+    )
 
 
 def test_no_fast_law_gives_no_torque_and_a_zero_gain(arm_r):
