@@ -1,6 +1,7 @@
 """Controller node: `arm_state_estimate` and `joint_trajectory` in, `joint_torque` and `controller/state` out."""
 
 import os
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from time import perf_counter
@@ -79,7 +80,9 @@ class ControllerNode(ArmNode):
 
     def __init__(self):
         super().__init__("controller", parameter_groups())
-        # Redesign (Riccati) happens here, off the control path; one at a time, in order.
+        # Redesign (Riccati) happens here, off the control path; one at a time, in order. The interpreter's lock
+        # goes back to the control path within this time, where 5 ms are usual.
+        sys.setswitchinterval(1e-4)
         self._designer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
 
     def build(self):
