@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from harness import Arm, Bench, trajectory
 
@@ -41,6 +42,42 @@ def check_driver(bench, *options):
     bench.wait_for("the check to end", lambda: process.poll() is not None, 3 * bench.PATIENCE)
     bench.processes.running.pop("check")
     return process.returncode, bench.log("check")
+
+
+def test_stamps_are_the_devices_times_however_late_a_frame_comes(monkeypatch):
+    monkeypatch.syspath_prepend(TEMPLATE)
+    from flexarm_driver_template.device import MeasurementTime
+
+    random, period, start = np.random.default_rng(1), 5_000_000, 10**18  # [ns]
+    late = 1_000_000 + random.exponential(3e6, 2000).astype(int)  # [ns] on the line
+    late[0] = 200_000_000  # the first one waited for its reader
+    clock, measured = MeasurementTime(), period * np.arange(2000)
+    stamps = [clock.stamp(int(t), int(start + t + w)) for t, w in zip(measured, late, strict=True)]
+    known = np.array([s for s in stamps if s is not None])
+    assert len(known) == 1900
+    away = known - (start + measured[100:])
+    assert away.min() > 0 and away.max() < 2_000_000  # near the quickest way, never in the future
+    assert np.abs(np.diff(known) - period).max() < 0.1 * period
+
+
+def test_a_damaged_line_is_no_frame_and_pieces_make_whole_lines(monkeypatch):
+    monkeypatch.syspath_prepend(TEMPLATE)
+    from flexarm_driver_template import protocol
+
+    whole = protocol.seal("S", 7, 35000, -12, 40, 50, 3)
+    frame = protocol.frame(whole.strip(), 1, 2)
+    assert frame == protocol.Frame(7, 35000, [-12], [40, 50], [3])
+    for k in range(len(whole) - 1):
+        broken = bytearray(whole.strip())
+        broken[k] ^= 1
+        assert protocol.frame(bytes(broken), 1, 2) is None, bytes(broken)
+    assert protocol.frame(whole.strip(), 2, 2) is None
+    lines = protocol.Lines()
+    assert [lines.feed(p) for p in (whole[:5], whole[5:] + whole, b"x")] == [
+        [],
+        [whole.strip(), whole.strip()],
+        [],
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -78,19 +78,23 @@ class MeasurementTime:
     A frame that was late on the line keeps the time it was measured at, so that stamps have no jitter.
     """
 
+    #: Device time over which the first quickest frame is looked for [ns].
+    SETTLE = 500_000_000
     #: The clocks drift apart by less than this [-], and stamps are drawn to a quicker frame's by this [-].
-    DRIFT, DRAW = 2e-4, 0.05
+    DRIFT, DRAW = 2e-4, 0.5
 
     def __init__(self):
-        self._offset = self._last = None
+        self._offset = self._last = self._first = None
 
     def stamp(self, device_ns, host_ns):
-        """Host time [ns] of a measurement at `device_ns`, which arrived at `host_ns`."""
+        """Host time [ns] of a measurement at `device_ns`, which arrived at `host_ns`; None: not known yet."""
         newest = host_ns - device_ns
         if self._offset is None:
-            self._offset, self._last = newest, device_ns
-        step = device_ns - self._last
-        self._last = device_ns
+            self._offset, self._last, self._first = newest, device_ns, device_ns
+        step, self._last = device_ns - self._last, device_ns
+        if device_ns - self._first < self.SETTLE:
+            self._offset = min(newest, self._offset)
+            return None
         low, high = self._offset - round(self.DRAW * step), self._offset + round(self.DRIFT * step)
         self._offset = min(max(newest, low), high)
         return device_ns + self._offset

@@ -69,7 +69,7 @@ class DriverNode(ArmNode):
         self._lock = threading.Lock()  # of the gate: frames come in a thread of their own
         self._writer = StateWriter(self.arm)
         self._device = Device(p["port"], joints, gauges)
-        self._first, self._frames, self._before, self._fault = None, 0, 0, ""
+        self._time, self._frames, self._before, self._fault = None, 0, 0, ""
         options = qos.overridable()
         self._state_pub = self.make_publisher(
             ArmState, "arm_state", qos.LINE, qos_overriding_options=options
@@ -118,13 +118,17 @@ class DriverNode(ArmNode):
                 self._publish(frame)
 
     def _publish(self, frame):
-        if self._first is None or frame.number <= self._number:  # the device, or we, began anew
-            self._first, self._time = frame.number, MeasurementTime()
+        if self._time is None or frame.number <= self._number:  # the device, or we, began anew
+            self._first, self._time = None, MeasurementTime()
+        self._number = frame.number
+        stamp = self._time.stamp(1000 * frame.microseconds, self.get_clock().now().nanoseconds)
+        if stamp is None:
+            return
+        if self._first is None:
+            self._first = frame.number
             with self._lock:
                 self._gate.begin(int.from_bytes(os.urandom(4), "little"))
-        self._number = frame.number
         sequence = (frame.number - self._first) % 2**32  # frames lost on the line are gaps
-        stamp = self._time.stamp(1000 * frame.microseconds, self.get_clock().now().nanoseconds)
         s, writer = self._scale, self._writer
         writer.head(stamp, self._gate.session, sequence)
         position = s["position_per_count"] * (frame.encoder - s["encoder_zero"])

@@ -371,6 +371,13 @@ def test_without_motion_what_needs_it_is_skipped(bench):
     assert skipped == {"velocity", "frozen strain"}
 
 
+def test_a_few_stamps_in_the_future_are_worth_a_word(bench):
+    stamp = bench.rest.stamp.copy()
+    stamp[:20] += 4_000_000
+    finding = listening.check_stamps(replace(bench.rest, stamp=stamp), Tolerances())
+    assert finding.verdict == Verdict.WARN and "up to 0.003 s in the future" in finding.text
+
+
 def test_stamps_that_jump_about_are_told_from_a_grid(bench):
     jitter = np.random.default_rng(0).uniform(-0.004, 0.004, bench.rest.size)
     finding = listening.check_jitter(

@@ -193,7 +193,8 @@ def check_stamps(samples, tolerances):
     least = float(age.min())
     if least < -1e-3:
         text = f"stamps are up to {-least:.3g} s in the future: take the time of measurement, on this clock"
-        return Finding("stamps", FAIL, text)
+        # A few are a clock that is still being compared with this one.
+        return Finding("stamps", FAIL if np.median(age) < -1e-3 else WARN, text)
     # The least: what a busy machine adds to the age is not the driver's.
     if least > tolerances.age:
         text = (
