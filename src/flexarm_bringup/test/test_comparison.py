@@ -374,6 +374,19 @@ def test_options_that_are_refused(words, message, capsys):
     assert message in capsys.readouterr().err
 
 
+def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
+    def interrupted(jobs, seed, workers):
+        yield 1, stored()["subjects"][0]["contenders"][contenders.PID]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_results", interrupted)
+    out = tmp_path / "rows.json"
+    words = ["--arms", "R", "--contenders", "composite (shipped),joint PID", "--no-combinations"]
+    with pytest.raises(KeyboardInterrupt):
+        command.main([*words, "--json", str(out)])
+    assert list(command.load(out)["subjects"][0]["contenders"]) == [contenders.PID]
+
+
 def test_the_command_runs(tmp_path, capsys, monkeypatch):
     """The whole way with `--quick`, on a motion that is over soon."""
     monkeypatch.setattr(subjects, "SUBJECTS", (SHORT,))

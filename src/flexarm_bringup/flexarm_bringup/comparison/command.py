@@ -52,13 +52,19 @@ def compare(options):
     if options.stored:
         found = merged([load(path) for path in options.stored])
     else:
-        found = study(options, Progress())
-    if options.json:
-        text = json.dumps(found, indent=1, allow_nan=False)
-        Path(options.json).write_text(text + "\n", encoding="utf-8")
+        # After every job: what an interrupted run has done is not lost.
+        found = study(options, Progress(), lambda rows: store(rows, options.json))
+    store(found, options.json)
     if options.write:
         report.write(found, options.write)
     print(report.text(found), file=sys.stdout)
+
+
+def store(found, path):
+    """Write rows, if there is a path."""
+    if path:
+        text = json.dumps(found, indent=1, allow_nan=False)
+        Path(path).write_text(text + "\n", encoding="utf-8")
 
 
 def load(path):
@@ -196,8 +202,15 @@ def _do(job, seed):
     return {"row": run(subject, combinations.setup(subject, what))}
 
 
-def study(options, progress):
+def study(options, progress, each=lambda found: None):
     """Tune and run everyone.
+
+    Parameters
+    ----------
+    options : namespace
+    progress : Progress
+    each : callable, optional
+        Of what there is, called after every job.
 
     Returns
     -------
@@ -214,8 +227,9 @@ def study(options, progress):
         subject, what = jobs[i]
         label = what if isinstance(what, str) else " + ".join(what)
         progress.step(f"{subject.arm}: {label}", len(results), len(jobs))
+        each(_gathered(options.seed, wanted, jobs, results))
     progress.done()
-    return {"seed": options.seed, "subjects": [_gathered(s, jobs, results) for s in wanted]}
+    return _gathered(options.seed, wanted, jobs, results)
 
 
 def _results(jobs, seed, workers):
@@ -247,8 +261,13 @@ def _processes(workers):
                 os.environ[name] = value
 
 
-def _gathered(subject, jobs, results):
-    mine = [(what, results[i]) for i, (s, what) in enumerate(jobs) if s == subject]
+def _gathered(seed, wanted, jobs, results):
+    """Rows by arm, of the jobs that are done; in the jobs' order, whichever came first."""
+    return {"seed": seed, "subjects": [_of_arm(s, jobs, results) for s in wanted]}
+
+
+def _of_arm(subject, jobs, results):
+    mine = [(w, results[i]) for i, (s, w) in enumerate(jobs) if s == subject and i in results]
     return {
         "arm": subject.arm,
         "motion": subject.motion,
