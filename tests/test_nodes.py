@@ -73,7 +73,8 @@ def test_a_signal_ends_every_node_with_code_0_and_leaves_nothing_behind(tmp_path
 
 
 def test_a_controller_that_is_told_to_end_disables_the_torque(bench):
-    bench.start_loop({**LOCKSTEP, "pause_at": 0.02}, arm="R", controller={"fast.type": "none"})
+    patient = {"fast.type": "none", "state_timeout": 60.0}
+    bench.start_loop({**LOCKSTEP, "pause_at": 0.02}, arm="R", controller=patient)
     arm = Arm(bench)
     bench.wait_for("the loop to stand", lambda: arm.ready() and arm.paused_at())
     assert arm.torques.newest.mode == JointTorque.ENABLED
