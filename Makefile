@@ -37,7 +37,7 @@ demo: build
 	@./flexarm demo
 
 test: build
-	@. tools/env.sh && ROS_PYTHON_CHECK_FIELDS=1 python -m pytest -q $(PYTEST_ARGS) $(TESTS)
+	@. tools/env.sh && ROS_PYTHON_CHECK_FIELDS=1 python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS) $(TESTS)
 
 # Its peers are no business of the other targets.
 bench: build

@@ -265,13 +265,16 @@ class Arm:
     namespace : str
         With a slash at its end, or empty.
     joints : sequence of str
+    pauses_at : int, optional
+        The sample at which the simulator pauses by itself.
     """
 
     #: Type of the service ~/reset.
     reset_kind = Trigger
 
-    def __init__(self, bench, namespace="", joints=("joint1",)):
+    def __init__(self, bench, namespace="", joints=("joint1",), pauses_at=None):
         self.bench, self.namespace, self.joints = bench, namespace, list(joints)
+        self.pauses_at = pauses_at
         self.measured = bench.tap(ArmState, f"{namespace}arm_state")
         self.estimated = bench.tap(ArmState, f"{namespace}arm_state_estimate")
         self.torques = bench.tap(JointTorque, f"{namespace}joint_torque")
@@ -307,29 +310,29 @@ class Arm:
         answer = self.bench.call(SetBool, f"{self.namespace}simulator/pause", data=paused)
         assert answer.success, answer.message
 
-    def paused_at(self):
-        """Stamp of the sample that is being sent again [ns]; 0 while the loop runs."""
-        last = [stamp_ns(m.header.stamp) for m in self.states.messages[-2:]]
-        return last[0] if len(last) == 2 and last[0] == last[1] else 0
-
     def stand(self):
-        """Pause and wait until the loop stands; the stamp [ns]."""
-        self.pause(True)
-        seen = len(self.states.messages)
-        self.bench.wait_for(
-            "the loop to stand", lambda: len(self.states.messages) > seen + 1 and self.paused_at()
-        )
-        return self.paused_at()
+        """Pause, and wait until the last sample before it has been answered; its stamp [ns]."""
+        answer = self.bench.call(SetBool, f"{self.namespace}simulator/pause", data=True)
+        assert answer.success, answer.message
+        return self.wait_standing(int(answer.message.split()[-1]))
+
+    def wait_standing(self, sequence=None, session=None):
+        """Until the loop stands, ready, at a sample (`pauses_at`) of a session (any); its stamp [ns]."""
+        sequence = self.pauses_at if sequence is None else sequence
+
+        def stands():
+            state = self.state
+            return state.sequence == sequence and session in (None, state.session) and self.ready()
+
+        self.bench.wait_for(f"the loop to stand at sample {sequence}", stands)
+        return self.now
 
     def reset(self):
         """Reset the simulator and wait until the controller answers in the new session."""
         answer = self.bench.call(Trigger, f"{self.namespace}simulator/reset")
         assert answer.success, answer.message
         session = int(answer.message.split()[-1])
-        self.bench.wait_for(
-            "the new session to stand, ready",
-            lambda: self.state.session == session and self.ready() and self.paused_at(),
-        )
+        self.wait_standing(session=session)
         return session
 
     def publish_trajectory(self, message):

@@ -75,8 +75,8 @@ def test_a_signal_ends_every_node_with_code_0_and_leaves_nothing_behind(tmp_path
 def test_a_controller_that_is_told_to_end_disables_the_torque(bench):
     patient = {"fast.type": "none", "state_timeout": 60.0}
     bench.start_loop({**LOCKSTEP, "pause_at": 0.02}, arm="R", controller=patient)
-    arm = Arm(bench)
-    bench.wait_for("the loop to stand", lambda: arm.ready() and arm.paused_at())
+    arm = Arm(bench, pauses_at=20)
+    arm.wait_standing()
     assert arm.torques.newest.mode == JointTorque.ENABLED
     assert bench.stop("controller", signal.SIGTERM) == 0
     bench.wait_for("DISABLED", lambda: arm.torques.newest.mode == JointTorque.DISABLED)
@@ -242,8 +242,8 @@ def loop(shared_bench):
     bench.start("simulator", {**LOCKSTEP, "pause_at": 0.01}, file=file)
     bench.start("observer", file=file)
     bench.start("controller", file=file)
-    arm = Arm(bench)
-    bench.wait_for("the loop to stand, ready", lambda: arm.ready() and arm.paused_at())
+    arm = Arm(bench, pauses_at=10)
+    arm.wait_standing()
     return arm
 
 

@@ -24,8 +24,8 @@ def loop(shared_bench):
         controller={"fast.type": "none", "state_timeout": 60.0},
         arm="one_link",
     )
-    arm = Arm(shared_bench)
-    shared_bench.wait_for("the loop to stand, ready", lambda: arm.ready() and arm.paused_at())
+    arm = Arm(shared_bench, pauses_at=10)
+    arm.wait_standing()
     return arm
 
 
@@ -33,8 +33,7 @@ def loop(shared_bench):
 def arm(loop, counter=itertools.count(1)):  # noqa: B008
     """The loop in a new session, paused at 10 ms, READY, nothing refused."""
     # An accepted trajectory clears the reason of the last refusal, the reset then forgets it.
-    if not loop.paused_at():
-        loop.reset()
+    loop.reset()
     loop.offer(trajectory(J, (10.0 + 0.001 * next(counter), [0.0])))
     loop.reset()
     assert loop.state.supervisor_state == CompositeState.READY

@@ -167,6 +167,18 @@ def test_a_push_during_which_the_safe_action_came_is_replayed_with_it():
     assert "moves 1 times as far as its model" in b.findings()["response"].text
 
 
+def test_a_push_that_nobody_saw_is_not_judged(bench):
+    def lose(samples, first, last):
+        kept = np.r_[0:first, last : samples.size]
+        arrays = {k: v[kept] for k, v in vars(samples).items() if v is not None}
+        return replace(samples, **arrays)
+
+    gap = bench.findings(lambda s: lose(s, 100, 115))["response"]
+    assert gap.verdict == Verdict.SKIPPED
+    assert "no sample came for 0.0" in gap.text and "joint1" in gap.text
+    assert bench.findings(lambda s: lose(s, 100, 103))["response"].verdict == Verdict.PASS
+
+
 def test_an_arm_under_its_weight_is_pushed_from_rest():
     b = Bench("long_reach", joint=1, position=0.2)
     b.push_again(b.push.torque)

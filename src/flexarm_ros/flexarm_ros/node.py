@@ -5,6 +5,7 @@ import re
 import signal
 import sys
 import traceback
+from collections import deque
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -64,6 +65,7 @@ class ArmNode(LifecycleNode):
         self._line = None
         self._made = []
         self._reported = {}
+        self._handed = deque()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.failure = ""
 
@@ -164,6 +166,18 @@ class ArmNode(LifecycleNode):
             if trigger() != TransitionCallbackReturn.SUCCESS:
                 return False
         return True
+
+    # From other threads -------------------------------------------------------------------------
+
+    def hand_over(self, callback, *args):
+        """From another thread: have the node's own thread call this between two samples, in the order handed over."""
+        self._handed.append((callback, args))
+        # rclpy runs the newest task first: each task takes the oldest call.
+        self.executor.create_task(self._take_over)
+
+    def _take_over(self):
+        callback, args = self._handed.popleft()
+        callback(*args)
 
     # Diagnostics -----------------------------------------------------------------------------
 

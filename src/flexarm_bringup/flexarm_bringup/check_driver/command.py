@@ -16,6 +16,8 @@ from .samples import Finding, Heard, Verdict, samples
 
 #: A jolt forth and back lasts twice this, and so long something is sent that must not be applied [s].
 JOLT, REFUSED = 0.15, 0.15
+#: A push is tried so often, where too many samples were lost to judge it.
+TRIES = 3
 #: Wall time that a phase may take, beside its own [s] and as a factor.
 PATIENCE, SLOW = 2.0, 5.0
 
@@ -224,6 +226,16 @@ class Examination:
         return any(f.check in checks and f.verdict == Verdict.FAIL for f in self.findings)
 
     def _push(self, joint, angle):
+        for _ in range(TRIES):
+            push, found, sent = self._pushed(joint, angle)
+            if found.size >= 10 and not moving.unseen(push, found):
+                break
+            self._rest()
+        self.findings += moving.check_push(self.model, push, found, sent, self.tolerances)
+        return push
+
+    def _pushed(self, joint, angle):
+        """Push a joint once: the push, the samples of it, and the torque sent."""
         position = np.array(self._samples(self.line.listen(0.05)).position[-1])
         push = moving.plan(self.model, position, joint, angle)
         sequences, torques = [], []
@@ -235,11 +247,9 @@ class Examination:
             torques.append(torque)
 
         heard = self.line.listen(push.duration, answer)
-        self.line.disable(heard[-1].message)
         found = self._samples(heard)
-        sent = moving.sent_torque(found, sequences, torques)
-        self.findings += moving.check_push(self.model, push, found, sent, self.tolerances)
-        return push
+        self.line.disable(heard[-1].message)
+        return push, found, moving.sent_torque(found, sequences, torques)
 
     def _stop(self, push):
         """Break off a jolt, then send what is to be refused."""

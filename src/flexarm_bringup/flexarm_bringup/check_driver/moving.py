@@ -28,6 +28,8 @@ PASS, WARN, FAIL, SKIPPED = Verdict.PASS, Verdict.WARN, Verdict.FAIL, Verdict.SK
 PERIODS, SHORTEST, LONGEST = 2.5, 0.5, 8.0
 #: Most of a joint's torque limit that a push takes [-].
 SHARE = 0.3
+#: Longest time without a sample in a push, as a share of it [-]: the torque over a longer one is anyone's guess.
+LONGEST_GAP = 0.05
 #: A signal is judged when its prediction spans so many of its resolutions.
 RESOLUTIONS = 8.0
 #: A gauge or mode counts as silent below this share of the largest of its kind; it may be loud in another push.
@@ -341,6 +343,12 @@ def _signals(name, what, names, measured, expected, least, gain_error):
     return Finding(name, PASS, f"{what}s bend as the model does: {seen}")
 
 
+def unseen(push, samples):
+    """Longest time without a sample while a joint was pushed [s]; 0 where it is short enough to judge the push."""
+    gap = float(np.diff(samples.time).max(initial=0.0))
+    return gap if gap > max(LONGEST_GAP * push.duration, 1.5 * samples.period) else 0.0
+
+
 def check_push(model, push, samples, sent, tolerances):
     """All that one push can tell.
 
@@ -366,6 +374,12 @@ def check_push(model, push, samples, sent, tolerances):
         return [Finding("response", FAIL, text)]
     if not np.isfinite(samples.position).all():
         return [check_finite(arm, samples)]
+    if gap := unseen(push, samples):
+        text = (
+            f"no sample came for {gap:.3f} s while {arm.joint_names[push.joint]} was pushed, so that what it did"
+            " can't be judged: lower the rate, or give the machine more time"
+        )
+        return [Finding("response", SKIPPED, text)]
     # Broken ones have been named by `check_finite`.
     kept = {k: getattr(samples, k) for k in ("velocity", "strain", "amplitude")}
     kept = {k: v if v is None or np.isfinite(v).all() else None for k, v in kept.items()}

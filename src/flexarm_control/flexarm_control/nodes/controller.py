@@ -217,7 +217,7 @@ class ControllerNode(ArmNode):
         except Exception as error:
             what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self.get_logger().warning(f"trajectory without preview: {what}{error}")
-        self.executor.create_task(self._offer, data, plan)
+        self.hand_over(self._offer, data, plan)
 
     def _offer(self, data, plan=None):
         verdict = self.core.offer(data, plan)
@@ -260,7 +260,7 @@ class ControllerNode(ArmNode):
         try:
             # A model of its own: the loop goes on with the old one meanwhile.
             law = self._design(model.build(self.arm), values)
-            self.executor.create_task(self._swap, law)
+            self.hand_over(self._swap, law)
             self._good = values
         except Exception as error:
             # A law may be anybody's, and this thread would drop its error without a word.
@@ -272,7 +272,7 @@ class ControllerNode(ArmNode):
                 for name, value in group.items()
                 if values[prefix][name] != value
             ]
-            self.executor.create_task(self.set_parameters_atomically, old)
+            self.hand_over(self.set_parameters_atomically, old)
 
     def _swap(self, law):
         """Between two samples: the new law goes on from where the old one is."""

@@ -274,7 +274,9 @@ class SimulatorNode(ArmNode):
             response.success, response.message = False, f"call ~/reset first: {self._fault}"
             return response
         self._paused = request.data
-        response.success, response.message = True, "paused" if request.data else "running"
+        response.success, response.message = True, "running"
+        if request.data:
+            response.message = f"paused at sample {self.sim.sequence}"
         if not request.data:
             self._resend()
         return response
