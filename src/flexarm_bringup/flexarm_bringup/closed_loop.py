@@ -136,8 +136,12 @@ class ClosedLoop:
 
     def _answer(self):
         """Measure, estimate, control: whether torque is enabled; a sample that was answered is answered alike."""
+        return self._answer_to(self.measure())
+
+    def _answer_to(self, measured):
+        """Estimate and control; as `_answer`."""
         try:
-            return self.controller.step(self.estimate(self.measure()))
+            return self.controller.step(self.estimate(measured))
         except MessageError as error:
             self.controller.disable(str(error))
             return False

@@ -27,6 +27,7 @@ from flexarm_sim.simulator import PARAMETERS as SIMULATOR_PARAMETERS
 from . import parameter_files
 from .closed_loop import ClosedLoop
 from .metrics import tracking_metrics
+from .network import Network, NetworkedLoop
 
 #: Groups of components by the prefix of their parameters, and the type where none is given, as in the nodes.
 COMPONENTS = {
@@ -69,11 +70,15 @@ class Scenario:
     noise : bool
         Whether sensors have the noise that the arm file states.
     seed : int
-        Of the noise.
+        Of the noise, and of what the network does.
     rate : float or None
         Samples per second; None: as in `controller`, else 1000 [Hz].
     delay : float
         From a measurement until its torque begins to act [s].
+    loss : float
+        Probability that a sample is lost on its way to the observer, each on its own [-]; see `network`.
+    jitter : float
+        Every sample is later still by a time uniform from 0 to this [s].
     duration : float or None
         From the motion's start; None: to the end of the `window` [s].
     window : float
@@ -96,6 +101,8 @@ class Scenario:
     seed: int = 0
     rate: float | None = None
     delay: float = 0.0
+    loss: float = 0.0
+    jitter: float = 0.0
     duration: float | None = None
     window: float = 3.0
     tolerance: float = 1e-3
@@ -230,14 +237,11 @@ def loop_of(scenario):
         scenario.stiffness_scale,
         scenario.damping_scale,
     )
-    return ClosedLoop(
-        arm,
-        **groups,
-        simulator=simulator,
-        controller=controller,
-        plant_arm=plant,
-        delay=scenario.delay,
-    )
+    parts = {**groups, "simulator": simulator, "controller": controller, "plant_arm": plant}
+    if scenario.loss or scenario.jitter:
+        network = Network(scenario.loss, scenario.delay, scenario.jitter, scenario.seed)
+        return NetworkedLoop(arm, **parts, network=network)
+    return ClosedLoop(arm, **parts, delay=scenario.delay)
 
 
 def run(scenario):

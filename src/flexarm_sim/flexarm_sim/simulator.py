@@ -175,10 +175,14 @@ class Simulator:
         When torque comes late, `before` goes on to act over the first `share` of the period; the torque of the
         next sample is then the mean over the period.
         """
+        parts = [(before, share)] if share > 0.0 else []
+        self.advance_in_parts([*parts, (torque, 1.0 - share)])
+
+    def advance_in_parts(self, parts):
+        """One period under several torques in turn: pairs of torque, or None, and its share of the period."""
         self.torque[:] = 0.0
-        if share > 0.0:
-            self._advance(before, share)
-        self._advance(torque, 1.0 - share)
+        for torque, share in parts:
+            self._advance(torque, share)
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         self._measure()
