@@ -19,6 +19,7 @@ setup(
         "console_scripts": [
             "observer = flexarm_control.nodes:start_observer",
             "controller = flexarm_control.nodes:start_controller",
+            "observer_controller = flexarm_control.nodes:start_observer_controller",
             "excite = flexarm_control.nodes:start_excite",
         ],
         "flexarm.slow_laws": [

@@ -10,11 +10,11 @@ BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 def groups():
     """Node name to its declared parameters by prefix."""
     from flexarm_control.nodes import controller, observer
-    from flexarm_ros.node import AUTOSTART
+    from flexarm_ros.node import COMMON
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
 
-    common = {"": (AUTOSTART,)}
+    common = {"": COMMON}
     return {
         "simulator": {"": (*common[""], *simulator.PARAMETERS, *simulator_node.PARAMETERS)},
         "observer": _with(observer.parameter_groups(), common),

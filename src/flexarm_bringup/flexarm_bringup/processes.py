@@ -11,12 +11,14 @@ import tempfile
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_ros.start import PARENT
 
 #: Package of each node's executable.
 NODES = {
     "simulator": "flexarm_sim",
     "observer": "flexarm_control",
     "controller": "flexarm_control",
+    "observer_controller": "flexarm_control",
 }
 
 
@@ -73,6 +75,7 @@ def environment(domain):
     env.setdefault("RCUTILS_LOGGING_USE_STDOUT", "0")
     # One thread each: small matrices, and the other processes need the other cores.
     env.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    env[PARENT] = str(os.getpid())  # nothing is left behind, even by kill -9
     return env
 
 
@@ -101,7 +104,7 @@ def arguments(parameters=None, file=None, remaps=()):
 
 
 class Processes:
-    """Child processes that end with the context, however it ends.
+    """Child processes that end with the context, however it ends; nodes and modules with this process, too.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from .errors import ParameterError
 
-KINDS = ("float", "int", "bool", "string", "float_array", "string_array")
+KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
 
 
 @dataclass(frozen=True)
@@ -91,13 +91,20 @@ class Parameter:
             if not all(isinstance(item, str) for item in value):
                 raise ParameterError(f"{where}: {list(value)!r} holds what is not a string")
             return list(value)
+        if self.kind == "int_array":
+            if isinstance(value, str) or not hasattr(value, "__len__"):
+                raise ParameterError(f"{where}: {value!r} is not a list of integers")
+            return [self._int(f"{where}[{i}]", v) for i, v in enumerate(value)]
         if self.kind == "int":
-            if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-                raise ParameterError(f"{where}: {value!r} is not an integer")
-            return int(self._in_range(where, value))
+            return self._int(where, value)
         if self.kind == "float":
             return self._float(where, value)
         return self._float_array(where, value, sizes or {})
+
+    def _int(self, where, value):
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+            raise ParameterError(f"{where}: {value!r} is not an integer")
+        return int(self._in_range(where, value))
 
     def _float(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Real):

@@ -18,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import Parameter
 
+from . import qos, scheduling
 from .parameters import NodeParameters
 from .spin import Line, spin
 
@@ -40,6 +41,8 @@ AUTOSTART = Parameter(
     "Configure and activate at the start; false: wait for a lifecycle manager.",
     read_only=True,
 )
+#: Parameters of every node.
+COMMON = (AUTOSTART, *scheduling.PARAMETERS)
 
 
 class ArmNode(LifecycleNode):
@@ -58,15 +61,20 @@ class ArmNode(LifecycleNode):
     def __init__(self, name, groups):
         super().__init__(name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        groups = {**groups, "": (AUTOSTART, *groups.get("", ()))}
-        self.parameters = NodeParameters(self, groups)
+        self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
+        groups = {**groups, "": (*COMMON, *groups.get("", ()))}
+        self.parameters = given = NodeParameters(self, groups)
+        scheduling.apply(
+            given["cpu_affinity"], given["realtime_priority"], self.get_logger().warning
+        )
         self.active = False
         self.line = None  # the control path, while active
         self._line = None
         self._made = []
         self._reported = {}
         self._handed = deque()
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._mismatches = qos.Mismatches(self)
+        self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self.failure = ""
 
     # What subclasses fill in -----------------------------------------------------------------
@@ -86,13 +94,22 @@ class ArmNode(LifecycleNode):
 
     # Made and unmade with the configuration ----------------------------------------------------
 
-    def make_publisher(self, *args, **kwargs):
-        """A publisher that lives until clean-up."""
-        return self._keep(self.destroy_publisher, self.create_publisher(*args, **kwargs))
+    def make_publisher(self, kind, topic, profile, **kwargs):
+        """A publisher that lives until clean-up; whoever can't hear it is shown in diagnostics."""
+        return self._keep(self.destroy_publisher, self._publisher(kind, topic, profile, **kwargs))
 
-    def make_subscription(self, *args, **kwargs):
-        """A subscription that lives until clean-up."""
-        return self._keep(self.destroy_subscription, self.create_subscription(*args, **kwargs))
+    def make_subscription(self, kind, topic, callback, profile, **kwargs):
+        """A subscription that lives until clean-up; whom it can't hear is shown in diagnostics."""
+        events, take = self._mismatches.callbacks(False, "qos_overriding_options" in kwargs)
+
+        def create(own):
+            return self.create_subscription(
+                kind, topic, callback, own, event_callbacks=events, **kwargs
+            )
+
+        subscription = qos.made(create, topic, profile)
+        take(subscription)
+        return self._keep(self.destroy_subscription, subscription)
 
     def make_service(self, *args, **kwargs):
         """A service that lives until clean-up."""
@@ -108,6 +125,16 @@ class ArmNode(LifecycleNode):
         """Name the subscription that is the control path, see `spin.Line`."""
         self._line = Line(subscription, period, on_period)
 
+    def _publisher(self, kind, topic, profile, **kwargs):
+        events, take = self._mismatches.callbacks(True, "qos_overriding_options" in kwargs)
+
+        def create(own):
+            return self.create_publisher(kind, topic, own, event_callbacks=events, **kwargs)
+
+        publisher = qos.made(create, topic, profile)
+        take(publisher)
+        return publisher
+
     def _keep(self, destroy, thing):
         self._made.append((destroy, thing))
         return thing
@@ -115,6 +142,7 @@ class ArmNode(LifecycleNode):
     def _unmake(self):
         for destroy, thing in reversed(self._made):
             destroy(thing)
+        self._mismatches.forget(thing for _, thing in self._made)
         self._made.clear()
 
     # Life cycle ------------------------------------------------------------------------------
@@ -182,7 +210,7 @@ class ArmNode(LifecycleNode):
     # Diagnostics -----------------------------------------------------------------------------
 
     def _publish_diagnostics(self):
-        level, message, values = self.diagnose()
+        level, message, values = self._with_mismatches(*self.diagnose())
         status = DiagnosticStatus(
             level=level,
             name=self.get_fully_qualified_name().lstrip("/"),
@@ -191,8 +219,22 @@ class ArmNode(LifecycleNode):
             values=[KeyValue(key=str(k), value=str(v)) for k, v in values.items()],
         )
         array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
+        array.header.stamp = self._now().to_msg()
         self._diagnostics.publish(array)
+
+    def _now(self):
+        """ROS time, for a stamp that people read; with `use_sim_time` and no /clock yet that of the system."""
+        now = self.get_clock().now()
+        return now if now.nanoseconds else self._system.now()
+
+    def _with_mismatches(self, level, message, values):
+        """What a node says of itself, and which of its topics somebody can't be heard on."""
+        found = self._mismatches.texts()
+        if not found:
+            return level, message, values
+        shown = {f"incompatible QoS on {topic}": text for topic, text in found.items()}
+        message = "; ".join(filter(None, (message, *found.values())))
+        return max(level, WARN), message, {**values, **shown}
 
     def report(self, text):
         """Log a refusal: at once when it is a new one, else every ten seconds; numbers aside."""
@@ -206,12 +248,12 @@ class ArmNode(LifecycleNode):
 
 
 def run(node_class, args=None):
-    """Run a node until SIGINT or SIGTERM; the process's exit code.
+    """Run a node, or several in one process, until SIGINT or SIGTERM; the process's exit code.
 
     Parameters
     ----------
     node_class : callable
-        Makes the node.
+        Makes the node, or a list of nodes: the order in which they are configured and activated.
     args : list of str, optional
         Command line.
 
@@ -223,17 +265,18 @@ def run(node_class, args=None):
     stopped = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.append(True))
-    node = None
+    nodes = []
     try:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         except RuntimeError as error:  # what rcl says of a command line or parameter file
             print(f"{node_class.__name__}: {error}", file=sys.stderr)
             return 1
-        node = node_class()
-        if not node.autostart():
+        made = node_class()
+        nodes = list(made) if isinstance(made, (list, tuple)) else [made]
+        if not all(node.autostart() for node in nodes):
             return 1
-        spin(node, stopped)
+        spin(nodes, stopped)
         return 0
     except (FlexarmError, ParameterException) as error:
         print(f"{node_class.__name__}: {error}", file=sys.stderr)
@@ -244,8 +287,9 @@ def run(node_class, args=None):
         traceback.print_exc()
         return 1
     finally:
-        if node is not None:
+        for node in nodes:
             if node.active:
                 node.stop()
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()

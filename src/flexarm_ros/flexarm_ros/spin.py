@@ -1,4 +1,4 @@
-"""Spins a node whose control path is one subscription, without rebuilding a wait set of everything per message.
+"""Spins nodes whose control path is one subscription, without rebuilding a wait set of everything per message.
 
 rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node
 that costs more than the control law. Here the control path waits on its own subscription alone, and the
@@ -13,7 +13,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 #: Longest wait of services, timers and slow topics for their turn [s].
 HOUSEKEEPING = 0.02
-#: So many of them are served in one turn; looking for them costs about 0.2 ms each.
+#: So many of them are served in one turn for each node; looking for them costs about 0.2 ms each.
 AT_ONCE = 2
 
 
@@ -41,30 +41,32 @@ class Line:
         self.lost = 0
 
 
-def spin(node, stopped):
-    """Serve `node` until `stopped` holds something.
+def spin(nodes, stopped):
+    """Serve nodes until `stopped` holds something.
 
     Parameters
     ----------
-    node : ArmNode
-        With a `line` while it is active, None otherwise.
+    nodes : sequence of ArmNode
+        At most one of them with a `line` while it is active, None otherwise; they share the executor.
     stopped : list
         Filled by a signal handler.
     """
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
+    context = nodes[0].context
+    executor = SingleThreadedExecutor(context=context)
+    for node in nodes:
+        executor.add_node(node)
     try:
-        while not stopped and node.context.ok():
-            line = node.line
-            if line is None:
+        while not stopped and context.ok():
+            node = next((n for n in nodes if n.line is not None), None)
+            if node is None:
                 executor.spin_once(timeout_sec=0.1)
             else:
-                _spin_line(node, line, executor, stopped)
+                _spin_line(node, node.line, executor, AT_ONCE * len(nodes), stopped)
     finally:
         executor.shutdown()
 
 
-def _spin_line(node, line, executor, stopped):
+def _spin_line(node, line, executor, at_once, stopped):
     handle, kind = line.subscription.handle, line.subscription.msg_type
     callback = line.subscription.callback
     waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -74,7 +76,7 @@ def _spin_line(node, line, executor, stopped):
     while node.line is line and not stopped:
         now = clock()
         if now >= others:
-            for _ in range(AT_ONCE):
+            for _ in range(at_once):
                 executor.spin_once(timeout_sec=0.0)
             if node.line is not line or not node.context.ok():
                 return

@@ -1,6 +1,7 @@
 """Starts and ends a node's process: a signal ends it cleanly from the first moment, while it still imports."""
 
 import contextlib
+import ctypes
 import faulthandler
 import gc
 import importlib
@@ -8,12 +9,33 @@ import os
 import signal
 import sys
 
+#: Names the process that this one is to end with, in the environment; see `end_with_parent`.
+PARENT = "FLEXARM_PARENT"
+_PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+
+
+def end_with_parent():
+    """Have the system send SIGTERM when the process that started this one is gone, however it ended; Linux.
+
+    Only where the environment names it, so that what a person starts by hand survives its shell. The request is
+    made by the child and not between fork and exec: Python may not run there beside the middleware's threads.
+    """
+    parent = os.environ.pop(PARENT, "")  # not for children of this process
+    if not parent.isdigit() or not sys.platform.startswith("linux"):
+        return
+    if os.getppid() == int(parent):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    # Gone already, and this process adopted by another: the signal would never come.
+    if os.getppid() != int(parent) and not os.path.exists(f"/proc/{parent}"):
+        os._exit(0)
+
 
 def start(module):
     """Import a node's module and call its `main`."""
     faulthandler.enable()  # a crash in the middleware says where
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
+    end_with_parent()
     importlib.import_module(module).main()
 
 
@@ -39,6 +61,7 @@ def leave(code):
 def leave_after(main):
     """Run a `main` of a process that may use the middleware, then `leave` with the code it exits with."""
     code = 0
+    end_with_parent()
     try:
         main()
     except SystemExit as error:

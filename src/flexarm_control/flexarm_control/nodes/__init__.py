@@ -13,6 +13,11 @@ def start_controller():
     start("flexarm_control.nodes.controller")
 
 
+def start_observer_controller():
+    """Entry point of ``ros2 run flexarm_control observer_controller``."""
+    start("flexarm_control.nodes.observer_controller")
+
+
 def start_excite():
     """Entry point of ``ros2 run flexarm_control excite``."""
     start("flexarm_control.nodes.excite")

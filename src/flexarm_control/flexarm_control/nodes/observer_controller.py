@@ -1,0 +1,81 @@
+"""Observer and controller in one process: the estimate goes to the controller by a call, not through the middleware.
+
+The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics; only
+`arm_state_estimate` is not subscribed to any more. It is published after the torque, where somebody listens.
+"""
+
+from flexarm_control.nodes.controller import ControllerNode
+from flexarm_control.nodes.observer import ObserverNode
+from flexarm_ros.node import run
+from flexarm_ros.start import leave
+
+ESTIMATE = "arm_state_estimate"
+
+
+class CalledController(ControllerNode):
+    """The controller, which is handed each estimate by `take`."""
+
+    def make_subscription(self, kind, topic, callback, *args, **kwargs):
+        if topic == ESTIMATE:
+            self.take = callback
+            return None
+        return super().make_subscription(kind, topic, callback, *args, **kwargs)
+
+    def make_line(self, subscription, *args, **kwargs):
+        # The control path of this process is the observer's subscription.
+        if subscription is not None:
+            super().make_line(subscription, *args, **kwargs)
+
+    def take(self, message):
+        """An estimate; replaced by the control path once the node is configured."""
+
+
+class Handover:
+    """Stands in the place of the publisher of estimates.
+
+    Parameters
+    ----------
+    publisher : Publisher
+    controller : CalledController
+    """
+
+    def __init__(self, publisher, controller):
+        self._publisher, self._controller = publisher, controller
+
+    def publish(self, message):
+        """Have the controller answer, then publish for whoever listens."""
+        self._controller.take(message)
+        if self._publisher.get_subscription_count():
+            self._publisher.publish(message)
+
+
+class CallingObserver(ObserverNode):
+    """The observer, which calls a controller of this process with each estimate.
+
+    Parameters
+    ----------
+    controller : CalledController
+    """
+
+    def __init__(self, controller):
+        super().__init__()
+        self._controller = controller
+
+    def make_publisher(self, kind, topic, *args, **kwargs):
+        publisher = super().make_publisher(kind, topic, *args, **kwargs)
+        return Handover(publisher, self._controller) if topic == ESTIMATE else publisher
+
+
+def nodes():
+    """Both nodes; the controller is ready before the observer sends it anything."""
+    controller = CalledController()
+    return controller, CallingObserver(controller)
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_control observer_controller``."""
+    leave(run(nodes, args))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,105 @@
+"""Where and how urgently a node's process runs: CPU affinity and real-time priority; Linux.
+
+Both are off by default. They apply to every thread that the process has when its node is made, the middleware's
+among them: a message waits for the slowest of them. Threads made later, in which laws are designed, stay on those
+CPUs but have ordinary priority, so that a design never holds up a sample.
+"""
+
+import os
+
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import Parameter
+
+CPU_AFFINITY = Parameter(
+    "cpu_affinity",
+    "int_array",
+    [],
+    "CPUs that the node's process runs on; empty: all. Nodes that share a process share it.",
+    low=0,
+    high=1023,
+    read_only=True,
+)
+REALTIME_PRIORITY = Parameter(
+    "realtime_priority",
+    "int",
+    0,
+    "Priority of the node's process among real-time processes (SCHED_FIFO); 0: an ordinary process.",
+    low=0,
+    high=99,
+    read_only=True,
+)
+PARAMETERS = (CPU_AFFINITY, REALTIME_PRIORITY)
+
+
+def threads():
+    """Thread ids of this process."""
+    return [int(name) for name in os.listdir("/proc/self/task")]
+
+
+def apply(cpus, priority, warn):
+    """Take the values of `PARAMETERS`.
+
+    Parameters
+    ----------
+    cpus : sequence of int
+        Empty: whatever the process was started with.
+    priority : int
+        0: whatever the process was started with.
+    warn : callable
+        Takes a sentence, where the system refuses the priority: the node then runs without it.
+
+    Raises
+    ------
+    ParameterError
+        For a CPU that this machine does not have, or that this process may not run on.
+    """
+    if cpus:
+        _pin(cpus)
+    if priority:
+        _hurry(priority, warn)
+
+
+def _pin(cpus):
+    if not hasattr(os, "sched_setaffinity"):
+        raise ParameterError("cpu_affinity: this system can't bind a process to CPUs: leave it out")
+    count = os.cpu_count() or 1
+    for cpu in cpus:
+        if cpu >= count:
+            raise ParameterError(
+                f"cpu_affinity: {cpu} is not a CPU of this machine, whose CPUs are 0 to {count - 1}"
+            )
+    try:
+        _each(lambda thread: os.sched_setaffinity(thread, cpus))
+        refused = set(cpus) - os.sched_getaffinity(0)
+    except OSError:
+        refused = set(cpus)
+    if refused:
+        raise ParameterError(
+            f"cpu_affinity: this process may not run on CPU {', '.join(map(str, sorted(refused)))}: its container"
+            " or cpuset leaves it out"
+        )
+
+
+def _hurry(priority, warn):
+    if not hasattr(os, "sched_setscheduler"):
+        warn(f"realtime_priority {priority} is not taken: this system has no SCHED_FIFO")
+        return
+    # Threads that these make later begin with ordinary priority.
+    policy, how = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority)
+    try:
+        _each(lambda thread: os.sched_setscheduler(thread, policy, how))
+    except OSError as error:
+        warn(
+            f"realtime_priority {priority} is refused by the system ({error.strerror}), the node goes on at ordinary"
+            " priority: allow it by a line `@realtime - rtprio 99` in /etc/security/limits.conf (log in anew, `ulimit"
+            " -r` shows it), by `setcap cap_sys_nice+ep` on the Python interpreter or --cap-add=SYS_NICE"
+            " --ulimit rtprio=99 for a container, or leave realtime_priority at 0"
+        )
+
+
+def _each(change):
+    for thread in threads():
+        try:
+            change(thread)
+        except ProcessLookupError:  # it has ended meanwhile
+            continue

@@ -1,0 +1,100 @@
+"""Observer and controller in one process; processes that end with the one that started them."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+from harness import Bench
+from test_lockstep import without_identity
+
+from flexarm_bringup import closed_loop, lockstep, recorder
+from flexarm_bringup.processes import Processes, own_domain
+from flexarm_control import profiles
+
+SEPARATE = {"observer": ("observer",), "controller": ("controller",)}
+TOGETHER = {"observer_controller": ("observer", "controller")}
+
+
+def record(directory, nodes):
+    """Samples of the default control on R over 0.3 s of the paper's motion, in lockstep, and the exit codes."""
+    start = closed_loop.TRAJECTORY_START_NS
+    with own_domain() as domain, Processes(domain, directory) as processes:
+        for name, of in ({"simulator": ("simulator",)} | nodes).items():
+            given = {"arm": "R", "lockstep": True, "state_timeout": 60.0, "observer.type": "kalman"}
+            for node in of:
+                given |= recorder.keep_for_recording(node)
+            processes.start_node(name, given)
+        with lockstep.LockstepRun(processes) as line:
+            message = lockstep.trajectory_message(("joint1",), profiles.paper_profile(), 101, start)
+            samples = line.run(message, 0.3)[0]
+        return samples, processes.stop()
+
+
+def test_one_process_gives_every_sample_of_three_to_the_last_bit(tmp_path):
+    three, _ = record(tmp_path / "three", SEPARATE)
+    two, codes = record(tmp_path / "two", TOGETHER)
+    assert codes == {"simulator": 0, "observer_controller": 0}
+    three, two = without_identity(three), without_identity(two)
+    assert len(three["joint_torque"]) == 401
+    assert len({sample["torque"] for sample in three["joint_torque"]}) > 200  # it moves
+    for topic, messages in three.items():
+        assert two[topic] == messages, topic
+
+
+def test_both_nodes_of_one_process_keep_names_parameters_and_life_cycle(tmp_path):
+    with Bench(tmp_path) as bench:
+        cpu = max(os.sched_getaffinity(0))
+        given = {"arm": "R", "cpu_affinity": [cpu], "observer.type": "luenberger"}
+        process = bench.start("observer_controller", given)
+        assert bench.get("observer", "observer.type") == "luenberger"
+        assert bench.get("controller", "slow.kp") == [6.25]
+        assert bench.set("controller", slow__kp=[9.0])[0].successful
+        assert bench.get("controller", "slow.kp") == [9.0]
+        assert bench.get("observer", "slow.kp") is None
+        refusal = bench.set("observer", cpu_affinity=[0])[0]
+        assert not refusal.successful
+        for thread in os.listdir(f"/proc/{process.pid}/task"):
+            assert os.sched_getaffinity(int(thread)) == {cpu}
+        for node in ("observer", "controller"):
+            assert bench.lifecycle(node) == "active"
+        assert bench.change("controller", "deactivate")
+        assert bench.lifecycle("observer") == "active"
+
+
+PARENT = """
+import os, signal, sys
+from flexarm_bringup.processes import Processes, own_domain
+with own_domain() as domain, Processes(domain, sys.argv[1]) as processes:
+    for key in ("first", "second"):
+        print(processes.start_node("observer", {"arm": "R"}).pid, flush=True)
+        if key == "first":
+            sys.stdin.readline()  # it is told when the first one runs
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def alive(pid):
+    """Whether a process runs: not gone, and not a zombie that nobody has buried."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return not re.search(r"\) [ZX]", file.read())
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="PR_SET_PDEATHSIG is Linux's")
+def test_a_killed_parent_leaves_no_nodes_behind_running_or_just_started(tmp_path):
+    with Bench(tmp_path / "bench") as bench:
+        command = [sys.executable, "-c", PARENT, str(tmp_path)]
+        parent = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        first = int(parent.stdout.readline())
+        said = tmp_path / "observer.log"
+        bench.wait_for("the first node to run", lambda: "observer" in said.read_text())
+        assert alive(first)
+        second = int(parent.communicate("go\n")[0])
+        assert parent.wait() == -signal.SIGKILL
+        for pid in (first, second):
+            bench.wait_for(f"process {pid} to end", lambda pid=pid: not alive(pid))
