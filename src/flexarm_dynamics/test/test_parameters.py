@@ -196,8 +196,22 @@ def test_any_value_is_canonical_or_a_parameter_error(kind, value, size):
     if kind == "float_array":
         assert len(checked) == size
         assert all(type(v) is float and -5 <= v <= 5 for v in checked)
+    elif kind == "int_array":
+        assert all(type(v) is int and -5 <= v <= 5 for v in checked)
     elif kind == "string_array":
         assert all(isinstance(v, str) for v in checked)
     else:
         assert type(checked) is wanted[kind]
     assert parameter.check(checked, {"joints": size}) == checked
+
+
+def test_an_integer_array_names_the_element_that_is_none():
+    cpus = Parameter("cpus", "int_array", [], "Some numbers.", low=0, high=7)
+    assert cpus.check([]) == []
+    assert cpus.check([0, 7]) == [0, 7]
+    with pytest.raises(ParameterError, match=r"^cpus\[1\]: 8 is above its upper limit 7"):
+        cpus.check([0, 8])
+    with pytest.raises(ParameterError, match=r"^cpus\[0\]: 1.0 is not an integer"):
+        cpus.check([1.0])
+    with pytest.raises(ParameterError, match="not a list of integers"):
+        cpus.check(3)
