@@ -293,7 +293,7 @@ class Arm:
 
     def ready(self):
         """Whether the controller sends torque."""
-        return self.state.supervisor_state != CompositeState.INACTIVE
+        return self.state.supervisor_state not in (CompositeState.INACTIVE, CompositeState.FAULT)
 
     def wait_ready(self):
         """Until the controller sends torque, and every topic of the line has been found."""
@@ -334,6 +334,10 @@ class Arm:
         session = int(answer.message.split()[-1])
         self.wait_standing(session=session)
         return session
+
+    def recover(self):
+        """Call ~/recover; whether there was a fault."""
+        return self.bench.call(Trigger, f"{self.namespace}controller/recover").success
 
     def publish_trajectory(self, message):
         """Publish on joint_trajectory, once."""
@@ -417,8 +421,13 @@ class Source:
         values = {"arm": arm, **settings}
         return simulator.Simulator(check_all(simulator.PARAMETERS, values, {"joints": 1}))
 
+    def recover(self):
+        """Call the controller's ~/recover; whether there was a fault."""
+        return self.bench.call(Trigger, "controller/recover").success
+
     def restart(self):
-        """A new session from rest."""
+        """A new session from rest, without a fault."""
+        self.recover()
         self.sim.reset()
         self.session, self.sequence = (self.session + 1) % 2**32, 0
 

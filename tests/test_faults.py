@@ -24,7 +24,7 @@ def line(tmp_path_factory):
     with Bench(tmp_path_factory.mktemp("log")) as bench:
         file = parameter_files.find("paper_composite")
         bench.start("observer", file=file)
-        bench.start("controller", file=file)
+        bench.start("controller", {"state_timeout": 60.0}, file=file)
         source = Source(bench)
         bench.publisher(ArmState, "arm_state_estimate")
         source.step()
@@ -77,17 +77,21 @@ BAD_STATES = {
 
 
 @pytest.mark.parametrize("case", BAD_STATES)
-def test_a_bad_state_disables_the_torque_with_a_reason_and_a_good_one_enables_it_again(
-    source, case
-):
+def test_a_bad_state_is_a_fault_with_a_reason_until_recover_is_called(source, case):
     changes, reason = BAD_STATES[case]
     torque, state = source.step(**changes)
     assert torque.mode == JointTorque.DISABLED
     assert list(torque.torque) == [0.0]
-    assert state.supervisor_state == CompositeState.INACTIVE
-    assert state.rejected_reason
+    assert state.supervisor_state == CompositeState.FAULT
+    said = state.rejected_reason
+    assert said
     # The observer says what it is; the controller does where it concerns the joints.
     assert re.search(reason, source.bench.log("observer")), source.bench.log("observer")
+    # Good states alone do not bring the torque back.
+    torque, state = source.step()
+    assert torque.mode == JointTorque.DISABLED
+    assert (state.supervisor_state, state.rejected_reason) == (CompositeState.FAULT, said)
+    assert source.recover()
     torque, state = source.until_enabled(most=3)
     assert state.rejected_reason == ""
     assert state.supervisor_state == CompositeState.READY
@@ -97,6 +101,7 @@ def test_a_bad_state_disables_the_torque_with_a_reason_and_a_good_one_enables_it
 def test_bad_joints_are_named_in_controller_state_too(source):
     _, state = source.step(joint_position=[NAN])
     assert "joint_position of joint1 is nan" in state.rejected_reason
+    source.recover()
     _, state = source.step(joint_names=["elbow"])
     assert "missing joint1; unknown elbow" in state.rejected_reason
 
@@ -106,6 +111,7 @@ def test_a_stream_of_bad_states_does_not_flood_the_log(source):
     for i in range(30):
         source.step(joint_position=[1e7 + i], joint_names=["joint1"])
     assert len(source.bench.log("observer").splitlines()) - before <= 2
+    source.recover()
     source.until_enabled(most=3)
 
 
@@ -171,25 +177,40 @@ def test_a_repeated_sequence_is_answered_from_before_and_moves_no_filter(source)
     assert repeated == plain
 
 
-def test_an_older_sequence_disables_and_the_stream_goes_on(source):
+def test_an_older_sequence_is_left_out_and_the_loop_goes_on(source):
     old = source.state()
     source.step()
     source.step()
-    torque, state = source.exchange(old)
-    assert torque.mode == JointTorque.DISABLED and state.rejected_reason
-    assert "is not newer than" in source.bench.log("observer")
+    told = len(source.torques.messages)
+    source.bench.publisher(ArmState, "arm_state").publish(old)
     torque, state = source.step()
     assert torque.mode == JointTorque.ENABLED
     assert state.supervisor_state == CompositeState.READY
+    later = [m.sequence for m in source.torques.messages[told:]]
+    assert old.sequence not in later, "what was answered is answered again"
 
 
-def test_a_stamp_that_goes_back_disables(source):
+def test_a_stamp_that_goes_back_is_a_fault(source):
     message = source.state()
     message.header.stamp.sec = 0
     torque, state = source.exchange(message)
-    assert torque.mode == JointTorque.DISABLED and state.rejected_reason
+    assert torque.mode == JointTorque.DISABLED
+    assert state.supervisor_state == CompositeState.FAULT
+    assert "clock went back by 0.999 s" in state.rejected_reason
     source.sim.advance(None)
-    source.until_enabled(most=3)
+    source.recover()
+    source.until_enabled()
+
+
+def test_a_stamp_that_jumps_ahead_is_a_fault(source):
+    message = source.state()
+    message.header.stamp.sec += 3600
+    torque, state = source.exchange(message)
+    assert torque.mode == JointTorque.DISABLED
+    assert state.supervisor_state == CompositeState.FAULT
+    assert "jumped ahead by 3.6e+03 s" in state.rejected_reason
+    source.restart()
+    source.until_enabled()
 
 
 def test_a_gap_in_the_sequence_is_bridged(source):
@@ -251,6 +272,8 @@ def test_the_controller_trusts_no_observer_either(source, changes):
     source.restart()
     assert estimate(source).mode == JointTorque.ENABLED
     assert estimate(source, **changes).mode == JointTorque.DISABLED
+    assert estimate(source).mode == JointTorque.DISABLED
+    assert source.recover()
     assert estimate(source).mode == JointTorque.ENABLED
 
 
@@ -418,13 +441,15 @@ def real_time(real_time_bench):
         if name not in real_time_bench.processes.running:
             real_time_bench.start(name, parameters)
     arm, seen = real_time_bench.arm, len(real_time_bench.arm.torques.messages)
+    arm.recover()
     real_time_bench.wait_for("the loop", lambda: len(arm.torques.messages) > seen + 20)
     arm.wait_ready()
     return arm
 
 
 def works(arm, by=0.2):
-    """The loop makes a small motion from where it is."""
+    """Once recovered, the loop makes a small motion from where it is."""
+    arm.recover()
     arm.wait_ready()
     goal = arm.state.reference_position[0] + by
     arm.offer(trajectory(J, (0.5, [goal], [0.0], [0.0])))
@@ -492,7 +517,6 @@ def test_when_the_observer_is_killed_the_controller_disables_after_state_timeout
         ),
     )
     bench.start("observer", PARAMETERS["observer"])
-    bench.wait_for("torque again", lambda: real_time.torques.newest.mode == JointTorque.ENABLED)
     works(real_time)
 
 
@@ -502,6 +526,9 @@ def test_a_simulator_that_is_killed_and_restarted_is_a_new_session_and_the_loop_
     bench.kill("simulator")
     bench.wait_for("DISABLED", lambda: real_time.torques.newest.mode == JointTorque.DISABLED)
     bench.start("simulator", PARAMETERS["simulator"])
+    bench.wait_for("a fault that stays", lambda: real_time.state.session != session)
+    assert real_time.state.supervisor_state == CompositeState.FAULT
+    assert real_time.recover()
     bench.wait_for(
         "a new session, READY",
         lambda: (

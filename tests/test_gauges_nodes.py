@@ -24,7 +24,7 @@ def line(tmp_path_factory):
     with Bench(tmp_path_factory.mktemp("log")) as bench:
         own = {"observer.calibration_samples": SAMPLES, "observer.stuck_samples": 10}
         bench.start("observer", {"arm": "R_lab", **own})
-        bench.start("controller", {"arm": "R_lab", "fast.type": "none"})
+        bench.start("controller", {"arm": "R_lab", "fast.type": "none", "state_timeout": 60.0})
         source = Source(bench, "R_lab")
         source.observed = bench.tap(ObserverState, "observer/state")
         yield source
@@ -123,12 +123,13 @@ def test_the_loop_goes_on_without_one_gauge_or_two_and_stops_without_three(sourc
     source.bench.wait_for("a warning that names both", warned)
     torque, state = source.step(**without(root=math.nan, middle=1.0, quarter=math.inf))
     assert torque.mode == JointTorque.DISABLED
-    assert state.supervisor_state == CompositeState.INACTIVE
+    assert state.supervisor_state == CompositeState.FAULT
     assert re.search(
         r"strain of root is nan \(missing\), strain of quarter is inf \(missing\), strain of middle is 1\.0"
         r" \(saturated\): without, the gauges \(three_quarter\) can't give link1_y_mode1, link1_y_mode2",
         source.bench.log("observer"),
     )
+    source.recover()
     source.until_enabled(most=3, **READ)
 
 

@@ -241,7 +241,7 @@ def loop(shared_bench):
     bench, file = shared_bench, parameter_files.find("paper_composite")
     bench.start("simulator", {**LOCKSTEP, "pause_at": 0.01}, file=file)
     bench.start("observer", file=file)
-    bench.start("controller", file=file)
+    bench.start("controller", {"state_timeout": 60.0}, file=file)
     arm = Arm(bench, pauses_at=10)
     arm.wait_standing()
     return arm

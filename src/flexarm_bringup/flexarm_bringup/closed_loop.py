@@ -5,11 +5,12 @@ from collections import deque
 import numpy as np
 
 from flexarm_control.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
-from flexarm_control.arm_controller import START_TOLERANCE, ArmController, Supervisor
+from flexarm_control.arm_controller import START_TOLERANCE, ArmController
 from flexarm_control.arm_observer import observe
 from flexarm_control.composite import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.composite import design, typed
 from flexarm_control.samples import ArmSample
+from flexarm_control.supervisor import State
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.arm import Arm
 from flexarm_dynamics.errors import FlexarmError, MessageError, ModelError
@@ -64,7 +65,7 @@ class ClosedLoop:
         delay=0.0,
     ):
         known = arm if isinstance(arm, Arm) else arm_file.load(arm)
-        sizes = {"joints": len(known.joints)}
+        sizes = {"joints": len(known.joints), "modes": len(known.modes)}
         settings = check_all(SIMULATOR_PARAMETERS, {"arm": known.name, **(simulator or {})}, sizes)
         settings["arm"] = known
         if plant_arm is not None:
@@ -77,7 +78,7 @@ class ClosedLoop:
         if chosen:
             chosen.setdefault("rate", 1e9 / self.simulator.period_ns)
         declared = (*CONTROLLER_PARAMETERS, START_TOLERANCE)
-        limits = check_all(declared, given, {"joints": model.n_joints})
+        limits = check_all(declared, given, sizes)
         law = design(model, slow, fast, manifold, chosen or None)
         self.controller = ArmController(model, law, limits, limits.pop("start_tolerance"))
         n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
@@ -143,7 +144,7 @@ class ClosedLoop:
         try:
             return self.controller.step(self.estimate(measured))
         except MessageError as error:
-            self.controller.disable(str(error))
+            self.controller.distrust(str(error))
             return False
 
     def _advance(self, torque):
@@ -235,7 +236,7 @@ class ClosedLoop:
         """Why the arm does not follow the trajectory any more; empty if it does."""
         controller, plant = self.controller, self.simulator.plant
         reference = controller.reference
-        if controller.state in (Supervisor.INACTIVE, Supervisor.FAULT) or not (
+        if controller.state in (State.INACTIVE, State.FAULT) or not (
             reference.active or reference.finished or reference.stopping
         ):
             return controller.reason or f"supervisor in state {controller.state.name}"

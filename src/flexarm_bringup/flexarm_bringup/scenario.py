@@ -13,11 +13,12 @@ import yaml
 
 from flexarm_control import trajectory
 from flexarm_control.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
-from flexarm_control.arm_controller import START_TOLERANCE, Supervisor
+from flexarm_control.arm_controller import START_TOLERANCE
 from flexarm_control.arm_observer import OBSERVERS
 from flexarm_control.arm_observer import PARAMETERS as OBSERVER_PARAMETERS
 from flexarm_control.composite import FAST, MANIFOLD, SLOW
 from flexarm_control.composite import PARAMETERS as DESIGN_PARAMETERS
+from flexarm_control.supervisor import State
 from flexarm_control.trajectory import specs
 from flexarm_dynamics import arm_file, registry
 from flexarm_dynamics.arm import Arm, scaled
@@ -318,7 +319,7 @@ def _metrics(scenario, loop, record, end, duration):
     found = {
         "lost": bool(loop.lost),
         "reason": loop.lost,
-        "state": Supervisor(record.state[-1]).name,
+        "state": State(record.state[-1]).name,
         "motion_s": end,
         "simulated_s": float(record.time[-1]),
     }

@@ -141,6 +141,7 @@ class ArmObserver:
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self._measured, self._derivative = np.zeros(n), np.zeros(n)
         self._mapped, self._used = np.zeros(m), np.zeros(m)
+        self._nothing = np.zeros(0)
         self._motion = Motion(model)
         self._order = SampleOrder()
         self.reason = ""
@@ -151,7 +152,7 @@ class ArmObserver:
         Parameters
         ----------
         sample : ArmSample
-            Its `amplitude` is filled in from the strains when it is None.
+            Its `amplitude` is filled in from the strains when it is None; for an arm without modes there is none.
 
         Returns
         -------
@@ -165,16 +166,17 @@ class ArmObserver:
             When the sample can't be used; the estimate stays as it was.
         """
         last_stamp = self._order.stamp_ns
+        if sample.amplitude is None and not self.model.n_modes:
+            sample.amplitude = self._nothing  # on a topic no amplitudes and unknown ones look alike
         self._check(sample)
         verdict = self._order.judge(sample)
         if verdict == SampleOrder.REPEAT:
             return self.observer.converged
-        if verdict == SampleOrder.STALE:
-            raise MessageError(
-                f"state {sample.sequence} of {sample.stamp_ns * 1e-9:.6f} s is not newer than"
-                f" {self._order.sequence} of {last_stamp * 1e-9:.6f} s: left out"
-            )
-        restart = verdict == SampleOrder.RESTART
+        if verdict in (SampleOrder.STALE, SampleOrder.FOREIGN):
+            raise MessageError(self._left_out(sample, verdict))
+        # After a clock that jumped, or a long silence, there is nothing to go on from.
+        gap = sample.stamp_ns - last_stamp > LONGEST_GAP
+        restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
         self._map_strain(sample, restart)
         if restart:
             self.observer.reset()
@@ -195,6 +197,12 @@ class ArmObserver:
             self.calibration.push(sample)
         self._pass_on(sample)
         return self.observer.converged
+
+    def _left_out(self, sample, verdict):
+        order = self._order
+        if verdict == SampleOrder.FOREIGN:
+            return f"two sources send states (sessions {order.session} and {sample.session}): stop one of them"
+        return f"state {sample.sequence} is not newer than {order.sequence}: left out"
 
     def _map_strain(self, sample, restart):
         """Judge the gauges, and fill in the amplitudes where they are this observer's to make."""
@@ -266,6 +274,13 @@ class ArmObserver:
             raise MessageError(
                 f"observer {name} failed: {type(error).__name__}: {error}"
             ) from error
+        observer = self.observer
+        if not (np.isfinite(observer.amplitude).all() and np.isfinite(observer.rate).all()):
+            # From what is no number it would never come back.
+            observer.reset()
+            raise MessageError(
+                f"observer {type(observer).__name__} has lost the arm: its estimate is not finite; it begins anew"
+            )
 
     def _check(self, sample):
         arm = self.model.arm
@@ -283,6 +298,12 @@ class ArmObserver:
                 )
         if sample.rate is not None:
             check_finite(sample.rate, self.model.mode_names, "modal_rate")
+        wild = np.abs(sample.torque) >= HUGE_TORQUE  # false for NaN, which means unknown
+        if wild.any():
+            i = int(np.argmax(wild))
+            raise MessageError(
+                f"joint_torque of {self.model.joint_names[i]} is {sample.torque[i]}: no torque of an arm"
+            )
 
     def _joint_velocity(self, sample, dt):
         """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""
@@ -292,10 +313,14 @@ class ArmObserver:
         return slope + (self._derivative - slope) * np.exp(-self.bandwidth * dt)
 
 
+#: After a longer silence an observer starts afresh [ns].
+LONGEST_GAP = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].
 LONGEST_PREDICTION = 0.01
 #: Values beyond this are no measurement of an arm (rad, m, and their rates).
 HUGE = 1e6
+#: Torques beyond this are none [N m].
+HUGE_TORQUE = 1e9
 
 
 def check_finite(values, names, field):

@@ -72,10 +72,13 @@ class CompositeControl:
         delta_bar of the manifold [m, rad].
     deviation : ndarray, shape (2m,)
         z_f = z - z_bar [m, rad, m/s, rad/s].
+    fast_share : float
+        What part of the fast torque takes part, 0 to 1.
     """
 
     def __init__(self, model, slow, fast, manifold=None, feedforward=None):
         self.model, self.slow, self.fast = model, slow, fast
+        self.fast_share = 1.0
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = feedforward
         if feedforward is not None:
@@ -103,12 +106,17 @@ class CompositeControl:
         ):
             if mine is not None and its is not None:
                 mine.resume(its)
-        self.limit = other.limit
+        self.limit, self.fast_share = other.limit, other.fast_share
 
     @property
     def needs_rates(self):
         """Whether the rates of the deflections are needed: an observer."""
         return self.fast.needs_rates
+
+    @property
+    def free(self):
+        """Whether no law holds the joints to the reference."""
+        return self.slow.drifts
 
     def reset(self):
         """A new session begins: the laws forget their own states."""
@@ -151,7 +159,7 @@ class CompositeControl:
             self.deviation[m:] = np.nan
         else:
             np.subtract(delta_d, rate, out=self.deviation[m:])
-        self.fast_torque[:] = self.fast.torque(self.deviation, q)
+        np.multiply(self.fast.torque(self.deviation, q), self.fast_share, out=self.fast_torque)
         np.add(self.slow_torque, self.fast_torque, out=self.torque)
         return self.torque
 

@@ -1,5 +1,7 @@
 """One sample of the arm, as plain arrays: what observers and controllers work on."""
 
+from collections import deque
+
 import numpy as np
 
 
@@ -55,25 +57,41 @@ WRAP = 2**32
 
 
 class SampleOrder:
-    """Tells new samples from repeats, restarts and those out of order; by number, never by a clock."""
+    """Tells new samples from all others; by number and stamp, never by a clock.
 
-    NEW, REPEAT, RESTART, STALE = range(4)
+    NEW; REPEAT: the last one again; RESTART: of a session not seen before; STALE: an older one of this session;
+    JUMP: a later number with a stamp that is not later: the source's clock went back; FOREIGN: of a session that
+    was left for the present one, so that two sources send.
+    """
+
+    NEW, REPEAT, RESTART, STALE, JUMP, FOREIGN = range(6)
+    #: A session that was left, or numbers from before, are the present ones after so many samples without others.
+    ALONE = 200
 
     def __init__(self):
         self.session, self.sequence, self.stamp_ns = None, -1, 0
+        self._left, self._other = deque(maxlen=16), 0
 
     def judge(self, sample):
         """Class of `sample` beside the last one taken."""
         if sample.session != self.session:
-            return self.RESTART
+            return self._or_restart(self.FOREIGN) if sample.session in self._left else self.RESTART
         ahead = (sample.sequence - self.sequence) % WRAP  # a uint32 wraps after 50 days at 1 kHz
+        if ahead >= WRAP // 2:
+            return self._or_restart(self.STALE)
+        self._other = 0
         if ahead == 0:
             return self.REPEAT
-        if ahead >= WRAP // 2 or sample.stamp_ns <= self.stamp_ns:
-            return self.STALE
-        return self.NEW
+        return self.NEW if sample.stamp_ns > self.stamp_ns else self.JUMP
+
+    def _or_restart(self, verdict):
+        self._other += 1
+        return verdict if self._other < self.ALONE else self.RESTART
 
     def take(self, sample):
         """Remember `sample` as the last one."""
+        if sample.session != self.session and self.session is not None:
+            self._left.append(self.session)
+        self._other = 0
         self.session, self.sequence = sample.session, sample.sequence
         self.stamp_ns = sample.stamp_ns

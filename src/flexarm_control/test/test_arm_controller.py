@@ -1,5 +1,6 @@
 """The controller of an arm: its states, what it answers to a bad sample, its limits."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,11 +8,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control import trajectory
-from flexarm_control.arm_controller import PARAMETERS, ArmController, Supervisor
+from flexarm_control.arm_controller import PARAMETERS, ArmController
 from flexarm_control.composite import design
 from flexarm_control.samples import ArmSample
-from flexarm_dynamics.arm import Limits
-from flexarm_dynamics.errors import DesignError
+from flexarm_control.supervisor import State
+from flexarm_dynamics import arm_file
+from flexarm_dynamics.errors import DesignError, ParameterError
+from flexarm_dynamics.model import build
 from flexarm_dynamics.parameters import check_all
 from flexarm_dynamics.units import POUND_FORCE_FOOT
 
@@ -37,7 +40,7 @@ def sample(k=0, position=0.0, session=1, n=1, **fields):
 
 def controller(model, law=None, **settings):
     law = law or design(model, SLOW, FAST)
-    checked = check_all(PARAMETERS, settings, {"joints": model.n_joints})
+    checked = check_all(PARAMETERS, settings, {"joints": model.n_joints, "modes": model.n_modes})
     return ArmController(model, law, checked)
 
 
@@ -69,6 +72,7 @@ class Scripted:
     def __init__(self, *torques):
         self.torques = list(torques)
         self.needs_rates, self.limit, self.feedforward = True, None, None
+        self.free, self.fast_share = False, 1.0
 
     def reset(self):
         pass
@@ -85,13 +89,13 @@ class Scripted:
 
 def test_states_go_from_inactive_over_ready_and_tracking_to_holding(arm_r):
     core, seen = controller(arm_r), []
-    assert core.state == Supervisor.INACTIVE
+    assert core.state == State.INACTIVE
     for k in range(40):
         assert core.step(sample(k)) is True
         seen.append(core.state)
         if k == 4:
             assert core.offer(motion(at_ns=stamp(10))).accepted
-    R, T, H = Supervisor.READY, Supervisor.TRACKING, Supervisor.HOLDING
+    R, T, H = State.READY, State.TRACKING, State.HOLDING
     assert seen == [R] * 10 + [T] * 20 + [H] * 10
     assert_array_equal(core.reference.position, [0.1])
 
@@ -102,13 +106,13 @@ def test_a_second_motion_leads_from_holding_to_tracking_and_back(arm_r):
     core.offer(motion())
     for k in range(1, 30):
         core.step(sample(k))
-    assert core.state == Supervisor.HOLDING
+    assert core.state == State.HOLDING
     assert core.offer(motion(end=0.3, start=0.1)).trajectory_id == core.trajectory_id == 2
     core.step(sample(30))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     for k in range(31, 60):
         core.step(sample(k))
-    assert core.state == Supervisor.HOLDING
+    assert core.state == State.HOLDING
     assert_array_equal(core.reference.position, [0.3])
 
 
@@ -120,7 +124,7 @@ def test_ready_holds_the_joint_where_it_was_found(arm_r):
     core.step(sample(1, position=0.69))
     assert_allclose(core.position_error, [0.01], rtol=1e-12)
     assert core.torque[0] > 0.0
-    assert core.state == Supervisor.READY
+    assert core.state == State.READY
 
 
 def test_the_torque_is_that_of_the_composite_control(arm_r):
@@ -168,29 +172,83 @@ def test_a_new_session_starts_at_the_measured_position_with_no_trajectory(arm_r)
     core.offer(motion())
     for k in range(51, 60):
         core.step(sample(k))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     # earlier stamps and numbers: the simulator was reset
     for k in range(40):
         assert core.step(sample(k, 0.02, session=2)) is True
-        assert core.state == Supervisor.READY
+        assert core.state == State.READY
         assert_array_equal(core.reference.position, [0.02])
 
 
-def test_an_older_sample_disables_and_the_next_one_is_ready_again(arm_r):
-    for stale in (
-        sample(3),
-        sample(4, stamp_ns=stamp(6)),
-        sample(7, stamp_ns=stamp(5)),
-        sample(8, stamp_ns=stamp(1)),
-    ):
+def test_a_sample_that_comes_after_a_later_one_needs_no_answer_and_changes_nothing(arm_r):
+    core, clean = controller(arm_r), controller(arm_r)
+    for c in (core, clean):
+        c.step(sample(4))
+        c.offer(motion())
+        c.step(sample(5, 0.001))
+    for stale in (sample(3), sample(4, np.nan), sample(4, stamp_ns=stamp(6))):
+        assert core.step(stale) is None
+        assert answer(core) == answer(clean)
+    assert core.late == 3
+    assert core.step(sample(6, 0.002)) is clean.step(sample(6, 0.002)) is True
+    assert answer(core) == answer(clean)
+
+
+def test_a_source_that_counts_anew_in_its_session_is_followed_after_a_while(arm_r):
+    core = controller(arm_r)
+    core.step(sample(5000))
+    late = [core.step(sample(k, 0.3, stamp_ns=stamp(6000 + k))) for k in range(300)]
+    assert late[:199] == [None] * 199 and late[199:] == [True] * 101
+    assert_array_equal(core.reference.position, [0.3])
+
+
+@pytest.mark.parametrize("back", [sample(7, stamp_ns=stamp(5)), sample(8, stamp_ns=stamp(1))])
+def test_a_clock_that_goes_back_is_a_fault_and_after_recovery_the_new_time_counts(arm_r, back):
+    core = controller(arm_r)
+    core.step(sample(5))
+    assert core.step(back) is False
+    assert core.state == State.FAULT
+    assert "clock went back by 0" in core.reason
+    again = sample(back.sequence + 1, 0.2, stamp_ns=back.stamp_ns + MS)
+    assert core.step(again) is False
+    assert core.recover() and core.state == State.INACTIVE
+    assert core.step(sample(back.sequence + 2, 0.2, stamp_ns=back.stamp_ns + 2 * MS)) is True
+    assert (core.state, core.reason) == (State.READY, "")
+    assert_array_equal(core.reference.position, [0.2])
+
+
+def test_a_stamp_that_jumps_ahead_is_a_fault_a_short_gap_is_bridged(arm_r):
+    core = controller(arm_r, max_gap=0.1)
+    core.step(sample(0))
+    assert core.step(sample(100)) is True
+    assert core.missed == 99
+    assert core.step(sample(201)) is False
+    assert core.state == State.FAULT
+    assert "jumped ahead by 0.101 s, max_gap is 0.1 s; 100 states are missing" in core.reason
+
+
+def test_two_sources_are_a_fault(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0, session=1))
+    assert core.step(sample(0, session=2)) is True  # a restart
+    assert core.step(sample(1, session=1)) is False
+    assert core.state == State.FAULT
+    assert "two sources send states (sessions 2 and 1)" in core.reason
+    # The one that stays may be either.
+    core.recover()
+    verdicts = [core.step(sample(k, session=1)) for k in range(2, 250)]
+    assert not any(verdicts[:190]) and all(verdicts[200:])
+
+
+def test_with_synchronised_clocks_an_old_state_or_one_of_the_future_is_a_fault(arm_r):
+    for now, why in ((stamp(152), "0.151 s old"), (stamp(-150), "0.151 s from the future")):
+        core = controller(arm_r, synchronised_clocks=True)
+        assert core.step(sample(0), stamp(99)) is True
+        assert core.step(sample(1), now) is False
+        assert core.state == State.FAULT and why in core.reason
+        # Without, stamps are no business of this clock.
         core = controller(arm_r)
-        core.step(sample(5))
-        assert core.step(stale) is False
-        assert core.state == Supervisor.INACTIVE
-        assert "not newer than 5" in core.reason
-        assert core.step(sample(9)) is True
-        assert core.state == Supervisor.READY
-        assert core.reason == ""
+        assert core.step(sample(0), stamp(10**9)) is True
 
 
 # --------------------------------------------------------------------------- unusable samples
@@ -206,38 +264,54 @@ BAD = {
 
 
 @pytest.mark.parametrize("reason", BAD)
-def test_an_unusable_sample_disables_with_the_reason_and_forgets_the_trajectory(arm_r, reason):
+def test_an_unusable_sample_is_a_fault_with_the_reason_and_forgets_the_trajectory(arm_r, reason):
     core = controller(arm_r)
     core.step(sample(0))
     core.offer(motion(end=0.1, duration=0.5))
     for k in range(1, 10):
         core.step(sample(k, 0.05))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     assert abs(core.torque[0]) > 0.1
     for _ in range(2):  # sent again, the answer is the same
         assert core.step(sample(10, **BAD[reason])) is False
         assert core.enabled is False
-        assert core.state == Supervisor.INACTIVE
+        assert core.state == State.FAULT
         assert reason in core.reason
         assert_array_equal(core.torque, [0.0])
         assert core.saturated is False
-    for k in range(11, 60):
+    for k in range(11, 20):  # latched
+        assert core.step(sample(k, 0.05)) is False
+    assert core.recover() is True
+    assert core.recover() is False
+    for k in range(20, 60):
         assert core.step(sample(k, 0.06)) is True
-        assert core.state == Supervisor.READY
+        assert core.state == State.READY
         assert core.reason == ""
         assert_array_equal(core.reference.position, [0.06])
         assert_array_equal(core.torque, [0.0])
 
 
-def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready(arm_r):
+@pytest.mark.parametrize("reason", BAD)
+def test_before_the_first_torque_an_unusable_sample_is_no_fault(arm_r, reason):
+    core = controller(arm_r)
+    assert core.step(sample(0, **BAD[reason])) is False
+    assert core.state == State.INACTIVE
+    assert reason in core.reason
+    assert core.step(sample(1)) is True
+
+
+def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready_once_recovered(arm_r):
     core = controller(arm_r)
     core.step(sample(0))
     core.step(sample(1, 0.2))
-    core.disable("no arm_state_estimate for 0.5 s")
+    core.distrust("no arm_state_estimate for 0.5 s")
     assert (core.enabled, core.reason) == (False, "no arm_state_estimate for 0.5 s")
+    assert core.state == State.FAULT
     assert_array_equal(core.torque, [0.0])
+    assert core.step(sample(1, 0.2)) is False
+    core.recover()
     assert core.step(sample(1, 0.2)) is True
-    assert core.state == Supervisor.READY
+    assert core.state == State.READY
     assert_array_equal(core.reference.position, [0.2])
 
 
@@ -248,17 +322,18 @@ def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready(arm_r):
     "error", [ZeroDivisionError("by zero"), KeyError("gain"), DesignError("late"), ValueError()]
 )
 def test_whatever_a_law_raises_disables_naming_it(arm_r, error):
-    core = controller(arm_r, Scripted(3.0, error, error, 4.0))
+    core = controller(arm_r, Scripted(3.0, error, 4.0))
     core.step(sample(0))
     core.offer(motion(end=5.0, duration=9.0))
     assert core.torque[0] == 3.0
     for _ in range(2):
         assert core.step(sample(1, 0.2)) is False
-        assert core.state == Supervisor.INACTIVE
+        assert core.state == State.FAULT
         assert f"{type(error).__name__}: {error}" in core.reason
         assert_array_equal(core.torque, [0.0])
+    core.recover()
     assert core.step(sample(2, 0.3)) is True
-    assert core.state == Supervisor.READY
+    assert core.state == State.READY
     assert_array_equal(core.reference.position, [0.3])
     assert_array_equal(core.torque, [4.0])
 
@@ -269,7 +344,7 @@ def test_a_torque_that_is_no_number_disables_naming_the_joint(arm_r, value):
     core.step(sample(0))
     assert core.step(sample(1)) is False
     assert core.reason == f"torque of joint1 came out as {value}"
-    assert core.state == Supervisor.INACTIVE
+    assert core.state == State.FAULT
     assert_array_equal(core.torque, [0.0])
 
 
@@ -324,25 +399,34 @@ def test_after_a_disable_the_rate_limit_starts_from_no_torque(arm_r):
     core.step(sample(1))
     assert_allclose(core.torque, [8.0])
     core.step(sample(2, np.nan))
+    core.recover()
     core.step(sample(3))
     assert_array_equal(core.torque, [0.0])
     core.step(sample(4))
     assert_allclose(core.torque, [8.0])
 
 
-def test_each_joint_has_its_own_limits(arm_r):
-    joints = [SimpleNamespace(limits=Limits(torque=t)) for t in (5.0, np.inf)]
-    arm = SimpleNamespace(joints=joints)
-    two = SimpleNamespace(
-        arm=arm, joint_names=("a", "b"), mode_names=arm_r.mode_names, n_joints=2, n_modes=2
-    )
+def test_each_joint_has_its_own_limits():
+    arm = arm_file.load("two_link")
+    joints = [
+        replace(joint, limits=replace(joint.limits, torque=most))
+        for joint, most in zip(arm.joints, (5.0, np.inf), strict=True)
+    ]
+    two = build(replace(arm, joints=tuple(joints)))
+    m = two.n_modes
+
+    def still(k):
+        s = sample(k, n=2)
+        s.amplitude, s.rate = np.zeros(m), np.zeros(m)
+        return s
+
     law = Scripted([9.0, 9.0], [9.0, -9.0], [9.0, 1e9])
     core = controller(two, law, torque_rate_limit=[1000.0, 0.0])
-    core.step(sample(0, n=2))  # the first, from rest, in no time: the limited joint stays at 0
+    core.step(still(0))  # the first, from rest, in no time: the limited joint stays at 0
     assert_array_equal(core.torque, [0.0, 9.0])
-    core.step(sample(1, n=2))
+    core.step(still(1))
     assert_allclose(core.torque, [1.0, -9.0])
-    core.step(sample(2, n=2))
+    core.step(still(2))
     assert_allclose(core.torque, [2.0, 1e9])
     assert core.saturated is True
 
@@ -351,7 +435,7 @@ def test_limits_can_change_between_two_samples(arm_r):
     core = controller(arm_r, Scripted(9.0, 9.0))
     core.step(sample(0))
     assert_array_equal(core.torque, [9.0])
-    core.configure(check_all(PARAMETERS, {"torque_limit": [1.0]}, {"joints": 1}))
+    core.configure(check_all(PARAMETERS, {"torque_limit": [1.0]}, {"joints": 1, "modes": 2}))
     core.step(sample(1))
     assert_array_equal(core.torque, [1.0])
 
@@ -373,7 +457,9 @@ def test_a_trajectory_is_refused_after_a_disable_saying_why(arm_r):
     core.step(sample(1, np.nan))
     verdict = core.offer(motion())
     assert not verdict.accepted
-    assert "joint_position of joint1 is nan" in verdict.reason
+    assert "in fault, call ~/recover first: joint_position of joint1 is nan" in verdict.reason
+    core.recover()
+    assert "no valid state: none yet" in core.offer(motion()).reason
 
 
 def test_a_refused_trajectory_leaves_the_present_one_and_shows_until_the_next_is_accepted(arm_r):
@@ -384,7 +470,7 @@ def test_a_refused_trajectory_leaves_the_present_one_and_shows_until_the_next_is
     assert core.offer(motion(start=2.0)).accepted is False
     assert "start_tolerance" in core.reason
     core.step(sample(2))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     assert "start_tolerance" in core.reason
     core.refuse("joint_names: not this arm's")
     assert core.reason == "joint_names: not this arm's"
@@ -398,6 +484,7 @@ def test_why_the_state_is_bad_comes_before_why_a_trajectory_was_refused(arm_r):
     core.refuse("no points")
     core.step(sample(1, np.nan))
     assert "joint_position" in core.reason
+    core.recover()
     core.step(sample(2))
     assert core.reason == "no points"
 
@@ -422,7 +509,7 @@ def test_a_trajectory_stamped_zero_starts_at_the_first_state_after_it(arm_r):
     core.offer(motion(duration=0.02))
     core.step(sample(0))  # a repeat is no later state
     core.step(sample(5))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     assert_array_equal(core.reference.position, [0.0])
     core.step(sample(15))
     assert_allclose(core.reference.position, [0.05], rtol=1e-12)
@@ -436,7 +523,7 @@ def converging(arm_r, *samples):
     core = controller(arm_r)
     for s in samples:
         assert core.step(s) is False
-        assert core.state == Supervisor.INACTIVE
+        assert core.state == State.INACTIVE
         assert core.reason == "modal_rate is not known yet"
     return core
 
@@ -455,7 +542,7 @@ def test_a_trajectory_offered_while_converging_is_kept_and_starts_at_its_stamp(a
         assert core.step(sample(k)) is True
         assert core.reference.position[0] == 0.0
     core.step(sample(15))
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
     assert core.reference.position[0] != 0.0
 
 
@@ -466,7 +553,7 @@ def test_one_with_stamp_0_starts_with_the_first_torque(arm_r):
         core.step(unknown(k))
     assert core.step(sample(50)) is True
     assert core.reference.position[0] == 0.0
-    assert core.state == Supervisor.TRACKING
+    assert core.state == State.TRACKING
 
 
 def test_one_whose_start_passed_meanwhile_is_given_up_with_the_reason(arm_r):
@@ -476,7 +563,7 @@ def test_one_whose_start_passed_meanwhile_is_given_up_with_the_reason(arm_r):
         core.step(unknown(k))
     for k in range(20, 200):
         assert core.step(sample(k)) is True
-        assert core.state == Supervisor.READY
+        assert core.state == State.READY
         assert core.reference.position[0] == 0.0
     assert "before the observer had converged" in core.reason
 
@@ -496,4 +583,171 @@ def test_a_new_session_while_converging_forgets_what_was_offered(arm_r):
     core.offer(motion())
     core.step(unknown(0, session=2))
     assert core.step(sample(1, session=2)) is True
-    assert core.state == Supervisor.READY
+    assert core.state == State.READY
+
+
+# --------------------------------------------------------------------------- stops
+
+
+def tracking(core, to=40, **motion_):
+    """Under way in a long motion."""
+    core.step(sample(0))
+    assert core.offer(motion(**{"end": 2.0, "duration": 1.0, **motion_})).accepted
+    for k in range(1, to):
+        core.step(sample(k, core.reference.position.copy(), velocity=core.reference.velocity))
+    assert core.state == State.TRACKING
+    return to
+
+
+def test_a_smooth_stop_brakes_the_reference_from_where_it_is_and_then_holds(arm_r):
+    core = controller(arm_r, stop_deceleration=[4.0])
+    k = tracking(core, 400)
+    before = core.reference.velocity[0]
+    assert before > 1.0
+    assert core.brake("~/stop was called")
+    assert core.state == State.STOPPING
+    speeds, states = [before], []
+    for i in range(k, k + 1500):
+        q = core.reference.position + 0.01  # not where the reference is
+        assert core.step(sample(i, q, velocity=core.reference.velocity)) is True
+        speeds.append(core.reference.velocity[0])
+        states.append(core.state)
+    limit = max(4.0, abs(core.reference.acceleration[0]), 6.0)
+    assert np.abs(np.diff(speeds)).max() < 1e-3 * limit
+    assert speeds[-1] == 0.0
+    first = states.index(State.HOLDING)
+    assert set(states[:first]) == {State.STOPPING} and set(states[first:]) == {State.HOLDING}
+    assert first > 300
+    assert core.reason == "~/stop was called"
+    # A new trajectory is followed again.
+    here = core.reference.position[0]
+    assert core.offer(motion(end=here + 0.1, start=here, duration=0.1)).accepted
+    core.step(sample(k + 1500, here))
+    core.step(sample(k + 1501, here))
+    assert (core.state, core.reason) == (State.TRACKING, "")
+
+
+def test_without_torque_there_is_nothing_to_stop(arm_r):
+    core = controller(arm_r)
+    assert core.brake("because") is False
+    assert core.state == State.INACTIVE
+
+
+def test_a_joint_that_stays_behind_is_stopped_then_a_fault(arm_r):
+    core = controller(arm_r, tracking_error_limit=0.2)
+    k = tracking(core, 300)
+    q, states = core.reference.position.copy(), []
+    for i in range(k, k + 3000):  # the joint is stuck
+        core.step(sample(i, q))
+        states.append(core.state)
+    order = list(dict.fromkeys(states))
+    assert order in (
+        [State.TRACKING, State.STOPPING, State.FAULT],
+        [State.TRACKING, State.STOPPING, State.HOLDING, State.FAULT],
+    )
+    assert "tracking error of joint1 is" in core.reason and "limit of 0.2 rad" in core.reason
+
+
+def test_a_limit_exceeded_by_half_is_a_fault_at_once(arm_r):
+    core = controller(arm_r, tracking_error_limit=0.2)
+    core.step(sample(0))
+    core.step(sample(1, 0.29))
+    assert core.state == State.READY
+    assert core.step(sample(2, 0.31)) is False
+    assert core.state == State.FAULT
+    assert_array_equal(core.torque, [0.0])
+
+
+def test_a_limit_that_holds_again_is_forgiven(arm_r):
+    core = controller(arm_r, tracking_error_limit=0.2, limit_patience=0.1)
+    core.step(sample(0))
+    for k in range(1, 500):
+        core.step(sample(k, 0.25 if k % 90 < 80 else 0.1))
+    assert core.state == State.READY
+
+
+BEYOND = {
+    "velocity of joint1 is 13 rad/s": ({"position_margin": 0.0}, {"velocity": [13.0]}),
+    "deflection of link1_y_mode1 is 0.03": (
+        {"deflection_limit": [0.025, 0.0]},
+        {"amplitude": [-0.03, 0.0]},
+    ),
+    "strain of root is 0.0": ({"strain_limit": 1e-4}, {"amplitude": [-0.011, 0.0]}),
+    "position of joint1 is 0.06 rad out": ({"tracking_error_limit": 0.0}, {"position": 3.2}),
+    "position of joint1 is 0.07": (
+        {"tracking_error_limit": 0.0},
+        {"position": 3.0, "velocity": [9.0]},
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", BEYOND)
+def test_every_limit_stops_a_motion_and_says_which(reason):
+    settings, change = BEYOND[reason]
+    core = controller(limited(), **settings)
+    k = tracking(core, 20)
+    core.step(sample(k, **change))
+    assert core.state == State.STOPPING, core.reason
+    assert reason in core.reason
+
+
+def limited():
+    """Arm R with limits of position and velocity, and deflections that are watched."""
+    arm = arm_file.load("one_link")
+    joint = arm.joints[0]
+    limits = replace(joint.limits, position=(-3.14, 3.14), velocity=10.0)
+    return build(replace(arm, joints=(replace(joint, limits=limits),)))
+
+
+def test_a_torque_at_its_limit_for_long_stops_the_arm(arm_r):
+    core = controller(arm_r, Scripted(*[100.0] * 700), saturation_time=0.3, torque_limit=[1.0])
+    k = tracking(core, 300)
+    for i in range(k, k + 5):
+        core.step(sample(i, core.reference.position.copy()))
+    assert core.state == State.STOPPING
+    assert "time at the torque limit is 0.3" in core.reason
+    for i in range(k + 5, k + 250):
+        core.step(sample(i, core.reference.position.copy()))
+    assert core.state == State.FAULT
+
+
+def test_what_nothing_holds_to_the_reference_has_no_tracking_error(arm_r):
+    core = controller(arm_r, design(arm_r, {"type": "none"}, FAST))
+    core.step(sample(0))
+    assert core.step(sample(1, 1.0)) is True
+
+
+def test_the_fast_control_comes_and_goes_in_a_ramp(arm_r):
+    core = controller(arm_r, Scripted(*[1.0] * 1000))
+    core.step(sample(0))
+    core.enable_fast(False)
+    shares = []
+    for k in range(1, 300):
+        if k == 150:
+            core.enable_fast(True)
+        core.step(sample(k))
+        shares.append(core.law.fast_share)
+    assert_allclose(np.abs(np.diff(shares)).max(), 0.01)
+    assert shares[120] == 0.0 and shares[-1] == 1.0
+
+
+def test_the_fast_share_is_a_share_of_the_fast_torque(arm_r):
+    law = design(arm_r, SLOW, FAST)
+    reference = SimpleNamespace(
+        position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1)
+    )
+    state = (np.zeros(1), np.zeros(1), np.array([0.01, 0.0]), np.zeros(2))
+    law.step(*state, reference)
+    whole, slow = law.fast_torque.copy(), law.slow_torque.copy()
+    law.fast_share = 0.25
+    u = law.step(*state, reference)
+    assert_allclose(law.fast_torque, 0.25 * whole, rtol=1e-15)
+    assert_allclose(u, slow + 0.25 * whole, rtol=1e-15)
+
+
+def test_limits_are_taken_whole_or_not_at_all():
+    arm = arm_file.load("rigid")
+    core = None
+    with pytest.raises(ParameterError, match=r"strain_limit is 0\.001, but rigid has no gauges"):
+        core = controller(build(arm), Scripted(0.0), strain_limit=1e-3)
+    assert core is None

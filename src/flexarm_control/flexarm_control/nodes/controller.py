@@ -8,12 +8,14 @@ from time import perf_counter
 
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter as RosParameter
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control import arm_controller, composite, trajectory
-from flexarm_control.arm_controller import ArmController, Supervisor
+from flexarm_control.arm_controller import ArmController
 from flexarm_control.composite import FAST, MANIFOLD, PREFIX, SLOW
 from flexarm_control.samples import ArmSample
+from flexarm_control.supervisor import State
 from flexarm_dynamics import arm_file, model, registry
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import Parameter
@@ -23,6 +25,7 @@ from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
+from flexarm_ros.statistics import Latency
 
 SLOW_TYPE = Parameter(
     "type",
@@ -47,7 +50,7 @@ STATE_TIMEOUT = Parameter(
     "state_timeout",
     "float",
     0.5,
-    "Without a state for so long the torque is disabled and the trajectory given up.",
+    "Without a state for so long the torque is disabled: a fault.",
     unit="s",
     low=0.01,
     high=3600.0,
@@ -94,6 +97,7 @@ class ControllerNode(ArmNode):
         law = self._design(self.model, self._good)
         settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
         self.core = ArmController(self.model, law, settings, parameters["start_tolerance"])
+        self._limits_in_force = settings
         parameters.on_change(self._changed)
         arm = self.arm
         self._reader = StateReader(arm)
@@ -104,6 +108,9 @@ class ControllerNode(ArmNode):
         self._limits = self._trajectory_limits()
         self._samples, self._samples_before = 0, 0
         self._saturations, self._saturations_before = 0, 0
+        self._latency = Latency()
+        self._synchronised = parameters["synchronised_clocks"]
+        self._told = self.core.state
         self._ticks, self._seen = 0, False
         self._make_topics()
 
@@ -131,6 +138,9 @@ class ControllerNode(ArmNode):
             qos.COMMAND,
             qos_overriding_options=options,
         )
+        self.make_service(Trigger, "~/stop", self._on_stop)
+        self.make_service(Trigger, "~/recover", self._on_recover)
+        self.make_service(SetBool, "~/enable_fast", self._on_enable_fast)
         self._tick = self.parameters["state_timeout"] / 5.0
         self.make_timer(self._tick, self._watch)
 
@@ -145,23 +155,38 @@ class ControllerNode(ArmNode):
         if not self.active:
             return
         started = perf_counter()
-        self._ticks, self._seen = 0, True
         sample, core = self._sample, self.core
-        was = core.state
         try:
             self._reader.read(msg, sample)
-            enabled = core.step(sample)
+            now = self.get_clock().now().nanoseconds if self._synchronised else None
+            enabled = core.step(sample, now)
         except MessageError as error:
-            core.disable(str(error))
+            core.distrust(str(error))
             enabled = False
+        if enabled is None:
+            return
+        self._ticks, self._seen = 0, True
         self._torque_pub.publish(self._torque.answer(sample, enabled, core.torque))
         took = perf_counter() - started
+        self._latency.add(took)
         self._samples += 1
         self._saturations += core.saturated
         if self._state_pub.get_subscription_count():
             self._state_pub.publish(self._state.fill(sample, core, took))
-        if core.state == Supervisor.INACTIVE and was != Supervisor.INACTIVE:
-            self.get_logger().error(f"torque disabled: {core.reason}")
+        if core.state != self._told:
+            self._tell()
+
+    def _tell(self):
+        """Log what the supervisor has come to, where a user is to know it."""
+        state, was, reason = self.core.state, self._told, self.core.supervisor.reason
+        self._told = state
+        log = self.get_logger()
+        if state == State.FAULT:
+            log.error(f"fault, torque disabled until ~/recover is called: {reason}")
+        elif state == State.INACTIVE and was != State.FAULT:
+            log.error(f"torque disabled: {reason}")
+        elif state == State.STOPPING:
+            log.warning(f"stopping: {reason}")
 
     def _watch(self):
         """Steady clock: the states have stopped."""
@@ -170,15 +195,47 @@ class ControllerNode(ArmNode):
             return
         self._seen = False
         timeout = self.parameters["state_timeout"]
-        self._disable(
+        self.core.distrust(
             f"no arm_state_estimate for {timeout:g} s: are the driver (or simulator) and the observer"
             " running?"
         )
+        self._answer_again()
 
-    def _disable(self, reason):
-        self.core.disable(reason)
-        self.get_logger().error(f"torque disabled: {reason}")
-        self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+    def _answer_again(self):
+        """What has changed between two states: torque and controller/state, as answers to the last one."""
+        sample, core = self._sample, self.core
+        self._torque_pub.publish(self._torque.answer(sample, core.enabled, core.torque))
+        self._state_pub.publish(self._state.fill(sample, core, 0.0))
+        self._tell()
+
+    # Services --------------------------------------------------------------------------------
+
+    def _on_stop(self, request, response):
+        core = self.core
+        response.success = True
+        if core.brake("~/stop was called"):
+            response.message = f"{core.state.name}: the arm is brought to rest and held"
+        else:
+            response.message = f"{core.state.name}: there is no torque, the safe action acts"
+        return response
+
+    def _on_recover(self, request, response):
+        was = self.core.supervisor.reason
+        response.success = self.core.recover()
+        if response.success:
+            response.message = f"left the fault ({was}): torque with the next valid state"
+            self.get_logger().info(response.message)
+            self._answer_again()
+        else:
+            response.message = f"not in fault: {self.core.state.name}"
+        return response
+
+    def _on_enable_fast(self, request, response):
+        self.core.enable_fast(request.data)
+        response.success = True
+        response.message = f"fast control {'on' if request.data else 'off: the arm rings'}"
+        self.get_logger().info(response.message)
+        return response
 
     # Trajectories ----------------------------------------------------------------------------
 
@@ -249,11 +306,31 @@ class ControllerNode(ArmNode):
 
     def _changed(self, names):
         if names & {p.name for p in arm_controller.PARAMETERS}:
-            settings = self.parameters.group("", {p.name for p in arm_controller.PARAMETERS})
-            self.core.configure(settings)
+            self._take_limits()
         whole = {p.name for p in composite.PARAMETERS}
         if any(n in whole or n.startswith(tuple(PREFIX.values())) for n in names):
             self._designer.submit(self._redesign, self._law_parameters())
+
+    def _take_limits(self):
+        """Limits are in force from the next sample on, or go back to what they were."""
+        settings = self.parameters.group("", {p.name for p in arm_controller.PARAMETERS})
+        try:
+            self.core.configure(settings)
+        except FlexarmError as error:
+            self.get_logger().error(f"limits refused, the old ones stay: {error}")
+            self._put_back({"": settings}, {"": self._limits_in_force})
+            return
+        self._limits_in_force = settings
+
+    def _put_back(self, values, good):
+        """Set what differs back to what is in force."""
+        old = [
+            RosParameter(prefix + name, value=value)
+            for prefix, group in good.items()
+            for name, value in group.items()
+            if values[prefix][name] != value
+        ]
+        self.hand_over(self.set_parameters_atomically, old)
 
     def _redesign(self, values):
         """In the design thread: a new law swaps whole, or the parameters go back to what they were."""
@@ -266,13 +343,7 @@ class ControllerNode(ArmNode):
             # A law may be anybody's, and this thread would drop its error without a word.
             what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self.get_logger().error(f"design refused, the old law goes on: {what}{error}")
-            old = [
-                RosParameter(prefix + name, value=value)
-                for prefix, group in self._good.items()
-                for name, value in group.items()
-                if values[prefix][name] != value
-            ]
-            self.hand_over(self.set_parameters_atomically, old)
+            self._put_back(values, self._good)
 
     def _swap(self, law):
         """Between two samples: the new law goes on from where the old one is."""
@@ -309,17 +380,27 @@ class ControllerNode(ArmNode):
             "slow manifold": self.parameters["manifold.type"],
             "feed-forward": self.parameters["feedforward"],
             "samples per second": rate,
+            **self._latency.values(),
+            "states lost": core.missed,
+            "states too late": core.late,
+            "stops": core.supervisor.stops,
+            "faults": core.supervisor.faults,
+            "fast control": "on" if core.fast_enabled else "off",
             "saturated samples": self._saturations,
             "trajectory": core.trajectory_id,
         }
         if not self.active:
             return OK, "not active", values
-        if core.state == Supervisor.INACTIVE:
+        if core.state == State.FAULT:
+            return ERROR, f"{core.supervisor.reason}: mend it, then call ~/recover", values
+        if core.state == State.INACTIVE:
             return ERROR, core.reason or "no arm_state_estimate yet: start the observer", values
         if saturated:
             return WARN, f"torque at its limit in {saturated} of {rate} samples", values
         if core.reason:
             return WARN, core.reason, values
+        if not core.fast_enabled:
+            return WARN, "the fast control is off: call ~/enable_fast with data true", values
         return OK, "", values
 
 
