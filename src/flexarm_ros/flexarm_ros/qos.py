@@ -1,7 +1,25 @@
-"""Quality of service on the line: reliable, volatile, the newest sample only; overridable by parameters."""
+"""Quality of service on the line: reliable, volatile, the newest sample only; overridable by parameters.
 
-from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
+Two ends of a topic whose policies don't go together exchange nothing, and neither would say so: `Mismatches` does.
+"""
+
+import copy
+from dataclasses import dataclass
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    QoSReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+
+from flexarm_dynamics.errors import ParameterError
 
 LINE = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
@@ -18,7 +36,139 @@ COMMAND = QoSProfile(
     durability=QoSDurabilityPolicy.VOLATILE,
 )
 
+#: What a parameter ``qos_overrides.<topic>.<publisher|subscription>.<policy>`` may change.
+OVERRIDABLE = (
+    QoSPolicyKind.HISTORY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY,
+)
+#: The values of a policy of which one end may offer less than the other asks for: less, more.
+VALUES = {"reliability": ("best_effort", "reliable"), "durability": ("volatile", "transient_local")}
+
 
 def overridable():
     """Lets a user change the policies by ``qos_overrides.<topic>.<publisher|subscription>.…``."""
-    return QoSOverridingOptions.with_default_policies()
+    return QoSOverridingOptions(OVERRIDABLE)
+
+
+def made(create, topic, profile):
+    """Call ``create(profile)`` for a publisher or subscription with a profile of its own.
+
+    rclpy writes overrides into the profile that it is given: of a shared one, other topics would get them too.
+
+    Raises
+    ------
+    ParameterError
+        For an override that can't be used.
+    """
+    try:
+        return create(copy.copy(profile))
+    except (RuntimeError, ParameterException, InvalidQosOverridesError) as error:
+        raise ParameterError(f"quality of service of {topic}: {error}") from error
+
+
+def advice(topic, policy, publishes, overrides=True):
+    """What is wrong between the two ends of a topic, and what to change.
+
+    Parameters
+    ----------
+    topic : str
+        With its namespace.
+    policy : str
+        Such as "reliability".
+    publishes : bool
+        Whether this node's end is the publisher.
+    overrides : bool
+        Whether this end has ``qos_overrides`` parameters.
+    """
+    other = "subscriber" if publishes else "publisher"
+    if policy not in VALUES:
+        return f"nothing is exchanged with a {other} of {topic}: give both ends the same {policy}"
+    less, more = VALUES[policy]
+    if publishes:
+        text = (
+            f"a subscriber of {topic} gets nothing: it asks for {policy} {more}, offered is {less};"
+        )
+        text += f" have it ask for {less}"
+        here = f"publisher.{policy}:={more}"
+    else:
+        text = f"nothing comes from a publisher of {topic}: it offers {policy} {less}, asked for is {more};"
+        text += f" have it offer {more}"
+        here = f"subscription.{policy}:={less}"
+    if overrides:
+        text += f", or start this node with -p qos_overrides.{topic}.{here}"
+    return text
+
+
+@dataclass
+class _Mismatch:
+    end: object  # publisher or subscription of this node
+    publishes: bool
+    text: str
+    seen: bool = False  # whether the other end has been found in the graph
+
+
+class Mismatches:
+    """Other ends of a node's topics that nothing is exchanged with, for want of compatible policies.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Of whose topics.
+    """
+
+    def __init__(self, node):
+        self._node = node
+        self._found = {}
+
+    def callbacks(self, publishes, overrides):
+        """Event callbacks for a new publisher or subscription, and the function that takes it once it exists."""
+        ends = []
+
+        def incompatible(event):
+            if ends:  # destroyed ends have no more events
+                policy = QoSPolicyKind(int(event.last_policy_kind)).name.lower()
+                self._note(ends[0], policy, publishes, overrides)
+
+        kind = PublisherEventCallbacks if publishes else SubscriptionEventCallbacks
+        return kind(incompatible_qos=incompatible), ends.append
+
+    def _note(self, end, policy, publishes, overrides):
+        topic = end.topic_name
+        key = topic, policy, publishes
+        if key not in self._found:
+            text = advice(topic, policy, publishes, overrides)
+            self._found[key] = _Mismatch(end, publishes, text)
+            self._node.get_logger().warning(text)
+
+    def forget(self, ends):
+        """These publishers and subscriptions are destroyed."""
+        gone = {id(end) for end in ends}
+        self._found = {k: m for k, m in self._found.items() if id(m.end) not in gone}
+
+    def texts(self):
+        """What is wrong now, by topic; what was put right or has left is forgotten. Not on the control path."""
+        self._found = {k: m for k, m in self._found.items() if self._lasts(m)}
+        return {topic: m.text for (topic, _, _), m in self._found.items()}
+
+    def _lasts(self, mismatch):
+        """Whether there is still an other end that does not match; not found yet counts as yes."""
+        node, end = self._node, mismatch.end
+        look = (
+            node.get_subscriptions_info_by_topic
+            if mismatch.publishes
+            else node.get_publishers_info_by_topic
+        )
+        there = any(
+            not _compatible(end.qos_profile, other.qos_profile, mismatch.publishes)
+            for other in look(end.topic_name)
+        )
+        gone = mismatch.seen and not there
+        mismatch.seen |= there
+        return not gone
+
+
+def _compatible(own, other, publishes):
+    offered, asked = (own, other) if publishes else (other, own)
+    return qos_check_compatible(offered, asked)[0] != QoSCompatibility.ERROR

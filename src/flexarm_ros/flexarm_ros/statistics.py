@@ -100,6 +100,9 @@ class Gaps:
         Since the start.
     """
 
+    #: A number further off than this is no gap: the source counts anew.
+    FAR = 100_000
+
     def __init__(self):
         self.lost = 0
         self._session, self._sequence, self._before = None, 0, 0
@@ -113,9 +116,11 @@ class Gaps:
             self._session, self._sequence = session, sequence
             return
         ahead = (sequence - self._sequence) % WRAP
-        if 0 < ahead < WRAP // 2:
+        if 0 < ahead < self.FAR:
             self.lost += ahead - 1
-            self._sequence = sequence
+        elif ahead == 0 or ahead > WRAP - self.FAR:
+            return
+        self._sequence = sequence
 
     def take(self):
         """Samples lost since the last call."""

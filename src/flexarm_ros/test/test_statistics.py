@@ -75,6 +75,7 @@ def test_latency_is_text_in_milliseconds():
         ([0, 3, 1, 2, 4], 2),  # late ones were counted as lost, and stay so
         ([2**32 - 2, 2**32 - 1, 0, 1], 0),
         ([2**32 - 2, 2], 3),
+        ([7, 2**31, 2**31 + 2, 8, 10], 2),  # another count
     ],
 )
 def test_gaps_in_the_numbers_are_lost_samples(numbers, lost):

@@ -1,7 +1,10 @@
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
 from dataclasses import replace
+from math import isnan
+from time import perf_counter
 
+import numpy as np
 from std_srvs.srv import Trigger
 
 from flexarm_control import arm_observer, composite, gauge_health
@@ -15,6 +18,10 @@ from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
+from flexarm_ros.statistics import Gaps, Latency, Percentiles
+
+#: So large a part of the samples may get lost in a second before it is worth a warning.
+MANY_LOST = 0.01
 
 TYPE = Parameter(
     "type",
@@ -52,6 +59,9 @@ class ObserverNode(ArmNode):
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
         self._samples, self._refused, self._samples_before = 0, 0, 0
         self._refused_before, self._refusal = 0, ""
+        self._latency, self._gaps = Latency(), Gaps()
+        self._innovation, self._squared = Percentiles(), Percentiles()
+        self._size = np.zeros(len(arm.modes))
         options = qos.overridable()
         self._estimate_pub = self.make_publisher(
             ArmState, "arm_state_estimate", qos.LINE, qos_overriding_options=options
@@ -93,6 +103,8 @@ class ObserverNode(ArmNode):
     def _on_state(self, msg):
         if not self.active:
             return
+        started = perf_counter()
+        self._gaps.add(msg.session, msg.sequence)
         sample, writer, core = self._sample, self._writer, self.core
         try:
             self._reader.read(msg, sample)
@@ -112,6 +124,7 @@ class ObserverNode(ArmNode):
         writer.write("modal_amplitude", core.amplitude)
         writer.write("modal_rate", core.rate if known else None)
         self._estimate_pub.publish(writer.message)
+        self._measure(started)
         if self._state_pub.get_subscription_count():
             name = self.parameters["observer.type"]
             self._state_pub.publish(
@@ -119,6 +132,15 @@ class ObserverNode(ArmNode):
                     sample, name, core.observer, sample.strain, core.gauges and core.gauges.health
                 )
             )
+
+    def _measure(self, started):
+        """What diagnostics tell of this sample."""
+        self._latency.add(perf_counter() - started)
+        observer = self.core.observer
+        self._squared.add(observer.innovation_squared)
+        if observer.innovation.size == self._size.size:
+            np.abs(observer.innovation, out=self._size)
+            self._innovation.add(self._size.max(initial=0.0))
 
     def _on_calibrate(self, request, response):
         """Service: the gauges' bias from the samples at hand; answers at once."""
@@ -153,11 +175,15 @@ class ObserverNode(ArmNode):
     def diagnose(self):
         observer = self.core.observer
         rate, self._samples_before = self._samples - self._samples_before, self._samples
+        lost = self._gaps.take()
         values = {
             "observer": self.parameters["observer.type"],
             "samples per second": rate,
             "samples refused": self._refused,
+            "samples lost": self._gaps.lost,
+            **self._latency.values(),
             "converged": observer.converged,
+            **self._innovations(),
             **observer.parameters_estimated,
         }
         refused, self._refused_before = self._refused - self._refused_before, self._refused
@@ -174,7 +200,25 @@ class ObserverNode(ArmNode):
         if not observer.consistent:
             wrong = "innovations are larger than the noise explains: raise observer noise levels, or mend the arm file"
             return WARN, wrong, values
+        if lost > MANY_LOST * (rate + lost):
+            return (
+                WARN,
+                f"{lost} of {rate + lost} samples lost on their way from the driver",
+                values,
+            )
         return OK, "", values
+
+    def _innovations(self):
+        """Measured minus predicted amplitude in the last second, where the observer predicts one."""
+        (largest,) = self._innovation.take()
+        median, squared = self._squared.take(50.0)
+        values = {}
+        if not isnan(largest):
+            values["largest innovation [m, rad]"] = f"{largest:.3g}"
+        if not isnan(squared):
+            values["normalised innovation squared p50"] = f"{median:.3g}"
+            values["normalised innovation squared max"] = f"{squared:.3g}"
+        return values
 
 
 def main(args=None):
