@@ -36,6 +36,8 @@ SHM = Path("/dev/shm")
 DEEP = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
 )
+#: Of a controller that a loaded machine may hold up for seconds; in real time, too.
+PATIENT = {"state_timeout": 60.0, "max_gap": 60.0}
 #: Number of each transition, and the state it leads to.
 TRANSITIONS = {
     "configure": (Transition.TRANSITION_CONFIGURE, "inactive"),

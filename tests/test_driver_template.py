@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness import Arm, Bench, trajectory
+from harness import PATIENT, Arm, Bench, trajectory
 
 from flexarm_bringup.processes import arguments, executable
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
@@ -18,8 +18,8 @@ TEMPLATE = Path(__file__).resolve().parents[1] / "examples" / "flexarm_driver_te
 RATE = 200.0  # [Hz]
 TIMEOUT = 0.2  # [s] of the torque; generous, for a machine that is busy
 #: What a busy machine adds to ages and intervals is not the driver's fault.
-PATIENT = ["--duration", "1", "--rate-error", "0.3", "--jitter", "100", "--age", "5"]
-PATIENT += ["--torque-timeout", str(TIMEOUT), "--timeout", "30"]
+EASY = ["--duration", "1", "--rate-error", "0.3", "--jitter", "100", "--age", "5"]
+EASY += ["--torque-timeout", str(TIMEOUT), "--timeout", "30"]
 
 
 def start_template(bench, port, *options, **parameters):
@@ -37,7 +37,7 @@ def start_template(bench, port, *options, **parameters):
 
 def check_driver(bench, *options):
     """Run ``flexarm check_driver R --allow-motion``; exit code and what it said."""
-    words = ["check_driver", "R", "--allow-motion", *PATIENT, *options]
+    words = ["check_driver", "R", "--allow-motion", *EASY, *options]
     process = bench.processes.start("check", [executable("flexarm_bringup", "flexarm"), *words])
     bench.wait_for("the check to end", lambda: process.poll() is not None, 3 * bench.PATIENCE)
     bench.processes.running.pop("check")
@@ -133,7 +133,7 @@ def test_two_controllers_in_turn_bring_the_safe_action_and_a_torque_is_clipped(l
 def test_observer_and_controller_run_on_it_unchanged(line):
     # Soft fast gains and an observer with a model: they bear torques that come late.
     line.start("observer", {"arm": "R", "observer.type": "kalman"})
-    line.start("controller", {"arm": "R", "state_timeout": 5.0, "fast.alpha": 1.0})
+    line.start("controller", {"arm": "R", **PATIENT, "fast.alpha": 1.0})
     arm = Arm(line)
     arm.wait_ready()
     start = arm.measured.newest.joint_position[0]

@@ -419,7 +419,7 @@ TIMEOUT = 1.0
 PARAMETERS = {
     "simulator": {"arm": "R", "rate": 200.0},
     "observer": {"arm": "R"},
-    "controller": {"arm": "R", "fast.type": "none", "state_timeout": TIMEOUT},
+    "controller": {"arm": "R", "fast.type": "none", "max_gap": 60.0, "state_timeout": TIMEOUT},
 }
 
 

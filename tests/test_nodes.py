@@ -7,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from harness import SHM, Arm, Bench, Drive, Source, abandoned, segments, trajectory
+from harness import PATIENT, SHM, Arm, Bench, Drive, Source, abandoned, segments, trajectory
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -626,7 +626,8 @@ def test_two_arms_side_by_side_one_killed_the_other_unaffected_topics_remapped(b
     }
     for side, given in remaps.items():
         for name in NODES:
-            bench.start(name, common, key=f"{side}_{name}", remaps=[f"__ns:=/{side}", *given])
+            own = common | (PATIENT if name == "controller" else {})
+            bench.start(name, own, key=f"{side}_{name}", remaps=[f"__ns:=/{side}", *given])
     left, right = Arm(bench, "left/"), Arm(bench, "right/")
     bench.wait_for("both arms", lambda: left.ready() and right.ready())
     assert left.state.session != right.state.session

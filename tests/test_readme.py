@@ -89,6 +89,9 @@ def test_parameter_tables_are_those_of_the_declarations():
     )
 
 
+PATIENCE = ["-p", "state_timeout:=60.0", "-p", "max_gap:=60.0"]
+
+
 @contextlib.contextmanager
 def started(commands, directory):
     """The three nodes, by the README's own commands, in real time."""
@@ -96,6 +99,8 @@ def started(commands, directory):
         for command in commands:
             _, _, package, name, *rest = words_of(command)
             rest = [w.replace("config/", f"{ROOT}/config/") for w in rest]
+            if name == "controller":  # on a machine that may hold it up for seconds
+                rest = [*rest, *([] if "--ros-args" in rest else ["--ros-args"]), *PATIENCE]
             processes.start(name, [executable(package, name), *rest])
         assert set(processes.running) == {"simulator", "observer", "controller"}
         with LockstepRun(processes) as line:
