@@ -430,15 +430,29 @@ class Chain(ArmModel):
         if method is not None and straight_line and self.straight_line is not None:
             module, constants = self.straight_line
             return explicit_stepper(module, method, constants, self)
+        return self._loops(method)
+
+    def lockable_stepper(self, method):
+        return self._loops(method, lockable=True)
+
+    def _loops(self, method, lockable=False):
+        """A stepper that runs the recursion in loops."""
         none = tuple(np.zeros_like(part) for part in self._none)
+        driven, n, size = none[2], self.n_joints, 2 * (self.n_joints + self.n_modes)
+        stages = np.zeros((4, size))  # of the implicit method
+
+        def lock(mask):
+            driven[:] = mask  # with the acceleration zero
+            stages[:, size // 2 : size // 2 + n] = 0.0
+
+        lock = lock if lockable else None
         data = (self._data, self._new_work(), *none)
         if method is not None:
-            return explicit_stepper(self.kernel, method, data, self)
-        n, size = self.n_joints, 2 * (self.n_joints + self.n_modes)
+            return explicit_stepper(self.kernel, method, data, self, lock)
         extra = (np.zeros_like(none[0]), np.zeros_like(none[1]))
-        arguments = (np.zeros((4, size)), np.zeros(n), extra)
+        arguments = (stages, np.zeros(n), extra)
         step, trajectory = self.kernel.implicit_step, self.kernel.implicit_trajectory
-        return Stepper(self, step, trajectory, arguments, data)
+        return Stepper(self, step, trajectory, arguments, data, lock)
 
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion."""

@@ -135,6 +135,18 @@ class ArmModel(ABC):
         Stepper
         """
 
+    def lockable_stepper(self, method):
+        """As `stepper`, with `Stepper.lock`: for brakes.
+
+        Raises
+        ------
+        ModelError
+            Where the model has none.
+        """
+        raise ModelError(
+            f"model {self.arm.model} can't lock joints: take safe_action damp or zero, or model chain"
+        )
+
     def with_payload(self, scale):
         """The same arm in the same mode shapes, with its payload's mass and inertia scaled.
 
@@ -269,6 +281,9 @@ class Stepper:
         What they take after the number of substeps, but for friction and data.
     data : object
         What the right-hand side needs.
+    lock : callable, optional
+        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call; they have to be
+        at rest, and their torque zero.
 
     Attributes
     ----------
@@ -276,10 +291,11 @@ class Stepper:
         Taken where a call names none.
     """
 
-    def __init__(self, model, step, trajectory, arguments, data):
+    def __init__(self, model, step, trajectory, arguments, data, lock=None):
         self._step, self._trajectory = step, trajectory
         self._arguments, self._data = arguments, data
         self._none = np.zeros(model.n_joints)
+        self.lock = lock
         self.friction = model.friction_table()
 
     def __call__(self, state, torque, step, substeps=1, friction=None, change=None):
@@ -335,7 +351,7 @@ class Stepper:
         )
 
 
-def explicit_stepper(module, method, data, model):
+def explicit_stepper(module, method, data, model, lock=None):
     """`ArmModel.stepper` of a compiled module that has ``slope`` and the integrators."""
     n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
     net, coefficients = np.zeros(n), (method.weights, method.nodes)
@@ -343,9 +359,11 @@ def explicit_stepper(module, method, data, model):
         below = np.concatenate([[0.0], np.diag(method.A, -1)])
         work = tuple(np.zeros(size) for _ in range(3))
         arguments = (below, *coefficients, work, net)
-        return Stepper(model, module.low_storage, module.low_storage_trajectory, arguments, data)
+        functions = (module.low_storage, module.low_storage_trajectory)
+        return Stepper(model, *functions, arguments, data, lock)
     arguments = (method.A, *coefficients, np.zeros((method.weights.size + 1, size)), net)
-    return Stepper(model, module.runge_kutta, module.runge_kutta_trajectory, arguments, data)
+    functions = (module.runge_kutta, module.runge_kutta_trajectory)
+    return Stepper(model, *functions, arguments, data, lock)
 
 
 def scaled_payload(arm, scale):

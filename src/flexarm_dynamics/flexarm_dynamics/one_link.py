@@ -179,18 +179,35 @@ class OneLinkEquations(ArmModel):
         return np.array([[f.viscous, f.coulomb, f.smoothing]])
 
     def stepper(self, method):
-        if method is None:
-            raise ModelError(
-                f"model {self.arm.model} has no implicit integrator: take an explicit one, or model chain"
-            )
+        return self._stepper(method, self._data())
+
+    def lockable_stepper(self, method):
+        data = self._data()
+        scalars, rigid = data[0], data[0][0]
+
+        def lock(mask):
+            scalars[0] = (
+                np.inf if mask[0] else rigid
+            )  # a hub of infinite inertia: no acceleration at all
+
+        return self._stepper(method, data, lock)
+
+    def _data(self):
         c = self.coefficients
         scalars = np.array([c.rigid, c.moment, self._gravity[0], self._gravity[1]])
         inverse = np.linalg.inv(c.M22)
         inverse = 0.5 * (inverse + inverse.T)
         data = (scalars, c.h, inverse, inverse @ c.h, c.G, c.K, c.D, c.s)
+        return tuple(map(np.ascontiguousarray, data))
+
+    def _stepper(self, method, data, lock=None):
+        if method is None:
+            raise ModelError(
+                f"model {self.arm.model} has no implicit integrator: take an explicit one, or model chain"
+            )
         sources = (load.source(kernel), load.source(integrators))
         module = load.joined("one_link", sources, inline=("slope", "net_torque", "low_storage"))
-        return explicit_stepper(module, method, tuple(map(np.ascontiguousarray, data)), self)
+        return explicit_stepper(module, method, data, self, lock)
 
 
 class OneLink(OneLinkEquations):

@@ -7,11 +7,10 @@ import numpy as np
 from flexarm_dynamics.errors import ModelError, ShapeError
 
 from . import integrators
+from .brakes import Brakes
 
 #: Damping of the safe action `damp` where the arm file gives none: stops the rigid arm with this rate [1/s].
 DAMP_RATE = 10.0
-#: A brake's smoothing speed is raised until the explicit integrator stays stable: rate * substep.
-BRAKE_RATE_PER_STEP = 1.0
 #: The safe action is integrated in more substeps where it damps faster than this: rate * substep.
 DAMP_RATE_PER_STEP = 2.0
 
@@ -42,10 +41,16 @@ class Plant:
         self.substeps = integrators.substeps(model, period, integrator)
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
-        self._safe = self._friction + self._safe_friction()
-        self._safe[:, 2] = self._brake_smoothing()
-        self._safe_substeps = self.substeps * self._refinement(integrator)
+        self._safe, brake = self._friction.copy(), self._brake_torques()
+        self._safe[:, 0] += self._damping()
+        refinement = self._refinement(integrator)
+        self._safe_substeps = self.substeps * refinement
         self._no_torque = np.zeros(n)
+        self._brakes = None
+        if brake.any():
+            implicit = integrators.METHODS[integrator] is None
+            self._brakes = Brakes(model, period, brake, self._safe, implicit)
+            self._brakes.refine(refinement)
 
     def reset(self, position=None, delta=None):
         """At rest at `position` [rad], bent by `delta`; not given: as its own weight bends it, joints held."""
@@ -63,29 +68,39 @@ class Plant:
 
     def advance_safely(self, share=1.0):
         """One period, or a share of it, without drive torque, under each joint's safe action."""
-        self._run(self._no_torque, self._safe, share, self._safe_substeps)
+        if self._brakes is None:
+            self._run(self._no_torque, self._safe, share, self._safe_substeps)
+            return
+        self._brakes.advance(self.state, share)
+        self._check()
 
     def _run(self, torque, friction, share, substeps):
         count = max(1, math.ceil(share * substeps))  # no longer ones than of a whole period
         self._advance(self.state, torque, share * self.period / count, count, friction)
+        self._check()
+
+    def _check(self):
         if not np.isfinite(self.state).all():
             raise ModelError(
                 f"the state of {self.model.arm.name} is no longer finite: torque or speed beyond what its"
                 " model holds for; reset the simulator"
             )
 
-    def _safe_friction(self):
-        """What the safe action adds to friction: viscous, Coulomb, (unused); shape (n, 3)."""
-        table = np.zeros((self.model.n_joints, 3))
-        inertia = self._inertia()
+    def _damping(self):
+        """What the safe action `damp` adds to viscous friction, shape (n,) [N m s/rad]."""
+        damping, inertia = np.zeros(self.model.n_joints), self._inertia()
         for i, joint in enumerate(self.model.arm.joints):
             if joint.safe_action == "damp":
                 given = joint.damp_coefficient
-                table[i, 0] = DAMP_RATE * inertia[i] if given is None else given
-            elif joint.safe_action == "brake":
-                table[i, 0] = DAMP_RATE * inertia[i]
-                table[i, 1] = self._brake_torque(joint, inertia[i])
-        return table
+                damping[i] = DAMP_RATE * inertia[i] if given is None else given
+        return damping
+
+    def _brake_torques(self):
+        """Torques of the joints' brakes, shape (n,) [N m]; 0: none."""
+        joints = zip(self.model.arm.joints, self._inertia(), strict=True)
+        return np.array(
+            [self._brake_torque(j, B) if j.safe_action == "brake" else 0.0 for j, B in joints]
+        )
 
     def _refinement(self, integrator):
         """By how many substeps each of an explicit method is divided, to bear the safe action's damping.
@@ -105,12 +120,6 @@ class Plant:
             return joint.brake_torque
         # No datum: what stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
-
-    def _brake_smoothing(self):
-        step = self.period / self.substeps
-        # The joint alone is quicker to stop than the rigid arm by the ratio of h11 to B of (10).
-        H11 = np.diag(self._terms().H)[: self.model.n_joints]
-        return np.maximum(self._friction[:, 2], self._safe[:, 1] * H11 * step / BRAKE_RATE_PER_STEP)
 
     def _terms(self):
         n = self.model.n_joints

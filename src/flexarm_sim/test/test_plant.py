@@ -103,7 +103,8 @@ def test_a_stopping_action_never_adds_energy(name, action):
 def test_brake_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s(name):
     speeds, _ = coasting(built(name, joint={"safe_action": "brake"}), 2.0)
     assert speeds[999:].max() < 1.0 * DEGREE
-    assert speeds[150:].max() < 1.0 * DEGREE  # the rigid arm would take 0.2 s at its torque limit
+    assert speeds[300:].max() < 1.0 * DEGREE  # the rigid arm takes 0.2 s at its torque limit
+    assert speeds[-1] == 0.0
 
 
 def test_damp_brings_a_stiff_arms_joint_from_2_rad_s_below_1_deg_s_within_1_s():
@@ -156,16 +157,6 @@ def test_a_brake_far_too_strong_for_the_time_step_stops_the_arm_without_chatter(
     speeds, energies = coasting(arm)
     assert np.diff(energies).max() <= 1e-12 * energies[0]
     assert speeds[100:].max() < 1.0 * DEGREE
-
-
-def test_the_brake_holds_a_level_arm_against_gravity_but_for_a_creep():
-    arm = built("one_link", joint={"safe_action": "brake"}, gravity=(0.0, -9.81, 0.0))
-    plant = Plant(arm, 1e-3)
-    for _ in range(1000):
-        plant.advance_safely()
-    assert -0.005 < plant.q[0] < 0.0
-    assert abs(plant.qd[0]) < 0.3 * DEGREE
-    assert arm.tip_deflection(plant.delta)[0] < -0.005  # while the beam sags
 
 
 # --------------------------------------------------------------------------- errors
