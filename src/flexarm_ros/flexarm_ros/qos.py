@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.qos import (
-    QoSCompatibility,
     QoSDurabilityPolicy,
     QoSHistoryPolicy,
     QoSPolicyKind,
     QoSProfile,
     QoSReliabilityPolicy,
-    qos_check_compatible,
 )
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 
@@ -104,6 +102,7 @@ def advice(topic, policy, publishes, overrides=True):
 @dataclass
 class _Mismatch:
     end: object  # publisher or subscription of this node
+    policy: str
     publishes: bool
     text: str
     seen: bool = False  # whether the other end has been found in the graph
@@ -139,7 +138,7 @@ class Mismatches:
         key = topic, policy, publishes
         if key not in self._found:
             text = advice(topic, policy, publishes, overrides)
-            self._found[key] = _Mismatch(end, publishes, text)
+            self._found[key] = _Mismatch(end, policy, publishes, text)
             self._node.get_logger().warning(text)
 
     def forget(self, ends):
@@ -161,7 +160,7 @@ class Mismatches:
             else node.get_publishers_info_by_topic
         )
         there = any(
-            not _compatible(end.qos_profile, other.qos_profile, mismatch.publishes)
+            _apart(mismatch.policy, end.qos_profile, other.qos_profile)
             for other in look(end.topic_name)
         )
         gone = mismatch.seen and not there
@@ -169,6 +168,6 @@ class Mismatches:
         return not gone
 
 
-def _compatible(own, other, publishes):
-    offered, asked = (own, other) if publishes else (other, own)
-    return qos_check_compatible(offered, asked)[0] != QoSCompatibility.ERROR
+def _apart(policy, own, other):
+    """Whether two ends that don't match in a policy may be these; where policies have an order, by their values."""
+    return policy not in VALUES or getattr(own, policy) != getattr(other, policy)

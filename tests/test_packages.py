@@ -1,0 +1,128 @@
+"""What a package says of itself: keys for what it imports and nothing else, licences, changelogs."""
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from catkin_pkg.changelog import Changelog, populate_changelog_from_rst
+from catkin_pkg.package import parse_package
+from catkin_pkg.package_version import get_forthcoming_label
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
+TEMPLATE = ROOT / "examples" / "flexarm_driver_template"
+PYTHON = [path for path in (*PACKAGES, TEMPLATE) if (path / "setup.py").is_file()]
+OURS = {path.name for path in (*PACKAGES, TEMPLATE)}
+
+#: Key of rosdistro (rosdep/python.yaml) for what a module is imported as.
+KEYS = {
+    "control": "python-control-pip",
+    "hypothesis": "python3-hypothesis",
+    "matplotlib": "python3-matplotlib",
+    "mujoco": "python3-mujoco-pip",
+    "numba": "python3-numba",
+    "numpy": "python3-numpy",
+    "pytest": "python3-pytest",
+    "rosbags": "python3-rosbags-pip",
+    "scipy": "python3-scipy",
+    "sympy": "python3-sympy",
+    "yaml": "python3-yaml",
+}
+#: Packages of Jazzy, whose key is their name.
+JAZZY = {"builtin_interfaces", "diagnostic_msgs", "launch", "launch_ros", "rcl_interfaces", "rclpy"}
+JAZZY |= {"sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs"}
+#: Needed and not imported.
+USED_OTHERWISE = {("flexarm_bringup", "ros2launch")}
+#: An option that only its own command needs, without a key.
+WITHOUT = {"distributed"}
+#: Tests of a package below that look at one above: a key would make a circle, which colcon refuses.
+CIRCLES = {("flexarm_ros", "flexarm_control")}
+
+
+def names(paths):
+    """Names of packages, for test ids."""
+    return [path.name for path in paths]
+
+
+def imported(folders):
+    """Top-level modules that files import, but those of the standard library and their own neighbours."""
+    found, own = set(), set()
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
+        own |= {path.stem}
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                found.add(node.module.split(".")[0])
+    return found - set(sys.stdlib_module_names) - (own - set(KEYS) - JAZZY - OURS) - WITHOUT
+
+
+def keys(package, folders):
+    """The keys of what files import."""
+    modules = imported(folders) - {package}
+    unknown = modules - set(KEYS) - JAZZY - OURS
+    assert not unknown, f"no rosdep key known of {', '.join(sorted(unknown))}: add it to KEYS"
+    return {KEYS.get(module, module) for module in modules}
+
+
+@pytest.mark.parametrize("path", PYTHON, ids=names(PYTHON))
+def test_keys_are_those_of_what_a_package_imports(path):
+    package = parse_package(path)
+    declared = {dependency.name for dependency in package.exec_depends}
+    declared -= {key for name, key in USED_OTHERWISE if name == path.name}
+    assert declared == keys(path.name, [path / path.name, path / "launch"])
+    tests = {dependency.name for dependency in package.test_depends}
+    circles = {key for name, key in CIRCLES if name == path.name}
+    assert tests >= keys(path.name, [path / "test"]) - declared - circles
+    assert tests <= keys(path.name, [path / "test"])
+
+
+def test_keys_of_the_messages_are_those_of_their_build():
+    path = ROOT / "src" / "flexarm_msgs"
+    package = parse_package(path)
+    text = (path / "CMakeLists.txt").read_text()
+    found = set(re.findall(r"find_package\((\w+)", text))
+    tools = {d.name for d in package.buildtool_depends}
+    assert found == tools | {d.name for d in package.build_depends}
+    types = re.findall(r"^(\w+)/\w+", "".join(p.read_text() for p in path.glob("msg/*.msg")), re.M)
+    assert set(types) == {d.name for d in package.build_depends}
+    assert set(types) <= {d.name for d in package.exec_depends}
+
+
+@pytest.mark.parametrize("path", PACKAGES, ids=names(PACKAGES))
+def test_a_manifest_is_valid_and_its_licence_is_the_projects(path):
+    warnings = []
+    package = parse_package(path, warnings=warnings)
+    package.validate(warnings=warnings)
+    assert not warnings
+    assert package.licenses == ["Apache-2.0"] and package.licenses[0].file == "LICENSE"
+    licence = (ROOT / "LICENSE").read_text()
+    assert "Apache License" in licence and (path / "LICENSE").read_text() == licence
+
+
+@pytest.mark.parametrize("path", PYTHON, ids=names(PYTHON))
+def test_setup_py_agrees_with_the_manifest(path):
+    package = parse_package(path)
+    given = {}
+    for node in ast.walk(ast.parse((path / "setup.py").read_text())):
+        if isinstance(node, ast.keyword) and isinstance(node.value, ast.Constant):
+            given[node.arg] = node.value.value
+    assert given["version"] == package.version
+    assert given["license"] == str(package.licenses[0])
+    assert given["maintainer"] == package.maintainers[0].name
+    assert given["maintainer_email"] == package.maintainers[0].email
+
+
+@pytest.mark.parametrize("path", PACKAGES, ids=names(PACKAGES))
+def test_a_changelog_can_be_tagged_for_a_release(path):
+    text = (path / "CHANGELOG.rst").read_text()
+    assert get_forthcoming_label(text) == "Forthcoming"
+    # As catkin_prepare_release does.
+    released = text.replace("Forthcoming\n-----------", "0.1.0 (2026-01-31)\n------------------")
+    changelog = Changelog(path.name)
+    populate_changelog_from_rst(changelog, released)
+    ((version, _, entries),) = changelog.foreach_version()
+    assert version == parse_package(path).version and len(entries) >= 1
+    assert text.splitlines()[1] == f"Changelog for package {path.name}"
