@@ -1,0 +1,123 @@
+"""config/security/flexarm.policy.xml allows each node what it creates, and nothing else."""
+
+import re
+import time
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+
+from flexarm_bringup.processes import own_domain
+from flexarm_control.nodes.controller import ControllerNode
+from flexarm_control.nodes.observer import ObserverNode
+from flexarm_sim.nodes.simulator import SimulatorNode
+
+POLICY = Path(__file__).resolve().parents[1] / "config" / "security" / "flexarm.policy.xml"
+CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
+#: What SROS 2 makes of a list: its elements' name, and the attributes that it may have (policy 0.2.0).
+LISTS = {"topics": {"publish", "subscribe"}, "services": {"request", "reply"}}
+
+
+def policy():
+    """The root of the policy file."""
+    return ElementTree.parse(POLICY).getroot()
+
+
+def profile(enclave):
+    """The profile of an enclave, and what it allows: {kind: absolute names}, of each kind."""
+    (found,) = policy().findall(f"enclaves/enclave[@path='/flexarm/{enclave}']/profiles/profile")
+    allowed = {kind: [] for kinds in LISTS.values() for kind in kinds}
+    for names in found:
+        for kind, rule in names.attrib.items():
+            assert rule == "ALLOW"
+            allowed[kind] += [absolute(name.text, found) for name in names]
+    return found, allowed
+
+
+def absolute(name, found):
+    """A name as SROS 2 resolves it: of the namespace, `~` of the node."""
+    space = found.get("ns").rstrip("/")
+    if name.startswith("/"):
+        return name
+    return f"{space}/{found.get('node')}{name[1:]}" if name.startswith("~") else f"{space}/{name}"
+
+
+def test_the_policy_file_is_of_the_form_that_sros2_reads():
+    root = policy()
+    assert (root.tag, root.get("version")) == ("policy", "0.2.0")
+    assert [child.tag for child in root] == ["enclaves"]
+    paths = [enclave.get("path") for enclave in root[0]]
+    assert paths == [f"/flexarm/{name}" for name in (*CLASSES, "operator")]
+    for found in root.iter("profile"):
+        assert set(found.attrib) == {"ns", "node"}
+        for names in found:
+            assert names.attrib and set(names.attrib) <= LISTS[names.tag]
+            assert {name.tag for name in names} == {names.tag[:-1]}
+            for name in names:
+                assert re.fullmatch(r"(~?/)?\w+(/\w+)*", name.text), name.text
+
+
+@pytest.fixture(scope="module")
+def created():
+    """What each node has created: {node: {kind: names}}, from the graph."""
+    with own_domain() as domain:
+        rclpy.init(domain_id=domain, args=["--ros-args", "-p", "arm:=R", "-p", "fast.type:=none"])
+        nodes, bystander = {}, Node("bystander")
+        try:
+            for name, node_class in CLASSES.items():
+                nodes[name] = node_class()
+                assert nodes[name].trigger_configure() == TransitionCallbackReturn.SUCCESS
+            yield {name: settled(lambda name=name: graph(bystander, name)) for name in CLASSES}
+        finally:
+            for node in (*nodes.values(), bystander):
+                node.destroy_node()
+            rclpy.try_shutdown()
+
+
+def graph(node, name):
+    """Names of what a node has, by kind; from the graph, which alone knows what rcl creates by itself."""
+    kinds = {
+        "publish": node.get_publisher_names_and_types_by_node,
+        "subscribe": node.get_subscriber_names_and_types_by_node,
+        "reply": node.get_service_names_and_types_by_node,
+        "request": node.get_client_names_and_types_by_node,
+    }
+    return {kind: sorted(n for n, _ in ask(name, "/")) for kind, ask in kinds.items()}
+
+
+def settled(ask, answers=20):
+    """An answer that has stayed the same for so many times."""
+    same, last = 0, None
+    while same < answers:
+        now = ask()
+        same = same + 1 if now == last else 0
+        last = now
+        time.sleep(0.01)
+    return last
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_each_node_may_do_what_it_does_and_nothing_else(created, name):
+    found, allowed = profile(name)
+    assert found.get("node") == name
+    for kind, names in created[name].items():
+        assert sorted(allowed[kind]) == names, f"{kind} of {name} in {POLICY.name}"
+
+
+def test_only_the_controller_may_publish_torque_and_only_the_operator_trajectories():
+    for topic, alone in (("/joint_torque", "controller"), ("/joint_trajectory", "operator")):
+        who = [e for e in (*CLASSES, "operator") if topic in profile(e)[1]["publish"]]
+        assert who == [alone]
+
+
+def test_the_operator_calls_and_reads_what_the_nodes_offer(created):
+    _, allowed = profile("operator")
+    offered = {
+        kind: {n for c in created.values() for n in c[kind]} for kind in ("publish", "reply")
+    }
+    assert set(allowed["request"]) <= offered["reply"]
+    assert set(allowed["subscribe"]) <= offered["publish"]
+    assert "/joint_trajectory" in created["controller"]["subscribe"]
