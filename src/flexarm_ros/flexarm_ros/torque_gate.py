@@ -12,6 +12,73 @@ from flexarm_dynamics.errors import MessageError
 from .messages import TorqueReader
 
 
+class Controllers:
+    """Who sends: an id that comes back after another one is that of a second controller.
+
+    A controller that was restarted has a new id, and is taken at once.
+
+    Parameters
+    ----------
+    alone : float
+        After two were heard in turn, one has to be silent for so long; in the unit of the times given [s].
+
+    Attributes
+    ----------
+    ids : set of int
+        Heard since `forget`.
+    pair : tuple of int
+        The last two that were heard in turn, ascending; empty before.
+    """
+
+    def __init__(self, alone):
+        self.alone = alone
+        self.forget()
+
+    def forget(self):
+        """Nobody has been heard."""
+        self.ids, self.pair = set(), ()
+        self._last, self._until = None, -np.inf
+
+    def heard(self, controller, now):
+        """Note a message; whether two send in turn."""
+        if controller != self._last:
+            if controller in self.ids:
+                self._until = now + self.alone
+                self.pair = tuple(sorted((controller, self._last)))
+            self._last = controller
+            self.ids.add(controller)
+        return self.several(now)
+
+    def several(self, now):
+        """Whether two send in turn."""
+        return now < self._until
+
+
+class TorqueLimit:
+    """Clips torques to the joints' limits.
+
+    Parameters
+    ----------
+    arm : Arm
+
+    Attributes
+    ----------
+    clipped : int
+        Torques that went beyond a limit.
+    """
+
+    def __init__(self, arm):
+        self._limit = np.array([j.limits.torque for j in arm.joints])
+        self._torque = np.zeros(len(arm.joints))
+        self.clipped = 0
+
+    def clip(self, torque):
+        """The torque within the limits, shape (n,) [N m]; valid until the next call."""
+        np.clip(torque, -self._limit, self._limit, out=self._torque)
+        self.clipped += bool((self._torque != torque).any())
+        return self._torque
+
+
 class TorqueGate:
     """Lets one controller's fresh torque through, clipped to the joints' limits.
 
@@ -39,7 +106,7 @@ class TorqueGate:
     def __init__(self, arm, timeout):
         self.timeout = timeout
         self._reader = TorqueReader(arm)
-        self._limit = np.array([j.limits.torque for j in arm.joints])
+        self._limit, self._controllers = TorqueLimit(arm), Controllers(self.ALONE)
         self._torque = np.zeros(len(arm.joints))
         self.refused = self.clipped = 0
         self.begin(0)
@@ -50,8 +117,7 @@ class TorqueGate:
         self._sent = {}  # sequence -> time of its publication, oldest first
         self._answered = None
         self._until = -np.inf
-        self._controller, self._others = None, set()
-        self._several_until = -np.inf
+        self._controllers.forget()
         self.reason = "no torque yet"
 
     def sent(self, sequence, now):
@@ -70,7 +136,7 @@ class TorqueGate:
         """
         if message.session != self.session:
             return f"torque for session {message.session}, this is session {self.session}"
-        if self._several(message.controller_id, now):
+        if self._controllers.heard(message.controller_id, now):
             return self._close("several controllers publish joint_torque: stop all but one")
         if message.sequence not in self._sent:
             return f"torque for state {message.sequence}, which is older than the timeout or was never sent"
@@ -84,8 +150,8 @@ class TorqueGate:
         self._answered = message.sequence
         if torque is None:
             return self._close("the controller says DISABLED")
-        np.clip(torque, -self._limit, self._limit, out=self._torque)
-        self.clipped += bool((self._torque != torque).any())
+        self._torque[:] = self._limit.clip(torque)
+        self.clipped = self._limit.clipped
         self._until = self._sent[message.sequence] + self.timeout
         self.reason = ""
         return ""
@@ -101,12 +167,3 @@ class TorqueGate:
     def _close(self, reason):
         self._until, self.reason = -np.inf, reason
         return reason
-
-    def _several(self, controller, now):
-        """Whether an id has come back after another one; one that was restarted has a new id."""
-        if controller != self._controller:
-            if controller in self._others:
-                self._several_until = now + self.ALONE
-            self._controller = controller
-            self._others.add(controller)
-        return now < self._several_until

@@ -7,7 +7,7 @@ import pytest
 
 from flexarm_dynamics import arm_file
 from flexarm_msgs.msg import JointTorque
-from flexarm_ros.torque_gate import TorqueGate
+from flexarm_ros.torque_gate import Controllers, TorqueGate, TorqueLimit
 
 SESSION, TIMEOUT = 77, 0.05
 LIMIT = 13.558179483314  # [N m] 10 lbf ft
@@ -115,3 +115,21 @@ def test_sequence_wraps_as_uint32(gate):
     assert gate.offer(torque(1.0, sequence=2**32 - 1), 0.051) == ""
     assert gate.offer(torque(2.0, sequence=0), 0.052) == ""
     np.testing.assert_array_equal(gate.torque(0.06), [2.0])
+
+
+def test_controllers_are_told_apart_in_whatever_unit_of_time():
+    heard = Controllers(alone=100)
+    assert not heard.heard(7, 0) and not heard.heard(8, 1)  # 8: the same one, restarted
+    assert heard.pair == ()
+    assert heard.heard(7, 2) and heard.pair == (7, 8)
+    assert heard.heard(7, 101) and not heard.heard(7, 102)
+    heard.forget()
+    assert heard.ids == set() and not heard.heard(8, 103)
+
+
+def test_a_limit_clips_each_joint_and_counts_torques():
+    limit = TorqueLimit(arm_file.load("two_link"))
+    np.testing.assert_array_equal(limit.clip(np.array([5.0, -2.0])), [5.0, -2.0])
+    assert limit.clipped == 0
+    np.testing.assert_array_equal(limit.clip(np.array([9.0, -2.5])), [5.0, -2.0])
+    assert limit.clipped == 1

@@ -14,8 +14,11 @@ from flexarm_ros import qos
 from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
 from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.start import leave
+from flexarm_ros.torque_gate import Controllers, TorqueGate, TorqueLimit
 from flexarm_sim import simulator
 
+#: In lockstep, after two controllers were heard in turn one has to be silent for so many samples.
+ALONE_SAMPLES = 100
 #: Sequence numbers on the topics are uint32.
 WRAP = 2**32
 
@@ -108,7 +111,10 @@ class SimulatorNode(ArmNode):
         self._joint_state = JointState(name=list(self.arm.joint_names))
         self._fill()
         self._late, self._refused, self._waited, self._before = 0, 0, 0, 0
-        self._controllers, self._several, self._controller = set(), set(), None
+        real_time = round(1e9 * TorqueGate.ALONE)
+        alone = ALONE_SAMPLES * self.sim.period_ns if self._lockstep else real_time
+        self._controllers, self._limit = Controllers(alone), TorqueLimit(self.arm)
+        self._several = False  # since the last diagnostics
         self._fault = ""
         self._make_topics()
 
@@ -159,11 +165,13 @@ class SimulatorNode(ArmNode):
             return
         try:
             torque = self._reader.read(msg)
+            torque = None if torque is None else self._limit.clip(torque)
         except MessageError as error:
             self._refused += 1
             self.report(f"joint_torque {msg.sequence}: {error}: the safe action is applied")
             torque = None
-        self._watch_controllers(msg.controller_id)
+        if self._in_turn(msg.controller_id):
+            torque = None
         if self._lockstep:
             if msg.sequence != self.sim.sequence:
                 return  # an answer to a state that was sent again
@@ -245,16 +253,17 @@ class SimulatorNode(ArmNode):
                 " running, on this domain, with this arm?"
             )
 
-    def _watch_controllers(self, controller_id):
-        """An id that comes back after another one: two controllers. One that was restarted has a new id."""
-        if controller_id == self._controller:
-            return
-        if controller_id in self._controllers:
-            self._several = {controller_id, self._controller}
-            ids = ", ".join(str(i) for i in sorted(self._several))
-            self.report(f"joint_torque comes from several controllers ({ids}): stop all but one")
-        self._controller = controller_id
-        self._controllers.add(controller_id)
+    def _in_turn(self, controller_id):
+        """Whether two controllers send in turn: then neither moves the arm."""
+        controllers = self._controllers
+        if not controllers.heard(controller_id, self.sim.stamp_ns):
+            return False
+        self._several = True
+        ids = ", ".join(str(i) for i in controllers.pair)
+        self.report(
+            f"joint_torque comes from several controllers ({ids}): the safe action is applied; stop all but one"
+        )
+        return True
 
     # Services --------------------------------------------------------------------------------
 
@@ -262,7 +271,8 @@ class SimulatorNode(ArmNode):
         self.sim.reset()
         self._session = (self._session + 1) % 2**32
         self._answered, self._answer, self._fault = None, None, ""
-        self._controllers, self._several, self._controller = set(), set(), None
+        self._controllers.forget()
+        self._several = False
         self._pause_first()
         self._fill()
         self._publish()
@@ -289,13 +299,14 @@ class SimulatorNode(ArmNode):
             "samples per second": done,
             "periods without a fresh torque": self._late,
             "torques refused": self._refused,
-            "controllers seen": len(self._controllers),
+            "torques clipped": self._limit.clipped,
+            "controllers seen": len(self._controllers.ids),
         }
         if self.line is not None and not self._lockstep:
             values["periods lost"] = self.line.lost
         if self._fault:
             return ERROR, self._fault, values
-        several, self._several = self._several, set()
+        several, self._several = self._several, False
         if several:
             return ERROR, "several controllers publish joint_torque: stop all but one", values
         if self._paused:
