@@ -51,7 +51,8 @@ def packed(values, specs, sizes):
     fields = {name: np.asarray(value) for name, value in values._asdict().items()}
     shapes = {name: _shape(specs[name], sizes) for name in fields}
     kind = [(name, field.dtype, shapes[name]) for name, field in fields.items()]
-    record = np.zeros(1, np.dtype(kind, align=True)).view(np.recarray)
+    # No recarray: its attribute look-ups in Python cost more per call than the kernels do.
+    record = np.zeros(1, np.dtype(kind, align=True))
     for name, field in fields.items():
         record[name][(0, *(slice(n) for n in field.shape))] = field
     return record

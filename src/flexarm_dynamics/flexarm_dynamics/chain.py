@@ -213,16 +213,37 @@ class Chain(ArmModel):
         """
         n = self.n_joints
         q, qd = self._joint(q, "q"), self._joint(qd, "qd")
-        K, C = self.linearisation(q, qd)
         if delta is None:
-            f = self.forces(q, qd)
+            K, C, f = self._straight_arm(q, qd)
         else:
+            K, C = self.linearisation(q, qd)
             delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
             f = self.forces(q, qd, delta, delta_d) - K @ delta - C @ delta_d
         f[:n] += self.friction(qd)
         return Terms(
             M=self.mass_matrix(q, delta), f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:]
         )
+
+    @cached_property
+    def _straight(self):
+        """What `_straight_arm` works in: position, velocity, then zeros, and room for the forces; all complex."""
+        n, m = self.n_joints, self.n_modes
+        return tuple(np.zeros(size, complex) for size in (n, n, m, m, n, m, n + m))
+
+    def _straight_arm(self, q, qd):
+        """K, C and forces without deflections: control laws ask for them at every sample."""
+        n, m = self.n_joints, self.n_modes
+        K, C = np.zeros((n + m, m)), np.zeros((n + m, m))
+        if not m:
+            return K, C, self.forces(q, qd)
+        position, velocity, delta, delta_d, zero, modal_zero, out = self._straight
+        position[:], velocity[:] = q, qd
+        self.complex_kernel.linearise(
+            self._data, self._complex_work, position, delta, velocity, delta_d, STEP, zero, modal_zero, out,
+            K, C,
+        )  # fmt: skip
+        # The last derivative's real part: an imaginary step does not change it.
+        return K, C, out.real.copy()
 
     def derivative(self, state, torque):
         n, m = self.n_joints, self.n_modes

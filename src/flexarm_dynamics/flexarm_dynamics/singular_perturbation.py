@@ -103,6 +103,32 @@ def slow_subsystem(terms):
     return a, H11 - lift @ H21
 
 
+def slow_torque(terms, acceleration):
+    r"""Torque that gives the slow subsystem (10) an acceleration: :math:`\bar u = B^{-1}(\ddot q - a)`.
+
+    From the joint rows of (2) with the modes at rest under their own rows, without inverting anything twice:
+
+    .. math:: \bar u = M_{11}\ddot q + f_1 - K_1 K_2^{-1}(M_{21}\ddot q + f_2)
+
+    Parameters
+    ----------
+    terms : Terms
+        Without deflections.
+    acceleration : ndarray, shape (n,)
+        [rad/s^2]
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        [N m]
+    """
+    M, n = terms.M, terms.n
+    torque = M[:n, :n] @ acceleration + terms.f1
+    if terms.K1.any():
+        torque -= terms.K1 @ np.linalg.solve(terms.K2, M[n:, :n] @ acceleration + terms.f2)
+    return torque
+
+
 def fast_subsystem(terms):
     """A2 (2m, 2m) and B2 (2m, n) of the boundary layer (11), in the time t (mu taken into A2)."""
     s = state_space(terms)

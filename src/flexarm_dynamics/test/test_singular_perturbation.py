@@ -10,7 +10,7 @@ from flexarm_dynamics import arm_file
 from flexarm_dynamics import singular_perturbation as sp
 from flexarm_dynamics.arm import Friction
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import Terms
+from flexarm_dynamics.model import Terms, build
 from flexarm_dynamics.one_link import OneLink
 from flexarm_dynamics.units import POUND_FORCE, POUND_FORCE_FOOT
 
@@ -453,3 +453,26 @@ def test_torque_and_deflection_units_do_not_matter_to_the_poles(shipped, errata)
     np.testing.assert_allclose(
         np.sort_complex(np.linalg.eigvals(A)), np.sort_complex(np.linalg.eigvals(same)), rtol=1e-8
     )
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_slow_torque_gives_the_slow_subsystem_its_acceleration(gravity):
+    rng = np.random.default_rng(5)
+    for n, m in ((1, 2), (2, 3), (4, 1)):
+        terms = random_terms(rng, n, m, gravity)
+        wanted = rng.standard_normal(n)
+        a, B = sp.slow_subsystem(terms)
+        np.testing.assert_allclose(a + B @ sp.slow_torque(terms, wanted), wanted, atol=1e-12)
+
+
+def test_terms_of_the_straight_arm_hold_the_forces_and_their_derivatives():
+    model = build(arm_file.load("long_reach"))
+    for sign in (1.0, -1.0):  # the room that is used again carries nothing over
+        q, qd = np.array([0.3, sign, 1.1, -0.4]), sign * np.array([0.2, -0.5, 0.1, 0.7])
+        terms = model.terms(q, qd)
+        forces, (K, C) = model.forces(q, qd), model.linearisation(q, qd)
+        forces[: model.n_joints] += model.friction(qd)
+        found = np.concatenate([terms.f1, terms.f2])
+        np.testing.assert_allclose(found, forces, rtol=1e-13, atol=1e-12)
+        np.testing.assert_array_equal(np.vstack([terms.K1, terms.K2]), K)
+        np.testing.assert_array_equal(np.vstack([terms.C1, terms.C2]), C)

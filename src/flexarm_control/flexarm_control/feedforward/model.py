@@ -175,6 +175,8 @@ class ModelFeedforward(Feedforward):
         n, m = model.n_joints, model.n_modes
         self._advance = model.stepper(METHODS["rk4"])
         self._substeps = substeps(model, settings.period, "rk4")
+        # Compiled code is loaded at its first call: not on the control path.
+        self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
         self.state, self._error = np.zeros(2 * (n + m)), np.zeros(2 * (n + m))
         parts = np.split(self.state, [n, n + m, 2 * n + m])
         self.position, self.amplitude, self.velocity, self.rate = parts

@@ -2,10 +2,8 @@
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-
 from flexarm_dynamics.parameters import Parameter
-from flexarm_dynamics.singular_perturbation import slow_subsystem
+from flexarm_dynamics.singular_perturbation import slow_torque
 
 KP = Parameter(
     "kp",
@@ -77,8 +75,7 @@ class SlowLaw(ABC):
         acceleration : ndarray, shape (n,)
             The reference's [rad/s^2].
         """
-        a, B = slow_subsystem(terms)
-        return np.linalg.solve(B, acceleration - a)
+        return slow_torque(terms, acceleration)
 
     def reset(self):
         """A new session begins: forget what was learnt from the samples of the last one."""

@@ -14,7 +14,7 @@ Assumes that a(x) and B(x) are known: gravity, friction and payload as in the ar
 
 import numpy as np
 
-from flexarm_dynamics.singular_perturbation import slow_subsystem
+from flexarm_dynamics.singular_perturbation import slow_torque
 
 from .base import KP, KV, SlowLaw
 
@@ -39,5 +39,4 @@ class ModelFollowing(SlowLaw):
             - self.Lambda1 * reference.velocity
         )
         v = self.Lambda0 * q + self.Lambda1 * qd + u_hat
-        a, B = slow_subsystem(terms)
-        return np.linalg.solve(B, v - a)
+        return slow_torque(terms, v)
