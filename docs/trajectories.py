@@ -1,4 +1,6 @@
-"""The tables of docs/trajectories.md: what shapers and motions leave of vibration. `python docs/trajectories.py`
+"""The tables of docs/trajectories.md: what shapers and motions leave of vibration.
+
+Made by `python docs/trajectories.py`.
 
 The arm gets the slow torque (10) of the motion and nothing else, no feedback: the full model, integrated, from rest.
 """

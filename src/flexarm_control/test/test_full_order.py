@@ -50,8 +50,10 @@ def test_fast_sampling_gives_the_continuous_poles_of_the_papers_design(arm_r):
 
 
 def test_errata_poles(arm_r):
-    """R, m11, composite: -1.773, -3.945 +- 4.941j, -34.51, -34.49 +- 77.57j; with the reference's manifold
-    -1.532 +- 1.509j, -12.49, -20.78, -35.77 +- 79.95j."""
+    """Poles of R, m11, composite: -1.773, -3.945 +- 4.941j, -34.51, -34.49 +- 77.57j.
+
+    With the reference's manifold -1.532 +- 1.509j, -12.49, -20.78, -35.77 +- 79.95j.
+    """
     fine = 1e-5
     paper = full_order.poles(design(arm_r, SLOW, PAPER), np.zeros(1), fine)
     assert_allclose(

@@ -154,7 +154,6 @@ def by_runs(subject, kind, value):
         where the loop with its observer loses stability if it is elsewhere, else None; ``at_least``: whether
         that is only how far was looked.
     """
-
     unstable = kind.poles(subject, _beside(kind, value, 1.02))
     watched = trial.long_enough(subject.poles(**unstable)[0])
 

@@ -442,7 +442,9 @@ class Problem:
 
 
 def bandwidth(r):
-    r"""Lags L of the covariance for residuals (s, c): :math:`1.1447\,(\alpha s)^{1/3}` with
+    r"""Lags L of the covariance for residuals (s, c).
+
+    L is :math:`1.1447\,(\alpha s)^{1/3}` with
     :math:`\alpha = 4\rho^2/(1 - \rho^2)^2` of the channel with the largest correlation :math:`\rho` from one
     sample to the next.
     """

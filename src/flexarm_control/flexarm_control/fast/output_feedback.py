@@ -102,7 +102,7 @@ class OutputFeedback(FastLaw):
         self.reset()
 
     def _check_period(self, q):
-        """The regulator is designed in continuous time and held in discrete: is it stable so?"""
+        """Refuse a period that the regulator, designed in continuous time and held in discrete, is not stable with."""
         period = self.parameters["period"]
         Phi, Gamma, _ = self._step(period)
         self._refuse_long(period)

@@ -272,7 +272,6 @@ def _lengths(name, column):
 
 def _numbers(name, column, n):
     """Return the values of all points, n each, one after the other, as a flat float array."""
-
     # array() rather than numpy: it refuses None and strings, which numpy would convert; and it
     # copies the array('d') of a ROS message whole.
     numbers = array("d")
