@@ -31,7 +31,7 @@ def test_a_descriptor_has_text_unit_range_and_whether_it_is_read_only(node):
             assert len(made.floating_point_range) == (parameter.kind == "float"), name
         else:
             assert not spans, name
-        if parameter.kind.endswith("array"):  # ROS has ranges for single numbers only
+        if parameter.kind in ("float_array", "int_array"):  # ROS has ranges for single numbers only
             assert made.additional_constraints, name
         if parameter.choices:
             assert all(choice in made.additional_constraints for choice in parameter.choices), name
