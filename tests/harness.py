@@ -318,6 +318,14 @@ class Arm:
         assert answer.success, answer.message
         return self.wait_standing(int(answer.message.split()[-1]))
 
+    def run(self, seconds):
+        """Run on for so long, then stand; the samples of the session by stamp [ns]."""
+        end = self.now + round(seconds * 1e9)
+        self.pause(False)
+        self.wait_until(end)
+        self.stand()
+        return self.samples()
+
     def wait_standing(self, sequence=None, session=None):
         """Until the loop stands, ready, at a sample (`pauses_at`) of a session (any); its stamp [ns]."""
         sequence = self.pauses_at if sequence is None else sequence

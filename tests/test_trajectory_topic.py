@@ -41,15 +41,6 @@ def arm(loop, counter=itertools.count(1)):  # noqa: B008
     return loop
 
 
-def run(arm, seconds):
-    """Run on for so long, then pause; the samples of the session by stamp [ns]."""
-    end = arm.now + round(seconds * 1e9)
-    arm.pause(False)
-    arm.wait_until(end)
-    arm.stand()
-    return arm.samples()
-
-
 def column(samples, field, begin=0, end=2**63):
     """A field of joint1 over the samples from begin to end [ns]."""
     return np.array([getattr(m, field)[0] for s, m in samples.items() if begin <= s <= end])
@@ -127,13 +118,45 @@ REFUSED = {
 }
 
 
+def test_a_hundred_thousand_points_are_refused_and_the_loop_goes_on(arm):
+    point = trajectory(J, (1.0, [0.1])).points[0]
+    message = trajectory(J)
+    message.points = [point] * 100_000
+    assert re.search("100000 points, at most 10000 are taken", arm.refused(message))
+    assert arm.state.supervisor_state == CompositeState.READY
+
+
+def test_a_trajectory_of_thousands_of_points_is_followed(arm):
+    t = np.arange(1, 2001) * 1e-4
+    s = np.sin(np.pi * t)
+    number = arm.offer(trajectory(J, *((at, [0.1 * x]) for at, x in zip(t, s, strict=True))))
+    samples = arm.run(0.3)
+    assert arm.state.accepted_trajectory_id == number
+    assert arm.state.reference_position[0] == 0.1 * s[-1]
+    assert len(samples) > 250
+
+
+def test_trajectories_streamed_at_50_hz_make_one_smooth_motion(arm):
+    goals, first = 0.02 * np.arange(1, 11), arm.state.accepted_trajectory_id
+    for goal in goals:
+        arm.offer(trajectory(J, (0.1, [goal])))
+        arm.run(0.02)
+    samples = arm.run(0.2)
+    assert arm.state.accepted_trajectory_id == first + len(goals)
+    assert arm.state.reference_position[0] == pytest.approx(goals[-1])
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    position = column(samples, "reference_position")
+    steps = np.abs(np.diff(position) / np.diff(list(samples)))
+    assert steps.max() < 3e-9  # [rad/ns] never a jump: a ramp of 0.1 s to the goal ahead
+
+
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_trajectory_that_cannot_be_followed_is_refused_with_a_reason_and_the_arm_holds(arm, case):
     message, reason = REFUSED[case]
     accepted = arm.state.accepted_trajectory_id
     assert re.search(reason, arm.refused(message)), arm.state.rejected_reason
     begin = arm.now
-    samples = run(arm, 0.02)
+    samples = arm.run(0.02)
     assert arm.state.accepted_trajectory_id == accepted
     assert arm.state.supervisor_state == CompositeState.READY
     for field in ("reference_position", "reference_velocity", "reference_acceleration"):
@@ -148,9 +171,9 @@ def test_a_refused_trajectory_leaves_the_one_that_is_followed(arm):
     quintic = profiles.quintic(0.0, 0.5, 0.4)
     number = arm.offer(trajectory(J, (0.4, [0.5], [0.0], [0.0])))
     start = arm.now + MS  # the first sample after the pause
-    run(arm, 0.1)
+    arm.run(0.1)
     assert "nan" in arm.refused(trajectory(J, (1.0, [NAN])))
-    samples = run(arm, 0.4)
+    samples = arm.run(0.4)
     assert arm.state.accepted_trajectory_id == number
     follows(samples, start, quintic, 0.4)
 
@@ -176,7 +199,7 @@ def follows(samples, start, profile, duration, atol=1e-12):
 def test_stamp_0_starts_at_the_first_state_after_it_arrived(arm):
     arm.offer(trajectory(J, (0.2, [0.3], [0.0], [0.0])))
     standing = arm.now
-    samples = run(arm, 0.3)
+    samples = arm.run(0.3)
     assert column(samples, "reference_position", standing, standing) == [0.0]
     follows(samples, standing + MS, profiles.quintic(0.0, 0.3, 0.2), 0.2)
 
@@ -185,7 +208,7 @@ def test_an_explicit_stamp_starts_there_to_the_nanosecond(arm):
     start = arm.now + 50 * MS + 300_000  # between two samples
     arm.offer(trajectory(J, (0.2, [0.3], [0.0], [0.0]), stamp=start))
     assert arm.state.supervisor_state == CompositeState.READY
-    samples = run(arm, 0.3)
+    samples = arm.run(0.3)
     assert set(column(samples, "reference_position", 0, start)) == {0.0}
     follows(samples, start, profiles.quintic(0.0, 0.3, 0.2), 0.2)
     tracking = [s for s, m in samples.items() if m.supervisor_state == CompositeState.TRACKING]
@@ -195,7 +218,7 @@ def test_an_explicit_stamp_starts_there_to_the_nanosecond(arm):
 def test_a_single_point_with_positions_only_ramps_there_and_is_held(arm):
     arm.offer(trajectory(J, (0.1, [0.05])))
     start = arm.now + MS
-    samples = run(arm, 0.3)
+    samples = arm.run(0.3)
     ramp = column(samples, "reference_position", start, start + 100 * MS)
     t = np.array([stamp for stamp in samples if start <= stamp <= start + 100 * MS]) - start
     np.testing.assert_allclose(ramp, 0.5e-9 * t, rtol=0, atol=1e-12)
@@ -217,14 +240,14 @@ def test_an_identical_repeat_does_not_restart_the_motion_under_way_or_after_its_
             arm.publish_trajectory(motion)
         arm.refused(trajectory([fence], (1.0, [0.0])))
 
-    run(arm, 0.1)
+    arm.run(0.1)
     repeat("fence1")
-    run(arm, 0.1)
+    arm.run(0.1)
     repeat("fence2")
-    run(arm, 0.2)
+    arm.run(0.2)
     assert arm.state.supervisor_state == CompositeState.HOLDING
     repeat("fence3")
-    samples = run(arm, 0.05)
+    samples = arm.run(0.05)
     assert arm.state.accepted_trajectory_id == number
     assert arm.state.supervisor_state == CompositeState.HOLDING
     follows(samples, start, profiles.quintic(0.0, 0.4, 0.3), 0.3)
@@ -244,7 +267,7 @@ def test_a_new_trajectory_takes_over_with_a_continuous_reference_velocity(arm, f
     start = arm.now + 10 * MS if stamped else 0
     goal = arm.state.reference_position[0] + 0.1
     assert arm.offer(trajectory(J, point(0.3, goal), stamp=start)) == first + 1
-    samples = run(arm, 0.4)
+    samples = arm.run(0.4)
     velocity = column(samples, "reference_velocity")
     acceleration = np.abs(column(samples, "reference_acceleration")).max()
     # By the stamps: on a depth of one a sample may be lost on its way here.

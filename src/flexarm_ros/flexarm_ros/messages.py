@@ -3,11 +3,13 @@
 Numbers are cast here: a Python int or numpy scalar assigned to a float64 field is published as garbage.
 """
 
+import struct
 from array import array
 
 import numpy as np
 
 from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.shown import listed, show
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 
 SECOND = 1_000_000_000
@@ -38,10 +40,10 @@ class _Columns:
         if sorted(names) != sorted(self.names):
             missing = [n for n in self.names if n not in names]
             unknown = [n for n in names if n not in self.names]
-            wrong = [f"missing {', '.join(missing)}"] if missing else []
-            wrong += [f"unknown {', '.join(unknown)}"] if unknown else []
+            wrong = [f"missing {listed(missing)}"] if missing else []
+            wrong += [f"unknown {listed(unknown)}"] if unknown else []
             raise MessageError(
-                f"{self.field} {list(names)}: {'; '.join(wrong) or 'a name twice'} (this arm has"
+                f"{self.field} {show(list(names))}: {'; '.join(wrong) or 'a name twice'} (this arm has"
                 f" {self.names})"
             )
         self._seen = list(names)
@@ -296,3 +298,35 @@ class ObserverStateWriter:
         msg.gauge_health = array("B", judged)
         msg.converged = observer.converged
         return msg
+
+
+def trajectory_points(raw):
+    """Number of points of a serialised `JointTrajectory`, without reading them.
+
+    Parameters
+    ----------
+    raw : bytes
+        XCDR1 with its encapsulation header: the stamp, frame_id, joint_names, the points' number.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    struct.error, IndexError
+        When the bytes end before.
+    """
+    unpack = struct.Struct("<I" if raw[1] & 1 else ">I").unpack_from
+
+    def number(at):
+        """The uint32 at, or after, an offset; and what comes after it."""
+        at += -at % 4
+        return unpack(raw, at)[0], at + 4
+
+    length, at = number(4 + 8)
+    names, at = number(at + length)
+    for _ in range(names):
+        length, at = number(at)
+        at += length
+    return number(at)[0]

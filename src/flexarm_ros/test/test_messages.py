@@ -2,6 +2,7 @@
 
 import math
 import os
+import struct
 import subprocess
 import sys
 from array import array
@@ -12,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from flexarm_control.arm_observer import ArmObserver, design_observer
 from flexarm_control.samples import ArmSample
@@ -25,6 +27,7 @@ from flexarm_ros.messages import (
     TorqueWriter,
     set_stamp,
     stamp_ns,
+    trajectory_points,
 )
 
 NAN, INF = math.nan, math.inf
@@ -295,6 +298,7 @@ import sys
 from types import SimpleNamespace
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from flexarm_control.arm_controller import PARAMETERS, ArmController
 from flexarm_control.composite import design
 from flexarm_control.samples import ArmSample
@@ -412,3 +416,19 @@ def test_stamps_are_nanoseconds_to_the_last_one(ns):
     message = ArmState()
     set_stamp(message.header.stamp, ns)
     assert stamp_ns(over_the_wire(message).header.stamp) == ns
+
+
+@pytest.mark.parametrize("count", [0, 1, 777])
+@pytest.mark.parametrize("names", [[], ["joint1"], ["a", "", "shoulder"]])
+@pytest.mark.parametrize("frame", ["", "b", "base"])
+def test_the_points_of_a_serialised_trajectory_are_counted_without_reading_them(
+    count, names, frame
+):
+    point = JointTrajectoryPoint(positions=[0.1] * len(names))
+    message = JointTrajectory(joint_names=names, points=[point] * count)
+    message.header.frame_id = frame
+    raw = serialize_message(message)
+    assert trajectory_points(raw) == count
+    for cut in (0, 1, 5, 13):
+        with pytest.raises((struct.error, IndexError)):
+            trajectory_points(raw[:cut])

@@ -8,6 +8,7 @@ from time import perf_counter
 
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -21,7 +22,13 @@ from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros import qos
-from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter, stamp_ns
+from flexarm_ros.messages import (
+    CompositeStateWriter,
+    StateReader,
+    TorqueWriter,
+    stamp_ns,
+    trajectory_points,
+)
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
@@ -57,6 +64,8 @@ STATE_TIMEOUT = Parameter(
     read_only=True,
 )
 
+#: Longer trajectories are refused: their points are read in one go.
+MOST_POINTS = 10_000
 #: How long the last torque, DISABLED, is waited for to arrive.
 LAST_WORD = Duration(seconds=0.2)
 
@@ -87,6 +96,7 @@ class ControllerNode(ArmNode):
         # goes back to the control path within this time, where 5 ms are usual.
         sys.setswitchinterval(1e-4)
         self._designer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
+        self._receiver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="trajectory")
 
     def build(self):
         parameters = self.parameters
@@ -137,6 +147,7 @@ class ControllerNode(ArmNode):
             self._on_trajectory,
             qos.COMMAND,
             qos_overriding_options=options,
+            raw=True,
         )
         self.make_service(Trigger, "~/stop", self._on_stop)
         self.make_service(Trigger, "~/recover", self._on_recover)
@@ -239,42 +250,56 @@ class ControllerNode(ArmNode):
 
     # Trajectories ----------------------------------------------------------------------------
 
-    def _on_trajectory(self, msg):
-        if not self.active:
+    def _on_trajectory(self, raw):
+        """A serialised message: to turn thousands of points into objects is no work for the control path."""
+        if self.active:
+            self._receiver.submit(self._receive, raw, self.core.law)
+
+    def _receive(self, raw, law):
+        """In a thread of its own: the trajectory, and what the feed-forward wants to know before it is offered."""
+        try:
+            data = self._read_trajectory(raw)
+        except TrajectoryError as error:
+            self.hand_over(self._refuse, str(error))
             return
+        except Exception as error:  # anybody's bytes
+            self.hand_over(self._refuse, f"no JointTrajectory: {type(error).__name__}: {error}")
+            return
+        plan = None
+        try:
+            if self.core.plans:
+                plan = self.core.prepare(data, law)
+        except Exception as error:
+            what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+            self.get_logger().warning(f"trajectory without preview: {what}{error}")
+        self.hand_over(self._offer, data, plan)
+
+    def _read_trajectory(self, raw):
+        count = trajectory_points(raw)
+        if count > MOST_POINTS:
+            raise TrajectoryError(
+                f"{count} points, at most {MOST_POINTS} are taken: send fewer, a quintic polynomial joins them, or"
+                " one trajectory after another"
+            )
+        msg = deserialize_message(raw, JointTrajectory)
         low, high, velocity = self._limits
         points = [
             (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
             for p in msg.points
         ]
-        try:
-            data = trajectory.validate(
-                msg.joint_names,
-                self.arm.joint_names,
-                stamp_ns(msg.header.stamp),
-                points,
-                position_low=low,
-                position_high=high,
-                velocity_max=velocity,
-            )
-        except TrajectoryError as error:
-            self.core.refuse(str(error))
-            self.get_logger().warning(f"trajectory refused: {error}")
-            return
-        if self.core.plans:
-            self._designer.submit(self._prepare, data, self.core.law)
-        else:
-            self._offer(data)
+        return trajectory.validate(
+            msg.joint_names,
+            self.arm.joint_names,
+            stamp_ns(msg.header.stamp),
+            points,
+            position_low=low,
+            position_high=high,
+            velocity_max=velocity,
+        )
 
-    def _prepare(self, data, law):
-        """In the design thread: what the feed-forward wants to know before the trajectory is offered."""
-        plan = None
-        try:
-            plan = self.core.prepare(data, law)
-        except Exception as error:
-            what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
-            self.get_logger().warning(f"trajectory without preview: {what}{error}")
-        self.hand_over(self._offer, data, plan)
+    def _refuse(self, reason):
+        self.core.refuse(reason)
+        self.get_logger().warning(f"trajectory refused: {reason}")
 
     def _offer(self, data, plan=None):
         verdict = self.core.offer(data, plan)
@@ -365,7 +390,8 @@ class ControllerNode(ArmNode):
         self._torque_pub.wait_for_all_acked(LAST_WORD)
 
     def destroy_node(self):
-        self._designer.shutdown(wait=False, cancel_futures=True)
+        for worker in (self._designer, self._receiver):
+            worker.shutdown(wait=False, cancel_futures=True)
         super().destroy_node()
 
     def diagnose(self):
