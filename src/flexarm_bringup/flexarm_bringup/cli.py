@@ -66,6 +66,12 @@ def _observers(options):
     observers(options)
 
 
+def _robustness(options):
+    from .robustness import robustness
+
+    robustness(options)
+
+
 def _analyze(options):
     from .analysis.command import analyze
 
@@ -173,7 +179,7 @@ def parser():
 
 def _add_arm_commands(commands):
     """What needs an arm file and no ROS."""
-    from . import gauges, inspect_arm, observer_table, simulate
+    from . import gauges, inspect_arm, observer_table, robustness, simulate
 
     command = commands.add_parser(
         "simulate",
@@ -217,6 +223,15 @@ def _add_arm_commands(commands):
     )
     observer_table.add_arguments(command)
     command.set_defaults(function=_observers)
+    command = commands.add_parser(
+        "robustness",
+        help="how many lost samples, and how much random delay, a loop bears",
+        description="Carries out a motion with samples lost at random, and separately with random delays, at rising"
+        " levels, and tells where the loop breaks.",
+        epilog="example: flexarm robustness R --controller paper_composite --loss 0:0.1:0.9 --delay 0:4:40",
+    )
+    robustness.add_arguments(command)
+    command.set_defaults(function=_robustness)
 
 
 def _add_analyze(commands):

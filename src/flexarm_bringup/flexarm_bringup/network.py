@@ -133,7 +133,7 @@ class NetworkedLoop(ClosedLoop):
         while arrived := self.network.receive(now):
             self._take(*arrived)
         if now - self._heard_ns > 1e9 * STATE_TIMEOUT and self.controller.enabled:
-            self.controller.disable(f"no sample for {STATE_TIMEOUT:g} s")
+            self.controller.distrust(f"no sample for {STATE_TIMEOUT:g} s")
             self._torque = None
         return self.controller.enabled
 
