@@ -42,10 +42,18 @@ def unseal(line):
         return None
 
 
+#: A larger number is a damaged one: a double holds each count up to here [-].
+MOST = 2**53
+
+
 def frame(line, joints, gauges):
     """The `Frame` of a line; None where it is not one of `joints` and `gauges`."""
     word, numbers = unseal(line) or ("", [])
     if word != "S" or len(numbers) != 2 + 2 * joints + gauges:
+        return None
+    if (
+        min(numbers[:2]) < 0 or max(map(abs, numbers)) > MOST
+    ):  # one checksum in 256 is right by chance
         return None
     values = numbers[2:]
     return Frame(

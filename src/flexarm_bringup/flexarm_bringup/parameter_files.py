@@ -47,9 +47,10 @@ def load(name):
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
         sections = {key: _flat(section["ros__parameters"]) for key, section in data.items()}
-    except (yaml.YAMLError, OSError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        # ValueError: text that is no UTF-8, or a scalar that is not what it looks like, as a 13th month.
         raise ParameterError(f"{path}: can't be read: {error}") from None
-    except (TypeError, KeyError, AttributeError):
+    except (TypeError, KeyError, AttributeError, IndexError):
         raise ParameterError(
             f"{path}: not a ROS parameter file (node name: ros__parameters: …)"
         ) from None

@@ -235,7 +235,13 @@ def check(law, q, rate, margin=0.0):
     DesignError
         Naming the pole.
     """
-    slowest = poles(law, q, 1.0 / rate)[0]
+    try:
+        slowest = poles(law, q, 1.0 / rate)[0]
+    except np.linalg.LinAlgError as error:
+        raise DesignError(
+            f"the poles of the full-order closed loop, sampled at {rate:g} Hz, can't be computed ({error}): the gains"
+            " are beyond what a double holds: lower them"
+        ) from None
     if slowest.real < -margin + ROUNDING:
         return
     where = f"{slowest.real:.4g}" + (f" +- {abs(slowest.imag):.4g}j" if slowest.imag else "")

@@ -27,6 +27,7 @@ from .arm import (
     Payload,
 )
 from .errors import ArmFileError
+from .shown import show
 from .units import SI_UNIT, to_si
 
 #: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
@@ -149,7 +150,9 @@ class _Section:
         if choices and value not in choices:
             close = difflib.get_close_matches(value, choices, 1)
             hint = f"; {close[0]!r}?" if close else ""
-            raise ArmFileError(self.at(key), f"{value!r} is not one of {', '.join(choices)}{hint}")
+            raise ArmFileError(
+                self.at(key), f"{show(value)} is not one of {', '.join(choices)}{hint}"
+            )
         return value
 
     def flag(self, key):
@@ -190,7 +193,7 @@ def _kind(value):
         return "a mapping"
     if isinstance(value, int) and value.bit_length() > 64:
         return "an integer of more than 64 bits"
-    return "a list" if isinstance(value, list) else repr(value)
+    return "a list" if isinstance(value, list) else show(value)
 
 
 def _number(value, path):
@@ -199,7 +202,7 @@ def _number(value, path):
         try:
             value = float(value)
         except ValueError:
-            raise ArmFileError(path, f"{value!r} is not a number") from None
+            raise ArmFileError(path, f"{show(value)} is not a number") from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ArmFileError(path, f"{_kind(value)} is not a number")
     if isinstance(value, float) and not math.isfinite(value):

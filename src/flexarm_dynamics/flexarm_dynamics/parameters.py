@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from .errors import ParameterError
+from .shown import number, show
 
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
 
@@ -77,24 +78,27 @@ class Parameter:
         where = prefix + self.name
         if self.kind == "bool":
             if not isinstance(value, bool):
-                raise ParameterError(f"{where}: {value!r} is not a boolean: write true or false")
+                raise ParameterError(
+                    f"{where}: {show(value)} is not a boolean: write true or false"
+                )
             return value
         if self.kind == "string":
             if not isinstance(value, str):
-                raise ParameterError(f"{where}: {value!r} is not a string")
+                raise ParameterError(f"{where}: {show(value)} is not a string")
             if self.choices and value not in self.choices:
-                raise ParameterError(f"{where}: {value!r} is not one of {', '.join(self.choices)}")
+                raise ParameterError(
+                    f"{where}: {show(value)} is not one of {', '.join(self.choices)}"
+                )
             return value
         if self.kind == "string_array":
             if isinstance(value, str) or not isinstance(value, Sequence):
-                raise ParameterError(f"{where}: {value!r} is not a list of strings")
+                raise ParameterError(f"{where}: {show(value)} is not a list of strings")
             if not all(isinstance(item, str) for item in value):
-                raise ParameterError(f"{where}: {list(value)!r} holds what is not a string")
+                raise ParameterError(f"{where}: {show(list(value))} holds what is not a string")
             return list(value)
         if self.kind == "int_array":
-            if isinstance(value, str) or not hasattr(value, "__len__"):
-                raise ParameterError(f"{where}: {value!r} is not a list of integers")
-            return [self._int(f"{where}[{i}]", v) for i, v in enumerate(value)]
+            entries = enumerate(_listed(where, value, "integers"))
+            return [self._int(f"{where}[{i}]", v) for i, v in entries]
         if self.kind == "int":
             return self._int(where, value)
         if self.kind == "float":
@@ -103,31 +107,29 @@ class Parameter:
 
     def _int(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-            raise ParameterError(f"{where}: {value!r} is not an integer")
+            raise ParameterError(f"{where}: {show(value)} is not an integer")
         return int(self._in_range(where, value))
 
     def _float(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise ParameterError(f"{where}: {value!r} is not a number")
+            raise ParameterError(f"{where}: {show(value)} is not a number")
         if not _is_finite(value):
-            raise ParameterError(f"{where}: {value} is not finite")
+            raise ParameterError(f"{where}: {number(value)} is not finite")
         if isinstance(value, numbers.Integral):
             raise ParameterError(
-                f"{where}: {value!r} is an integer where a float is asked for: write {float(value)}"
+                f"{where}: {show(value)} is an integer where a float is asked for: write {float(value)}"
             )
         return float(self._in_range(where, value))
 
     def _float_array(self, where, value, sizes):
-        if isinstance(value, str) or not hasattr(value, "__len__"):
-            raise ParameterError(f"{where}: {value!r} is not a list of numbers")
-        value = list(value)
+        value = _listed(where, value, "numbers")
         if value and all(
             isinstance(v, numbers.Integral) and not isinstance(v, bool) and _is_finite(v)
             for v in value
         ):
-            wanted = ", ".join(str(float(v)) for v in value)
+            wanted = ", ".join(str(float(v)) for v in value[:12])
             raise ParameterError(
-                f"{where}: {[int(v) for v in value]} is a list of integers where floats are asked"
+                f"{where}: {show([int(v) for v in value])} is a list of integers where floats are asked"
                 f" for: write [{wanted}]"
             )
         out = [self._float(f"{where}[{i}]", v) for i, v in enumerate(value)]
@@ -147,16 +149,26 @@ class Parameter:
 
     def _in_range(self, where, value):
         if not _is_finite(value):
-            raise ParameterError(f"{where}: {value} is not finite")
+            raise ParameterError(f"{where}: {number(value)} is not finite")
         if self.low is not None and value < self.low:
             raise ParameterError(
-                f"{where}: {value} is below its lower limit {self.low} [{self.unit}]"
+                f"{where}: {number(value)} is below its lower limit {self.low} [{self.unit}]"
             )
         if self.high is not None and value > self.high:
             raise ParameterError(
-                f"{where}: {value} is above its upper limit {self.high} [{self.unit}]"
+                f"{where}: {number(value)} is above its upper limit {self.high} [{self.unit}]"
             )
         return value
+
+
+def _listed(where, value, what):
+    """The entries of what is a list, an array or the like."""
+    if not isinstance(value, str) and hasattr(value, "__len__"):
+        try:
+            return list(value)
+        except TypeError:  # an array without dimensions has a length in name only
+            pass
+    raise ParameterError(f"{where}: {show(value)} is not a list of {what}")
 
 
 def _is_finite(value):
@@ -195,6 +207,7 @@ def check_all(declared, values, sizes=None, prefix=""):
     for name in values:
         if name not in known:
             raise ParameterError(
-                f"{prefix}{name}: no such parameter; there are {', '.join(sorted(known)) or 'none'}"
+                f"{prefix}{name if isinstance(name, str) else show(name)}: no such parameter; there are"
+                f" {', '.join(sorted(known)) or 'none'}"
             )
     return {name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexarm_dynamics.shown import show
 from flexarm_dynamics.strain_map import gauge_rows
 
 from .samples import Finding, Verdict
@@ -86,7 +87,7 @@ def check_layout(arm, messages):
         }
         for found, sizes in sorted(shapes):
             if any(sizes) and sorted(found) != sorted(wanted):
-                wrong.append(f"{names} are {list(found)}, arm {arm.name} has {list(wanted)}")
+                wrong.append(f"{names} are {show(list(found))}, arm {arm.name} has {list(wanted)}")
             elif any(sizes) and found != tuple(wanted):
                 order.append(names)
             lengths += [

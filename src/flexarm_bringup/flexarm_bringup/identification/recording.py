@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.shown import listed, show
 
 #: Stamps may be off their grid by this share of the period [-].
 JITTER = 0.2
@@ -136,8 +137,11 @@ def read_csv(path, arm):
         For a column that is missing and for text that is no number, naming column and line.
     """
     path = Path(path)
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FlexarmError(f"{path}: can't be read as a table: {error}") from None
     if not rows:
         raise FlexarmError(
             f"{path}: empty; the first line names the columns: {', '.join(columns(arm))}"
@@ -215,8 +219,10 @@ def _in_order(rows, names, field, wanted, required):
         values, have = getattr(message, field), list(getattr(message, names))
         if len(values) == 0:
             continue
-        if set(have) != set(wanted) or len(values) != len(wanted):
-            raise FlexarmError(f"{names} {have} are not this arm's: {list(wanted)}")
+        if sorted(have) != sorted(wanted):
+            raise FlexarmError(f"{names} {show(have)} are not this arm's: {listed(wanted)}")
+        if len(values) != len(wanted):
+            raise FlexarmError(f"{field} has {len(values)} values for {len(wanted)} {names}")
         out[k] = [values[have.index(name)] for name in wanted]
     if required and not np.isfinite(out).all():
         raise FlexarmError(f"{field} is empty or not finite in some sample")

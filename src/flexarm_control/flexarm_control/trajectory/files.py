@@ -72,6 +72,8 @@ def read(
         raise TrajectoryError(f"{path}: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise TrajectoryError(f"{path}: not a text file") from None
+    except ValueError as error:  # a path with a zero byte
+        raise TrajectoryError(f"{show(str(path))}: {error}") from None
     try:
         names, points, lines = reader(text, joint_names)
     except TrajectoryError as error:
@@ -124,7 +126,10 @@ def _with_lines(message, lines):
 
 def _from_csv(text, joint_names):
     reader = csv.reader(text.splitlines())
-    rows = [(reader.line_num, [word.strip() for word in row]) for row in reader]
+    try:
+        rows = [(reader.line_num, [word.strip() for word in row]) for row in reader]
+    except csv.Error as error:
+        raise TrajectoryError(f":{reader.line_num}: not a CSV table: {error}") from None
     rows = [(line, row) for line, row in rows if any(row)]
     if not rows:
         raise TrajectoryError(f": empty: give a header {_wanted(joint_names)}, then points")
@@ -159,7 +164,7 @@ def _csv_columns(header, joint_names, line):
     hint = f"wanted {_wanted(joint_names)} for {', '.join(joint_names)}"
     for word in header:
         if word not in known:
-            raise TrajectoryError(f":{line}: unknown column {word!r}: {hint}")
+            raise TrajectoryError(f":{line}: unknown column {show(word)}: {hint}")
         if header.count(word) > 1:
             raise TrajectoryError(f":{line}: column {word} is there {header.count(word)} times")
     for field, names in fields.items():
@@ -178,9 +183,9 @@ def _csv_number(word, column, line):
     try:
         value = float(word)
     except ValueError:
-        raise TrajectoryError(f":{line}: {column} is {word!r}, not a number") from None
+        raise TrajectoryError(f":{line}: {column} is {show(word)}, not a number") from None
     if not math.isfinite(value):
-        raise TrajectoryError(f":{line}: {column} is {word}, not finite")
+        raise TrajectoryError(f":{line}: {column} is {show(word)}, not finite")
     return value
 
 
@@ -213,7 +218,9 @@ def _from_yaml(text, joint_names):
     try:
         # `ros2 topic echo` ends each message with a line of dashes.
         documents = [d for d in yaml.load_all(text, _LOADER) if d is not None]
-    except (yaml.YAMLError, *NOT_NUMBERS) as error:
+    except Exception as error:
+        # Not YAML's own errors alone: PyYAML lets others through on a scalar that is not what its tag says, and
+        # on endless nesting.
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         raise TrajectoryError(

@@ -1,10 +1,9 @@
 """Limits, and values as messages show and check them; shared by this package."""
 
-import reprlib
-
 import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.shown import show
 
 MAX_POINTS = 10**6
 # Beyond this a double resolves less than 1e-7 of the unit: no joint's value, but a wrong one.
@@ -19,16 +18,8 @@ SPEED_ROUNDING = 1e-6  # [-]
 UNITS = {"positions": "rad", "velocities": "rad/s", "accelerations": "rad/s^2"}
 SECOND = 1_000_000_000  # [ns]
 NOT_NUMBERS = (TypeError, ValueError, OverflowError)  # what conversions to numbers raise
-_REPR = reprlib.Repr()
-_REPR.maxstring = _REPR.maxother = 80
 
-
-def show(value):
-    """Write any value, cut short, for a message."""
-    try:
-        return _REPR.repr(value)
-    except Exception:  # a value's own repr may raise, and an int too long for one does
-        return f"a {type(value).__name__}"
+__all__ = ["joint_limit", "per_joint", "seconds", "show"]
 
 
 def joint_limit(name, values, joint_names):

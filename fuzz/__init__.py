@@ -1,0 +1,1 @@
+"""Malformed input for every reader of messages and files; see ``python -m fuzz --help``."""

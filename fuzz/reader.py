@@ -1,0 +1,103 @@
+"""What is fuzzed: readers, each with its inputs and with what must hold of every one."""
+
+import reprlib
+from random import Random
+
+from flexarm_dynamics.errors import FlexarmError
+
+
+class Violation(Exception):
+    """A property that does not hold."""
+
+
+def demand(holds, what):
+    """Raise unless a property holds."""
+    if not holds:
+        raise Violation(what)
+
+
+class Reader:
+    """One reader: `make` an input, `read` it, `check` what came of it.
+
+    Attributes
+    ----------
+    name : str
+    share : float
+        Part of all inputs that it gets, before the shares are made to add up to one [-].
+    error : type
+        What it may raise, and nothing else.
+    words : tuple of str
+        A refusal names one of them: fields, or what else tells where to look.
+    batch : int
+        Inputs in one run of `run`.
+    """
+
+    name, share, batch = "", 1.0, 1
+    error = FlexarmError
+    words = ()
+    #: A longer message is not one for a log.
+    LONGEST = 1500
+
+    def make(self, rng):
+        """An input."""
+        raise NotImplementedError
+
+    def read(self, given):
+        """Have it read."""
+        raise NotImplementedError
+
+    def check(self, given, result):
+        """Raise `Violation` unless what was read is valid."""
+
+    def state(self):
+        """What a refused input must leave alone, as something that compares."""
+        return None
+
+    def run(self, rng):
+        """One batch; how many inputs were refused.
+
+        Raises
+        ------
+        Violation, or whatever the reader should not have raised
+        """
+        self.given = self.make(rng)
+        before = self.state()
+        try:
+            result = self.read(self.given)
+        except self.error as error:
+            self.check_message(error)
+            demand(self.state() == before, "what was refused has changed the reader")
+            return 1
+        self.check(self.given, result)
+        return 0
+
+    def check_message(self, error):
+        """A refusal says what is wrong, and where."""
+        text = str(error)
+        demand(text.strip(), f"a {type(error).__name__} without a word")
+        demand(len(text) <= self.LONGEST, f"a message of {len(text)} characters: {text[:120]}…")
+        named = not self.words or any(word in text for word in self.words)
+        demand(named, f"the refusal names no field: {text}")
+
+    def renew(self):
+        """Begin anew after a failure."""
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 400
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = _SHORT.maxarray = 12
+_SHORT.maxlevel = 5
+
+
+def show(value):
+    """An input as text, cut short."""
+    try:
+        text = _SHORT.repr(value)
+        return text if len(text) < 2000 else f"{text[:2000]}…"
+    except Exception as error:
+        return f"a {type(value).__name__} ({type(error).__name__} when shown)"
+
+
+def generator(seed, name, number):
+    """The generator of one input."""
+    return Random(f"{seed} {name} {number}")

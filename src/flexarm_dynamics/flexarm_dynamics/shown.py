@@ -1,0 +1,36 @@
+"""Values as messages for people show them: cut short, whatever they are."""
+
+import reprlib
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 80
+#: So many of a list's entries are shown.
+_REPR.maxlist = _REPR.maxtuple = _REPR.maxset = _REPR.maxdict = _REPR.maxarray = 12
+_REPR.maxlevel = 3
+#: No value takes more room in a message [characters].
+LONGEST = 400
+
+
+def show(value):
+    """Any value as text: a sender's list may be as long as it likes, a log line may not."""
+    try:
+        text = _REPR.repr(value)
+    except Exception:  # a value's own repr may raise, and an int too long for one does
+        return f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+
+
+def number(value):
+    """A number as text, without its type; an integer of a thousand digits cut short, too."""
+    try:
+        text = str(value)
+    except ValueError:  # Python writes no longer ones in decimals
+        return show(value)
+    return text if len(text) <= 80 else f"{text[:80]}…"
+
+
+def listed(names):
+    """Names with commas between them, the first few of many."""
+    names = [name if len(name) <= 80 else f"{name[:80]}…" for name in names]
+    text = ", ".join(names[:12])
+    return text if len(names) <= 12 else f"{text} and {len(names) - 12} more"
