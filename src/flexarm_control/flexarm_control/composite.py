@@ -79,6 +79,7 @@ class CompositeControl:
     def __init__(self, model, slow, fast, manifold=None, feedforward=None):
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_share = 1.0
+        self._last = None  # reference and interval of the last step
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = feedforward
         if feedforward is not None:
@@ -144,7 +145,7 @@ class CompositeControl:
         ndarray, shape (n,)
             u of (12) [N m]; before any limit. Overwritten by the next step.
         """
-        m = delta.size
+        m, self._last = delta.size, (reference, dt)
         if dt > 0.0:
             self.slow.advance(dt)
             self.fast.advance(dt)
@@ -162,6 +163,15 @@ class CompositeControl:
         np.multiply(self.fast.torque(self.deviation, q), self.fast_share, out=self.fast_torque)
         np.add(self.slow_torque, self.fast_torque, out=self.torque)
         return self.torque
+
+    def look_ahead(self):
+        """Do beforehand what the next sample will need and what does not depend on it; call once the torque is sent.
+
+        The reference at the next stamp is known if it comes as long after this one as this one came after the last;
+        otherwise, or without this call, the next step does that work itself, with the same result to the last bit.
+        """
+        if self.feedforward is not None and self._last is not None:
+            self.feedforward.look_ahead(*self._last)
 
     def _on_manifold(self, q, qd, reference, terms):
         """Slow torque, and z_bar of the manifold."""

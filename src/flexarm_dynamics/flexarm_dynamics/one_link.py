@@ -23,6 +23,7 @@ Foreshortening is not in this model: its centrifugal term softens (`K_e - qd^2 G
 its length would stiffen. Keep the joint's speed well below the first bending frequency.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,9 @@ from .errors import ModelError
 from .kernels import integrators, load
 from .kernels import one_link as kernel
 from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation, scaled_payload
+
+#: Cosine and sine of an angle that is no number, as numpy has them.
+NOWHERE = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,7 @@ class OneLinkEquations(ArmModel):
         self.coefficients = self.derive()
         self._rotation = rotation(self.joint.origin_rpy)
         self._gravity = self._rotation.T @ np.asarray(arm.gravity)  # in the joint's frame
+        self._gravity_plain = float(self._gravity[0]), float(self._gravity[1])
         self._terms_at_rest = self._constant_terms()
 
     def with_payload(self, scale):
@@ -113,13 +118,14 @@ class OneLinkEquations(ArmModel):
     def terms(self, q, qd, delta=None, delta_d=None):
         c, constant = self.coefficients, self._terms_at_rest
         angle, speed = float(q[0]), float(qd[0])
-        gx, gy = self._gravity[0], self._gravity[1]
-        along = gx * np.cos(angle) + gy * np.sin(angle)
-        across = -gx * np.sin(angle) + gy * np.cos(angle)
+        # Plain numbers: numpy's functions of one number cost more than the rest of this.
+        gx, gy = self._gravity_plain
+        cosine, sine = (math.cos(angle), math.sin(angle)) if math.isfinite(angle) else NOWHERE
+        along, across = gx * cosine + gy * sine, gy * cosine - gx * sine
         friction = self.joint.friction
         f1 = (
             friction.viscous * speed
-            + friction.coulomb * np.tanh(speed / friction.smoothing)
+            + friction.coulomb * math.tanh(speed / friction.smoothing)
             - c.moment * across
         )
         M, C1 = constant.M, constant.C1

@@ -92,6 +92,9 @@ class Feedforward(ABC):
             Time since the last sample [s]; 0: the first one.
         """
 
+    def look_ahead(self, reference, dt):
+        """Work beforehand on the sample that will come after `dt` [s], between two samples; changes no result."""
+
     def warnings(self):
         """What a person should know of it on this arm; each a sentence."""
         return ()

@@ -167,6 +167,33 @@ def gains_along(model, path, period):
     return Gains(grid[at], gains)
 
 
+class _Ahead:
+    """The reference at a coming stamp, and what was worked out for it; the reference itself is left alone."""
+
+    def __init__(self, reference, dt):
+        self.path, self.dt = reference.path, dt
+        self.start_ns, self.stamp_ns = self.path.start_ns, reference.stamp_ns + round(dt * SECOND)
+        state = np.zeros((3, reference.position.size))
+        self.path.evaluate(self.stamp_ns, state)
+        self.position, self.velocity, self.acceleration = state
+        self._near = np.zeros_like(state)
+        self.state = self.prepared = self.elapsed = self.wanted = None
+
+    def near(self, offset):
+        self.path.near(self.stamp_ns, offset, self._near)
+        return self._near
+
+    def foresaw(self, reference, dt):
+        """Whether this is the sample that has come."""
+        path = reference.path
+        return (path, path and path.start_ns, reference.stamp_ns, dt) == (
+            self.path,
+            self.start_ns,
+            self.stamp_ns,
+            self.dt,
+        )
+
+
 class ModelFeedforward(Feedforward):
     """The nominal arm, simulated beside the real one; see the module."""
 
@@ -183,6 +210,7 @@ class ModelFeedforward(Feedforward):
         #: The gain that serves everywhere; None where it depends on the joints.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
         self._prepared, self._first = None, True
+        self._ahead = None  # what `look_ahead` has done
         self._held = None  # position, and what `wanted` made of it, while the reference rests
 
     def _same_everywhere(self):
@@ -216,12 +244,13 @@ class ModelFeedforward(Feedforward):
         self._prepared = plan
 
     def reset(self):
-        self._first = True
+        self._first, self._ahead = True, None
 
     def resume(self, other):
         if isinstance(other, ModelFeedforward):
             self.state[:], self.torque[:] = other.state, other.torque
             self._first, self._prepared = other._first, other._prepared
+            self._ahead = None
 
     def _preparation(self, reference):
         """What was designed for the trajectory that is followed, and the time since its start; or None."""
@@ -245,11 +274,19 @@ class ModelFeedforward(Feedforward):
         return state, torque
 
     def update(self, reference, dt):
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and not ahead.foresaw(reference, dt):
+            ahead = None
         if not self._first and dt > 0.0:  # the torque of the last sample has acted since
-            count = max(1, round(dt / self._period)) * self._substeps
-            self._advance(self.state, self.torque, dt / count, count)
+            if ahead is None:
+                self._move(self.state, dt)
+            else:
+                self.state[:] = ahead.state
         prepared, elapsed = self._preparation(reference)
-        state, torque = self.wanted(reference, prepared, elapsed)
+        if ahead is not None and (prepared, elapsed) == (ahead.prepared, ahead.elapsed):
+            state, torque = ahead.wanted
+        else:
+            state, torque = self.wanted(reference, prepared, elapsed)
         K = self.K
         if K is None and prepared is not None and prepared.gains is not None:
             K = prepared.gains.at(elapsed)
@@ -262,6 +299,21 @@ class ModelFeedforward(Feedforward):
             self.torque += K @ self._error
         np.clip(self.torque, -self.limit, self.limit, out=self.torque)
         self.acceleration[:] = reference.acceleration
+
+    def _move(self, state, dt):
+        """Advance a state of the simulated arm in place, under the present torque."""
+        count = max(1, round(dt / self._period)) * self._substeps
+        self._advance(state, self.torque, dt / count, count)
+
+    def look_ahead(self, reference, dt):
+        if self._first or dt <= 0.0 or reference.path is None:
+            return
+        ahead = _Ahead(reference, dt)
+        ahead.state = self.state.copy()
+        self._move(ahead.state, dt)
+        ahead.prepared, ahead.elapsed = self._preparation(ahead)
+        ahead.wanted = self.wanted(ahead, ahead.prepared, ahead.elapsed)
+        self._ahead = ahead
 
     def _begins_anew(self, reference, K):
         """Whether the simulated arm is put where it is wanted."""

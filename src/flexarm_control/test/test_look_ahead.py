@@ -1,0 +1,87 @@
+"""Work done between two samples for the next one: it changes nothing but when it is done."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from flexarm_control import composite, trajectory
+from flexarm_control.trajectory import ReferenceGenerator
+
+SLOW, FAST = {"type": "linear_model_following"}, {"type": "lqr"}
+CORRECTED = {"type": "corrected"}
+MS = 1_000_000
+
+
+def torques(model, kind, ahead, gaps, count=None):
+    """Torques over two motions; `count` collects how often the manifold was worked out on the path."""
+    control = composite.design(model, SLOW, FAST, CORRECTED, {"feedforward": kind})
+    reference = ReferenceGenerator(model.joint_names)
+    reference.start(np.zeros(1), 0)
+    calls, along = [], control.manifold.along
+
+    def counted(reference):
+        calls.append(None)
+        return along(reference)
+
+    control.manifold.along = counted
+    out, stamp, q = [], 0, np.zeros(1)
+    for k, gap in enumerate(gaps):
+        if k in (3, 40):  # the second takes over from the first while it moves
+            point = [(100 * MS, [0.3 - 0.01 * k], [0.0], [0.0], [])]
+            data = trajectory.validate(model.joint_names, model.joint_names, 0, point)
+            plan = (
+                control.feedforward.prepare(data, np.zeros((3, 1)))
+                if k == 3 and kind == "preview"
+                else None
+            )
+            verdict = reference.offer(data)
+            assert verdict.accepted
+            control.feedforward.take(plan, verdict.trajectory_id)
+        stamp += gap
+        reference.sample(stamp)
+        before = len(calls)
+        q = reference.position + 1e-3 * np.sin(0.1 * k)
+        m = model.n_modes
+        u = control.step(
+            q, reference.velocity, np.zeros(m), np.zeros(m), reference, 1e-9 * gap if k else 0.0
+        )
+        out.append(u.copy())
+        if count is not None:
+            count.append(len(calls) - before)
+        if ahead:
+            control.look_ahead()
+    return np.array(out)
+
+
+@pytest.mark.parametrize("kind", ["model", "preview"])
+@pytest.mark.parametrize("jitter", [False, True])
+def test_looking_ahead_changes_no_bit(arm_r, kind, jitter):
+    gaps = [MS] * 120
+    if jitter:  # samples lost: the next one is not the one foreseen
+        gaps[20], gaps[45], gaps[46] = 3 * MS, 2 * MS, 2 * MS
+    plain, moved = (torques(arm_r, kind, ahead, gaps) for ahead in (False, True))
+    assert np.ptp(plain) > 0.1
+    np.testing.assert_array_equal(moved, plain)
+
+
+def test_looking_ahead_leaves_the_manifold_of_the_motion_out_of_the_step(arm_r):
+    alone, helped = [], []
+    torques(arm_r, "model", False, [MS] * 120, alone)
+    torques(arm_r, "model", True, [MS] * 120, helped)
+    assert sum(alone[10:90]) == 80
+    assert sum(helped[10:90]) == 1  # where the second motion took over
+
+
+def test_a_control_without_feedforward_has_nothing_to_look_ahead_to(arm_r):
+    control = composite.design(arm_r, SLOW, FAST, CORRECTED)
+    control.look_ahead()
+    reference = SimpleNamespace(
+        position=np.zeros(1),
+        velocity=np.zeros(1),
+        acceleration=np.zeros(1),
+        near=lambda _: np.zeros((3, 1)),
+    )
+    m = arm_r.n_modes
+    control.step(np.zeros(1), np.zeros(1), np.zeros(m), np.zeros(m), reference, 0.001)
+    control.look_ahead()
