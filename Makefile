@@ -3,6 +3,7 @@ PYTHON ?= python3
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 COMPARE_ARGS ?=
+LATENCY_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
 ifneq ($(origin PYTHON),file)
@@ -13,7 +14,7 @@ export FLEXARM_ROOT := $(CURDIR)
 TESTS := $(wildcard src/*/test tests)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test bench compare lint clean distclean
+.PHONY: help build demo test bench compare latency lint clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -22,6 +23,7 @@ help:
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then tune rivals on the same arms, and compare; COMPARE_ARGS=--quick'
+	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
 	@echo 'make lint       check style (ruff)'
 	@echo 'make clean      remove what was built, results and caches; .venv stays'
 	@echo 'make distclean  clean, and remove .venv'
@@ -47,6 +49,11 @@ bench: build
 COMPARE_OUT := --json docs/comparison.json --write docs/comparison.md
 compare: build
 	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
+
+# The table of docs/latency.md, of a whole run alone.
+LATENCY_OUT := --write docs/latency.md
+latency: build
+	@. tools/env.sh && python -m flexarm_bringup.cli latency $(if $(LATENCY_ARGS),$(LATENCY_ARGS),$(LATENCY_OUT))
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check

@@ -96,6 +96,12 @@ def _excite(options):
     excite(options)
 
 
+def _latency(options):
+    from .latency import latency
+
+    latency(options)
+
+
 def _parameters(options):
     from .parameter_tables import tables, write
 
@@ -165,6 +171,17 @@ def parser():
     run.add_argument("executable")
     run.add_argument("arguments", nargs=argparse.REMAINDER)
     run.set_defaults(function=_run)
+
+    from .latency import add_arguments as add_latency_arguments
+
+    latency = commands.add_parser(
+        "latency",
+        help="measurement to torque of the running loop, beside a bare relay of the same messages",
+        description="Runs loop and relay in real time, in turns, at several rates; three to four minutes.",
+        epilog="example: flexarm latency --quick --json results/latency.json",
+    )
+    add_latency_arguments(latency)
+    latency.set_defaults(function=_latency)
 
     parameters = commands.add_parser(
         "parameters",

@@ -1,7 +1,8 @@
 """A bare relay of the line's messages through as many processes: what the middleware alone costs.
 
 Each of three plain nodes answers the message it gets with a ready-made one of the same type and size, and
-sends the same side messages; nothing is computed. ``python -m flexarm_bringup.relay ROLE ARM [COUNT]``.
+sends the same side messages; nothing is computed. ``python -m flexarm_bringup.relay ROLE ARM [COUNT|SPIN]``: of a
+source the round trips, of the others how they are served: ``executor``, by rclpy's, or ``line``, as the nodes are.
 """
 
 import statistics
@@ -22,6 +23,7 @@ from flexarm_ros.messages import (
     TorqueWriter,
     set_stamp,
 )
+from flexarm_ros.spin import Line, spin
 from flexarm_sim.simulator import Simulator
 
 from .processes import Processes, own_domain
@@ -40,6 +42,7 @@ def filled_state(arm):
 
 def _answer(incoming, outgoing):
     outgoing.header.stamp = incoming.header.stamp
+    outgoing.session = incoming.session
     outgoing.sequence = incoming.sequence
 
 
@@ -58,7 +61,7 @@ def observer(arm):
             _answer(msg, state)
             state_pub.publish(state)
 
-    node.create_subscription(ArmState, "arm_state", relay, qos.LINE)
+    node.line = Line(node.create_subscription(ArmState, "arm_state", relay, qos.LINE))
     return node
 
 
@@ -76,7 +79,7 @@ def controller(arm):
             _answer(msg, state)
             state_pub.publish(state)
 
-    node.create_subscription(ArmState, "arm_state_estimate", relay, qos.LINE)
+    node.line = Line(node.create_subscription(ArmState, "arm_state_estimate", relay, qos.LINE))
     return node
 
 
@@ -121,7 +124,10 @@ def main():
             node = Source(arm, int(sys.argv[3]))
         else:
             node = {"observer": observer, "controller": controller}[role](arm)
-        rclpy.spin(node)
+        if sys.argv[3:] == ["line"]:
+            spin([node], [])
+        else:
+            rclpy.spin(node)
     except (SystemExit, KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

@@ -1,0 +1,86 @@
+"""What `flexarm latency` makes of the windows that it measured."""
+
+import argparse
+
+import numpy as np
+import pytest
+
+from flexarm_bringup import latency
+from flexarm_dynamics.errors import FlexarmError
+
+CASE = latency.CASES[1]
+
+
+def window(milliseconds, missed=0, enabled=None):
+    times = [1e-3 * t for t in milliseconds]
+    enabled = len(times) if enabled is None else enabled
+    return {"latencies": times, "enabled": enabled, "missed": missed, "lost": 0}
+
+
+def test_ratios_are_taken_round_by_round():
+    # The machine slows down threefold in the second round: the loop costs 1.5 of the relay in each.
+    relay = {"windows": [window([1.0, 1.0, 2.0]), window([3.0, 3.0, 6.0]), window([1.0, 1.0, 2.0])]}
+    loop = {"windows": [window([1.5, 1.5, 3.0]), window([4.5, 4.5, 9.0]), window([1.5, 1.5, 3.0])]}
+    loop["mathematics"] = {"controller": 1e-4}
+    bare, row = latency.summary(CASE, {"relay": relay, "three processes": loop})
+    assert bare["latency_ms"]["p50"] == pytest.approx(1.0)
+    assert row["latency_ms"]["p50"] == pytest.approx(1.5)
+    assert row["ratio"]["p50"] == pytest.approx(1.5)
+    assert row["ratio"]["p99"] == pytest.approx(1.5)
+    assert row["controller_share"] == pytest.approx(0.1)
+    cells = latency.table([bare, row]).splitlines()[-1].split(" | ")
+    assert cells[1:3] == ["three processes", "1.50"]
+    assert cells[-1].startswith("10 %")
+
+
+def test_missed_samples_count_with_those_answered():
+    found = {"relay": {"windows": [window([1.0] * 6, missed=2), window([1.0] * 2, 0, enabled=0)]}}
+    (row,) = latency.summary(CASE, found)
+    assert row["missed"] == pytest.approx(0.2)
+    assert row["enabled"] == pytest.approx(0.75)
+
+
+def test_a_window_without_an_answer_is_an_error_that_names_it():
+    found = {"relay": {"windows": [window([1.0]), window([])]}}
+    with pytest.raises(FlexarmError, match="R, 500 Hz: no torque came back in a window of relay"):
+        latency.summary(CASE, found)
+
+
+def options(*words):
+    parser = argparse.ArgumentParser()
+    latency.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def test_options_choose_the_cases():
+    assert [c.name for c in latency.chosen(options())] == [
+        *(f"R, {rate} Hz" for rate in (200, 500, 1000)),
+        "long_reach, 500 Hz",
+    ]
+    quick = latency.chosen(options("--quick", "--arms", "R"))
+    assert [c.rate for c in quick] == [500.0]
+    with pytest.raises(FlexarmError, match="there are R, 200 Hz"):
+        latency.chosen(options("--arms", "two_link"))
+
+
+def test_the_table_goes_between_the_markers_alone(tmp_path):
+    file = tmp_path / "page.md"
+    file.write_text(f"above\n{latency.BEGIN}\nold\n{latency.END}\nbelow\n")
+    latency.write(file, "new")
+    assert file.read_text() == f"above\n{latency.BEGIN}\nnew\n{latency.END}\nbelow\n"
+    file.write_text("none")
+    with pytest.raises(FlexarmError, match="no lines"):
+        latency.write(file, "new")
+
+
+def test_motions_of_the_cases_are_those_of_their_arms():
+    from flexarm_dynamics import arm_file
+
+    for case in latency.CASES:
+        joints = arm_file.load(case.arm).joints
+        for ends in (case.begin, case.end):
+            assert len(ends) == len(joints)
+            for joint, angle in zip(joints, ends, strict=True):
+                low, high = joint.limits.position
+                assert low <= angle <= high
+        assert np.abs(np.subtract(case.end, case.begin)).max() > 0.5
