@@ -238,7 +238,7 @@ def _sagging_path(model, record):
         amplitude.append(bent)
     amplitude = np.array(amplitude).reshape(len(knots), model.n_modes)
     columns = [np.interp(time, time[knots], column) for column in amplitude.T]
-    return _path(model, reference, np.array(columns).reshape(model.n_modes, -1).T)
+    return _path(model, reference, np.array(columns).reshape(model.n_modes, len(time)).T)
 
 
 def _residual(record, model, tip, end, window):

@@ -256,6 +256,29 @@ def test_a_rival_runs_in_the_same_loop():
     )
 
 
+def test_a_rival_has_the_shipped_controllers_peak_torque_and_no_more(monkeypatch):
+    shipped = contenders.prepared(SHORT, contenders.SHIPPED, ())
+    assert "torque_limit" not in shipped.controller
+    assert list(contenders.allowed(SHORT)) == trial.run(SHORT, shipped)["peak_torque_Nm"]
+    stiff = [60.0, 5.0, 0.3, 0.0, 1.5]  # takes all it can get
+    free = trial.run(SHORT, contenders.CONTENDERS[contenders.PID].setup(SHORT, stiff))
+    assert free["peak_torque_Nm"][0] > 3.0
+    monkeypatch.setattr(contenders, "allowed", lambda subject: (1.5,))
+    held = trial.run(SHORT, contenders.prepared(SHORT, contenders.PID, stiff))
+    assert held["peak_torque_Nm"] == pytest.approx([1.5], rel=1e-12)
+
+
+def test_what_a_rival_works_out_along_the_motion_it_works_out_once(two):
+    seen, calls = {}, []
+    law = JointPid(two, pid(two).gains, seen)
+    law._along = lambda reference: calls.append(reference) or np.array([0.1, 0.2])
+    first, later = (reference([x, 0.0], [0.0, 0.0], [0.0, 0.0]) for x in (0.1, 0.2))
+    for point in (first, first, later, first):
+        assert_allclose(law.along(point), [0.1, 0.2])
+    assert [id(c) for c in calls] == [id(first), id(later)]
+    assert_allclose(JointPid(two, law.gains, seen).along(first), [0.1, 0.2])
+
+
 def test_a_shaped_motion_is_judged_by_the_motion_that_was_asked_for():
     """Stiffly led along another motion, the joint is off by what the motions differ."""
     contender = contenders.CONTENDERS["joint PID, ZV shaper"]

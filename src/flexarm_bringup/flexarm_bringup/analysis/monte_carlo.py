@@ -8,9 +8,8 @@ appended to a JSON-lines file as they come; its first line is the specification.
 import hashlib
 import json
 import math
-import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import FlexarmError, ParameterError
 
 from .. import scenario as scenarios
+from ..workers import processes
 
 FILE = "monte_carlo.jsonl"
 #: Uniform ranges: factors of payload, stiffness and damping [-], and the delay [s].
@@ -40,8 +40,6 @@ METRICS = (
     "saturation_share",
 )
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-#: Environment of workers: one thread each, or they hinder each other.
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,7 @@ def _results(spec, missing, workers, scheduler):
     if scheduler is None and workers == 1:
         yield from (sample(spec, n) for n in missing)
         return
-    with _processes(workers) if scheduler is None else _dask(scheduler) as executor:
+    with processes(workers) if scheduler is None else _dask(scheduler) as executor:
         yield from through(executor, spec, missing)
 
 
@@ -176,23 +174,6 @@ def through(executor, spec, missing):
     finally:
         for future in waiting:
             future.cancel()
-
-
-@contextmanager
-def _processes(workers):
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    # Never fork: this process may have threads.
-    executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-    try:
-        yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @contextmanager

@@ -2,11 +2,9 @@
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,13 +12,12 @@ from pathlib import Path
 from flexarm_dynamics.errors import FlexarmError
 
 from ..progress import Progress
+from ..workers import processes
 from . import combinations, report, subjects
-from .contenders import CONTENDERS, PREVIEW
+from .contenders import CONTENDERS, PREVIEW, prepared
 from .trial import run
 from .tuning import tune
 
-#: Libraries that would start a thread per core in every process.
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: Of `--quick`: one arm, so many simulations each, watched so long [s].
 QUICK, QUICK_BUDGET, QUICK_WINDOW = "R", 2, 0.2
 
@@ -174,7 +171,7 @@ def contend(subject, name, seed):
 
     def result(values, **noise):
         try:
-            return run(subject, contender.setup(subject, values), **noise)
+            return run(subject, prepared(subject, name, values), **noise)
         except FlexarmError as error:
             return {"refused": str(error), "cost": 1e4}
 
@@ -238,27 +235,10 @@ def _results(jobs, seed, workers):
         for i, job in enumerate(jobs):
             yield i, _do(job, seed)
         return
-    with _processes(workers) as executor:
+    with processes(workers) as executor:
         waiting = {executor.submit(_do, job, seed): i for i, job in enumerate(jobs)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
-
-
-@contextmanager
-def _processes(workers):
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    # Never fork: this process may have threads.
-    executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
-    try:
-        yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 def _gathered(seed, wanted, jobs, results):

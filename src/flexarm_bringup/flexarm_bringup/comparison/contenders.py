@@ -7,7 +7,7 @@ tuned, not a gain each.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +18,7 @@ from flexarm_control.trajectory import specs
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 
-from . import subjects
+from . import subjects, trial
 from .rivals import FullStateLqr, JointPid, lqr_gain, slowest
 from .tuning import Free
 
@@ -31,6 +31,16 @@ SHORTEST = 0.4
 
 #: Rigid control that the full-order check refuses is run all the same [1/s].
 ANYHOW = -1e3
+
+SHIPPED, PREVIEW, TUNED = (f"composite ({kind})" for kind in ("shipped", "preview", "tuned"))
+#: Those that are no rivals.
+OWN = (SHIPPED, PREVIEW, TUNED)
+PID = "joint PID"
+
+#: What would stop a rival that is far off; how far is too far, the comparison says itself.
+UNWATCHED = dict.fromkeys(
+    ("tracking_error_limit", "velocity_margin", "position_margin", "saturation_time"), 0.0
+)
 
 #: Where a law of its own answers: the composite control that is built around it does nothing.
 IDLE = {
@@ -179,6 +189,12 @@ def _observer(subject):
 
 
 @lru_cache
+def _seen(subject, law):
+    """What a rival's law works out along the motion: the same in every simulation."""
+    return {}
+
+
+@lru_cache
 def _plants(subject):
     """The sampled arm, linear at rest, in the motion's beginning and end."""
     arm = subjects.model_of(subject.arm)
@@ -194,7 +210,9 @@ def _pid_screen(subject, values):
 
 def _pid_setup(subject, values):
     gains = pid_gains(subject, values)
-    return Setup(IDLE | _observer(subject), lambda model: JointPid(model, gains))
+    return Setup(
+        IDLE | _observer(subject), lambda model: JointPid(model, gains, _seen(subject, PID))
+    )
 
 
 # PID with a shaper -------------------------------------------------------------------------------
@@ -268,7 +286,9 @@ def _lqr_setup(subject, values):
     end = subjects.ends_of(subject)[1]
     return Setup(
         IDLE | _observer(subject),
-        lambda model: FullStateLqr(model, end, subject.rate, sizes, decay, share),
+        lambda model: FullStateLqr(
+            model, end, subject.rate, sizes, decay, share, _seen(subject, "LQR")
+        ),
     )
 
 
@@ -305,10 +325,6 @@ def _adaptive_setup(subject, values):
     return Setup(IDLE | law | _observer(subject))
 
 
-SHIPPED, PREVIEW, TUNED = (f"composite ({kind})" for kind in ("shipped", "preview", "tuned"))
-#: Those that are no rivals.
-OWN = (SHIPPED, PREVIEW, TUNED)
-PID = "joint PID"
 CONTENDERS = {
     c.name: c
     for c in (
@@ -322,3 +338,26 @@ CONTENDERS = {
         Contender("adaptive rigid", _adaptive_free, _adaptive_setup),
     )
 }
+
+
+@lru_cache
+def allowed(subject):
+    """Peak torque of the shipped controller on the subject's motion, per joint [N m]; empty where it fails."""
+    row = trial.run(subject, _shipped_setup(subject, ()))
+    return tuple(row.get("peak_torque_Nm", ()))
+
+
+def prepared(subject, name, values):
+    """Setup of a contender; a rival has no more torque than the shipped controller takes on this motion.
+
+    Raises
+    ------
+    FlexarmError
+        Where there is no such design.
+    """
+    setup = CONTENDERS[name].setup(subject, values)
+    if name in OWN:
+        return setup
+    most = allowed(subject)
+    limit = {"torque_limit": list(most)} if most else {}
+    return replace(setup, controller=setup.controller | UNWATCHED | limit)

@@ -31,6 +31,8 @@ class Rival:
     Parameters
     ----------
     model : ArmModel
+    seen : dict, optional
+        What `along` has worked out; laws of the same arm may share one, for a motion that they all run.
 
     Attributes
     ----------
@@ -41,12 +43,14 @@ class Rival:
     """
 
     feedforward = None
-    needs_rates = True
-    limit = None
+    needs_rates, free = True, False
+    limit, fast_share = None, 1.0
+    #: No more points of a reference than this are remembered.
+    REMEMBERED = 20000
 
-    def __init__(self, model):
+    def __init__(self, model, seen=None):
         n, m = model.n_joints, model.n_modes
-        self.model = model
+        self.model, self._seen = model, {} if seen is None else seen
         self.slow_torque, self.fast_torque = np.zeros(n), np.zeros(n)
         self.torque, self.quasi_steady = self.slow_torque, np.zeros(m)
         self._still = np.zeros(n)
@@ -62,6 +66,18 @@ class Rival:
         self.slow_torque[:] = self._torque(np.concatenate([q, delta, qd, delta_d]), reference, dt)
         return self.torque
 
+    def along(self, reference):
+        """`_along` of a point of the reference, worked out once."""
+        key = b"".join(
+            x.tobytes() for x in (reference.position, reference.velocity, reference.acceleration)
+        )
+        found = self._seen.get(key)
+        if found is None:
+            found = self._along(reference)
+            if len(self._seen) < self.REMEMBERED:
+                self._seen[key] = found
+        return found
+
 
 class JointPid(Rival):
     """PID of each joint; see the module.
@@ -74,8 +90,8 @@ class JointPid(Rival):
         ``acceleration`` [kg m^2].
     """
 
-    def __init__(self, model, gains):
-        super().__init__(model)
+    def __init__(self, model, gains, seen=None):
+        super().__init__(model, seen)
         self.gains = {name: np.asarray(value, float) for name, value in gains.items()}
         self.integral, self._error = np.zeros(model.n_joints), np.zeros(model.n_joints)
 
@@ -91,7 +107,11 @@ class JointPid(Rival):
         u = k["p"] * self._error + self.integral
         u += k["d"] * (reference.velocity - s[n + m : 2 * n + m])
         u += k["velocity"] * reference.velocity + k["acceleration"] * reference.acceleration
-        return u + self.model.terms(reference.position, self._still).f1
+        return u + self.along(reference)
+
+    def _along(self, reference):
+        """Weight of the rigid arm, (n,) [N m]."""
+        return self.model.terms(reference.position, self._still).f1.copy()
 
     @property
     def K(self):
@@ -130,21 +150,26 @@ class FullStateLqr(Rival):
         When the Riccati equation has no stabilising solution.
     """
 
-    def __init__(self, model, q, rate, sizes, decay=0.0, feedforward=1.0):
-        super().__init__(model)
+    def __init__(self, model, q, rate, sizes, decay=0.0, feedforward=1.0, seen=None):
+        super().__init__(model, seen)
         self.K, self._share = lqr_gain(model, q, rate, sizes, decay), feedforward
 
     def _torque(self, s, reference, dt):
-        n, m, model = self.model.n_joints, self.model.n_modes, self.model
-        terms = model.terms(reference.position, reference.velocity)
-        acceleration = self._share * reference.acceleration
+        bent, still, moving = self.along(reference)
+        self.quasi_steady[:] = bent
+        wanted = np.concatenate(
+            [reference.position, bent, reference.velocity, np.zeros(self.model.n_modes)]
+        )
+        return still + self._share * moving + self.K @ (wanted - s)
+
+    def _along(self, reference):
+        """Quasi-static deflections (m,), torque without acceleration and what that takes, each (n,) [N m]."""
+        n, m = self.model.n_joints, self.model.n_modes
+        terms = self.model.terms(reference.position, reference.velocity)
         a, B = slow_subsystem(terms)
         inertia = terms.M[n:, :n] @ reference.acceleration
-        self.quasi_steady[:] = np.linalg.solve(terms.K2, -inertia - terms.f2) if m else 0.0
-        wanted = np.concatenate(
-            [reference.position, self.quasi_steady, reference.velocity, np.zeros(m)]
-        )
-        return np.linalg.solve(B, acceleration - a) + self.K @ (wanted - s)
+        bent = np.linalg.solve(terms.K2, -inertia - terms.f2) if m else np.zeros(0)
+        return bent, np.linalg.solve(B, -a), np.linalg.solve(B, reference.acceleration)
 
 
 def slowest(plants, K, period):

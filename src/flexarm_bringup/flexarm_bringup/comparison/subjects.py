@@ -59,10 +59,10 @@ class Subject:
 
 
 SUBJECTS = (
-    Subject("R", "composite", "paper:duration=2", 500.0, 24, "pairs"),
-    Subject("one_link", "composite", "paper:duration=2", 500.0, 12, "none"),
+    Subject("R", "composite", "paper:duration=2", 500.0, 16, "pairs"),
+    Subject("one_link", "composite", "paper:duration=2", 500.0, 16, "none"),
     Subject("two_link", "two_link", SIXTY, 1000.0, 16, "star"),
-    Subject("long_reach", "long_reach", LONG_WAY, 500.0, 10, "star"),
+    Subject("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star"),
 )
 
 

@@ -78,12 +78,16 @@ class Manifold(ABC):
         torque : ndarray, shape (n,)
             Of the whole motion: the joint rows of (2) [N m].
         """
+        here, delta, rate, second = self._of_reference(reference)
+        return delta, rate, here.torque(delta, rate, second)
+
+    def _of_reference(self, reference):
+        """The reference's present `Point`, and deflection, rate and second derivative along it."""
         points = {}
         for i in range(-reach(self.order), reach(self.order) + 1):
             state = reference.near(i * step(self.order))
             points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
-        delta, rate, second = expand(points, self.order)
-        return delta, rate, points[0].torque(delta, rate, second)
+        return points[0], *expand(points, self.order)
 
     def error_response(self, q):
         """How a tracking error moves the manifold and its feed-forward, linearised at rest.

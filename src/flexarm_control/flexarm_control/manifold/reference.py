@@ -9,7 +9,6 @@ poles move: on the paper's arm from the double pole -2.5 to -1.5 +- 1.5j.
 """
 
 from .base import Manifold
-from .expansion import Point, expand, reach, step
 
 
 class ReferenceManifold(Manifold):
@@ -18,10 +17,6 @@ class ReferenceManifold(Manifold):
     order = 2
 
     def update(self, q, qd, reference, terms, slow_torque):
-        points = {}
-        for i in range(-reach(self.order), reach(self.order) + 1):
-            state = reference.near(i * step(self.order))
-            points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
-        delta, rate, second = expand(points, self.order)
+        here, delta, rate, second = self._of_reference(reference)
         self.amplitude[:], self.rate[:] = delta, rate
-        self.feedforward[:] = points[0].feedforward(delta, rate, second)
+        self.feedforward[:] = here.feedforward(delta, rate, second)
