@@ -126,3 +126,16 @@ def test_a_changelog_can_be_tagged_for_a_release(path):
     ((version, _, entries),) = changelog.foreach_version()
     assert version == parse_package(path).version and len(entries) >= 1
     assert text.splitlines()[1] == f"Changelog for package {path.name}"
+
+
+def test_every_topic_of_the_nodes_is_in_the_documentation_and_overridable():
+    text = (ROOT / "docs" / "ros.md").read_text()
+    for path in (*(ROOT / "src").glob("*/*/nodes/*.py"),):
+        for call in ast.walk(ast.parse(path.read_text())):
+            name = getattr(getattr(call, "func", None), "attr", "")
+            if name not in ("make_publisher", "make_subscription") or len(call.args) < 3:
+                continue
+            topic = call.args[1]
+            if isinstance(topic, ast.Constant):
+                assert f"| `{topic.value}` |" in text, topic.value
+                assert any(k.arg == "qos_overriding_options" for k in call.keywords), topic.value

@@ -18,7 +18,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from flexarm_bringup import cli, parameter_tables
+from flexarm_bringup import cli, launching, parameter_tables
 from flexarm_bringup.lockstep import LockstepRun
 from flexarm_bringup.processes import Processes, executable, installed, own_domain
 from flexarm_msgs.msg import CompositeState
@@ -59,6 +59,13 @@ def test_what_a_command_names_exists(command):
         if options.command == "run":
             executable(options.package, options.executable)
             check_files(options.arguments)
+    elif words[:3] == ["ros2", "launch", "flexarm_bringup"]:
+        text = installed("share", *words[2:3], "launch", words[3]).read_text()
+        arguments = getattr(launching, re.search(r"launching\.([A-Z_]+)", text).group(1))
+        given = dict(word.split(":=") for word in words[4:])
+        starts = getattr(launching, re.search(r"launching\.([a-z_]+)\)", text).group(1))
+        assert set(given) <= set(arguments)
+        assert starts({name: a.default for name, a in arguments.items()} | given)
     elif words[:2] == ["ros2", "topic"]:
         assert words[2] == "pub"
     elif words[:3] == ["ros2", "param", "set"]:
