@@ -57,7 +57,7 @@ class Luenberger(Observer):
         self._designs = {}
         self.innovation = np.zeros(model.n_modes)
         # Beyond a quarter period of the fastest mode the amplitudes no longer tell its rate: Phi12 turns singular.
-        self._longest = 0.5 * np.pi / model.frequencies()[-1]
+        self._longest = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
 
     def design(self, dt, q):
         """Transition of (11) over dt and the gain L; at rest, in configuration q.
