@@ -85,6 +85,7 @@ class ClosedLoop:
         self._measured, self._estimate = ArmSample(n, m, g), ArmSample(n, m)
         self._publish_rates = settings["publish_rates"]
         self._publish_velocity = settings["publish_joint_velocity"]
+        self._publish_amplitude = settings["publish_modal_amplitude"]
         self._set_delay(delay)
         self._reach = sum(link.length for link in model.arm.links)
         self.lost = self.unprepared = ""
@@ -107,7 +108,7 @@ class ClosedLoop:
         s.torque[:] = sim.torque
         has_gauges = sim.strain_map is not None
         s.strain = sim.strain if has_gauges else None
-        s.amplitude = sim.amplitude if has_gauges else None
+        s.amplitude = sim.amplitude if has_gauges and self._publish_amplitude else None
         s.rate = sim.rate if self._publish_rates else None
         return s
 

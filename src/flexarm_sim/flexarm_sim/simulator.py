@@ -89,6 +89,13 @@ PARAMETERS = (
         "Publish joint velocities; false: as a driver that has an encoder alone.",
         read_only=True,
     ),
+    Parameter(
+        "publish_modal_amplitude",
+        "bool",
+        True,
+        "Publish the modal amplitudes that the simulator maps from the strains; false: the observer maps them.",
+        read_only=True,
+    ),
 )
 
 

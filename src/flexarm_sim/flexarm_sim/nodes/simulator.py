@@ -3,11 +3,13 @@
 import os
 from array import array
 
+import numpy as np
+from rcl_interfaces.msg import SetParametersResult
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from flexarm_dynamics import arm_file
-from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.errors import MessageError, ModelError, ParameterError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
@@ -16,9 +18,12 @@ from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.start import leave
 from flexarm_ros.torque_gate import Controllers, TorqueGate, TorqueLimit
 from flexarm_sim import simulator
+from flexarm_sim.fault_injector import FIELDS, FaultInjector, Sample
 
 #: In lockstep, after two controllers were heard in turn one has to be silent for so many samples.
 ALONE_SAMPLES = 100
+#: In lockstep, where no message reaches a controller, so many periods are run between two looks at other calls.
+AT_ONCE = 200
 #: Sequence numbers on the topics are uint32.
 WRAP = 2**32
 
@@ -80,6 +85,19 @@ PARAMETERS = (
         high=20000.0,
         read_only=True,
     ),
+    Parameter(
+        "allow_faults",
+        "bool",
+        False,
+        "Whether `faults` may be set: for tests of what comes after the simulator.",
+        read_only=True,
+    ),
+    Parameter(
+        "faults",
+        "string_array",
+        [],
+        'Faults put into arm_state, each "SIGNAL KIND [key=value ...]": docs/fault_injection.md.',
+    ),
 )
 
 
@@ -87,7 +105,9 @@ class SimulatorNode(ArmNode):
     """Messages to arrays, one call of `Simulator`, arrays to messages."""
 
     def __init__(self):
+        self._injector = None
         super().__init__("simulator", {"": (*simulator.PARAMETERS, *PARAMETERS)})
+        self.add_on_set_parameters_callback(self._check_faults)
 
     def build(self):
         parameters = self.parameters
@@ -96,17 +116,23 @@ class SimulatorNode(ArmNode):
         names = {p.name for p in simulator.PARAMETERS}
         self.sim = simulator.Simulator(parameters.group("", names))
         parameters.on_change(self._changed)
+        self._injector = FaultInjector(self.arm, self._allowed(parameters["faults"]))
         self._lockstep = parameters["lockstep"]
         self._rates, self._velocity = (
             parameters["publish_rates"],
             parameters["publish_joint_velocity"],
         )
+        self._amplitude = self.sim.strain_map is not None and parameters["publish_modal_amplitude"]
         # A restart is a new session; so is a reset.
         self._session = int.from_bytes(os.urandom(4), "little")
         self._pause_first()
         self._answered = None  # sequence of the state whose answer is kept while paused
         self._answer = None
         self._safe = True  # in real time: whether the last period had the safe action
+        self._sent, self._awaited = (
+            [],
+            None,
+        )  # messages of the last sample; in lockstep, the sequence to be answered
         self._writer, self._reader = StateWriter(self.arm), TorqueReader(self.arm)
         self._joint_state = JointState(name=list(self.arm.joint_names))
         self._fill()
@@ -152,11 +178,32 @@ class SimulatorNode(ArmNode):
     def _changed(self, names):
         if "initial_position" in names:
             self.sim.settings["initial_position"] = self.parameters["initial_position"]
+        if "faults" in names:
+            self._injector.set(self.parameters["faults"])
+
+    def _allowed(self, lines):
+        """The faults, where there may be any."""
+        if lines and not self.parameters["allow_faults"]:
+            raise ParameterError("faults: start the simulator with allow_faults:=true to set them")
+        return lines
+
+    def _check_faults(self, parameters):
+        """Refuse what the injector would not take; its type has been looked at elsewhere."""
+        for parameter in parameters:
+            lines = parameter.value if parameter.name == "faults" else None
+            if self._injector is None or not lines or not all(isinstance(x, str) for x in lines):
+                continue
+            try:
+                FaultInjector(self.arm, self._allowed(lines))
+            except ParameterError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
     def start(self):
         mode = "lockstep" if self._lockstep else "real time"
         self.get_logger().info(f"arm {self.arm.name}, {mode}, {self.parameters['rate']:g} Hz")
         self._publish()
+        self._go_on()
 
     # Torque in, state out --------------------------------------------------------------------
 
@@ -173,16 +220,34 @@ class SimulatorNode(ArmNode):
         if self._in_turn(msg.controller_id):
             torque = None
         if self._lockstep:
-            if msg.sequence != self.sim.sequence:
+            if msg.sequence != self._awaited:
                 return  # an answer to a state that was sent again
             if self._paused:
                 return  # the state is sent again after the pause, and answered from the cache
-            self._advance(torque)
-            self._paused = self._paused or self.sim.sequence == self._pause_sequence
-            self._publish()
+            self._answered = msg.sequence
+            self._answer = None if torque is None else torque.copy()
+            self._step(self._fresh())
+            self._go_on()
         elif self._age(msg.sequence) <= min(self._age(self._answered), WRAP // 2):
             self._answered = msg.sequence
             self._answer = None if torque is None else torque.copy()
+
+    def _step(self, torque):
+        """In lockstep: one period, and the state after it."""
+        self._advance(torque)
+        self._paused = self._paused or self.sim.sequence == self._pause_sequence
+        self._publish()
+
+    def _go_on(self):
+        """In lockstep: where no message went out there is no answer to wait for; the last torque acts on and ages."""
+        for _ in range(AT_ONCE):
+            if not self._lockstep or self._paused or self._awaited is not None:
+                return
+            self._step(self._fresh())
+
+    def _fresh(self):
+        """The last torque, while what it answers is not too old; else None: the safe action."""
+        return self._answer if self._age(self._answered) <= self._timeout_samples else None
 
     def _age(self, sequence):
         """Samples since state `sequence`, as uint32 count; one from the future is very old, none older still."""
@@ -223,12 +288,16 @@ class SimulatorNode(ArmNode):
         writer.write("joint_velocity", sim.velocity if self._velocity else None)
         writer.write("joint_torque", sim.torque)
         writer.write("strain", sim.strain)
-        writer.write("modal_amplitude", None if sim.strain_map is None else sim.amplitude)
+        writer.write("modal_amplitude", sim.amplitude if self._amplitude else None)
         writer.write("modal_rate", sim.rate if self._rates else None)
 
     def _publish(self):
-        self._state_pub.publish(self._writer.message)
         sim = self.sim
+        self._sent = self._outgoing()
+        for message in self._sent:
+            self._state_pub.publish(message)
+        # Of several the newest, which one that comes after its successor is not.
+        self._awaited = max((m.sequence for m in self._sent), default=None)
         if (
             sim.sequence % self._joint_states_every == 0
             and self._joint_pub.get_subscription_count()
@@ -240,12 +309,40 @@ class SimulatorNode(ArmNode):
             msg.effort = array("d", sim.torque)
             self._joint_pub.publish(msg)
 
+    def _outgoing(self):
+        """Messages of the present sample: its own, or what faults make of it."""
+        message = self._writer.message
+        if self._injector.idle:
+            return [message]
+        names = {key: getattr(message, key) for key in set(FIELDS.values())}
+        values = {
+            key: np.array(getattr(message, key)) if len(getattr(message, key)) else None
+            for key in (*FIELDS, "modal_rate")
+        }
+        sample = Sample(self.sim.sequence, self.sim.stamp_ns, names, values)
+        return [self._message(s) for s in self._injector.outgoing(sample, self.sim.time)]
+
+    def _message(self, sample):
+        """An `ArmState` of its own, with what a faulty sample says."""
+        message = ArmState(session=self._session, sequence=sample.sequence)
+        message.header.frame_id = self._writer.message.header.frame_id
+        set_stamp(message.header.stamp, sample.stamp_ns)
+        for key, names in sample.names.items():
+            setattr(message, key, names)
+        for key, values in sample.values.items():
+            setattr(message, key, array("d", () if values is None else values))
+        return message
+
     def _resend(self):
         """Steady clock: send an unanswered state again, and say so when nobody answers."""
         if not self.active or not (self._lockstep or self._paused):
             return
         self._waited += 1
-        self._state_pub.publish(self._writer.message)
+        if self._awaited is None:
+            self._go_on()
+            return
+        for message in self._sent:
+            self._state_pub.publish(message)
         seconds = self._waited * self.parameters["resend_period"]
         if not self._paused and seconds >= 5.0:
             self.report(
@@ -273,9 +370,11 @@ class SimulatorNode(ArmNode):
         self._answered, self._answer, self._fault = None, None, ""
         self._controllers.forget()
         self._several = False
+        self._injector.reset()
         self._pause_first()
         self._fill()
         self._publish()
+        self._go_on()
         response.success, response.message = True, f"session {self._session}"
         return response
 
@@ -304,6 +403,8 @@ class SimulatorNode(ArmNode):
         }
         if self.line is not None and not self._lockstep:
             values["periods lost"] = self.line.lost
+        if not self._injector.idle:
+            values["faults"] = "; ".join(str(f) for f in self._injector.faults)
         if self._fault:
             return ERROR, self._fault, values
         several, self._several = self._several, False
