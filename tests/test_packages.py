@@ -72,11 +72,15 @@ def test_keys_are_those_of_what_a_package_imports(path):
     package = parse_package(path)
     declared = {dependency.name for dependency in package.exec_depends}
     declared -= {key for name, key in USED_OTHERWISE if name == path.name}
-    assert declared == keys(path.name, [path / path.name, path / "launch"])
+    needed = keys(path.name, [path / path.name, path / "launch"])
+    manifest = f"{path.relative_to(ROOT)}/package.xml"
+    assert not needed - declared, f"add as exec_depend to {manifest}"
+    assert not declared - needed, f"not imported, take from {manifest}"
     tests = {dependency.name for dependency in package.test_depends}
     circles = {key for name, key in CIRCLES if name == path.name}
-    assert tests >= keys(path.name, [path / "test"]) - declared - circles
-    assert tests <= keys(path.name, [path / "test"])
+    needed = keys(path.name, [path / "test"])
+    assert not needed - declared - circles - tests, f"add as test_depend to {manifest}"
+    assert not tests - needed, f"not imported by tests, take from {manifest}"
 
 
 def test_keys_of_the_messages_are_those_of_their_build():
