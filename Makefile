@@ -3,6 +3,8 @@ PYTHON ?= python3
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 COMPARE_ARGS ?=
+FUZZ_ARGS ?= --inputs 1000000 --dds 10000
+SOAK_ARGS ?= --minutes 30
 LATENCY_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
@@ -14,7 +16,7 @@ export FLEXARM_ROOT := $(CURDIR)
 TESTS := $(wildcard src/*/test tests)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test bench compare latency lint clean distclean
+.PHONY: help build demo test bench compare latency fuzz soak lint clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -24,6 +26,8 @@ help:
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then tune rivals on the same arms, and compare; COMPARE_ARGS=--quick'
 	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
+	@echo 'make fuzz       build, then malformed input for every reader and node; FUZZ_ARGS="--inputs 10000"'
+	@echo 'make soak       build, then random motions, parameters and faults; SOAK_ARGS="--minutes 5"'
 	@echo 'make lint       check style (ruff)'
 	@echo 'make clean      remove what was built, results and caches; .venv stays'
 	@echo 'make distclean  clean, and remove .venv'
@@ -54,6 +58,13 @@ compare: build
 LATENCY_OUT := --write docs/latency.md
 latency: build
 	@. tools/env.sh && python -m flexarm_bringup.cli latency $(if $(LATENCY_ARGS),$(LATENCY_ARGS),$(LATENCY_OUT))
+
+# docs/testing.md says what they check, and how a failure is repeated.
+fuzz: build
+	@. tools/env.sh && python -W ignore -m fuzz $(FUZZ_ARGS)
+
+soak: build
+	@. tools/env.sh && python -m soak $(SOAK_ARGS)
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check

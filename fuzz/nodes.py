@@ -1,0 +1,291 @@
+"""Running nodes: malformed messages and parameters over DDS, in lockstep; afterwards they must hold an arm."""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+from random import Random
+
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter as RosParameter
+from std_srvs.srv import SetBool, Trigger
+
+from flexarm_dynamics import arm_file
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_ros.messages import set_stamp
+
+from . import odd
+from .__main__ import Tally
+from .files import Parameters, declared
+from .messages import good_state, good_torque, spoil_state, spoil_torque
+from .trajectories import good_points, spoil_points
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import harness
+
+NODES = ("simulator", "observer", "controller")
+#: Of all messages: states to the observer, states to the controller, torques, trajectories, parameters.
+SHARES = {
+    "arm_state": 0.35,
+    "arm_state_estimate": 0.2,
+    "joint_torque": 0.2,
+    "joint_trajectory": 0.15,
+}
+#: A node is asked for an answer after so many messages that have none.
+AT_ONCE = 5
+#: A state that is not answered is sent again so often.
+MOST_TRIES = 20
+
+
+class Nodes:
+    """Three nodes, and a program beside them that sends what it should not.
+
+    Parameters
+    ----------
+    bench : harness.Bench
+    seed : int
+    arm : str
+    """
+
+    def __init__(self, bench, seed, arm="R"):
+        self.bench, self.random = bench, Random(f"{seed} nodes")
+        self.description = arm_file.load(arm)
+        bench.start_loop(
+            arm=arm,
+            simulator={"lockstep": True, "pause_at": -1.0},
+            controller={"state_timeout": 3600.0},
+        )
+        self.arm = harness.Arm(bench, joints=self.description.joint_names)
+        self.wait("the controller to be ready", self.arm.ready)
+        self.given = self._parameters()
+        self.tallies = []
+
+    def wait(self, what, condition):
+        """Wait for a condition; messages that nobody will look at are forgotten."""
+
+        def holds():
+            for tap in self.bench._taps.values():
+                del tap.messages[:-50]
+            return condition()
+
+        self.bench.processes.check()
+        return self.bench.wait_for(what, holds)
+
+    def alive(self, *nodes):
+        """Each node answers a service."""
+        self.bench.processes.check()
+        for node in nodes or NODES:
+            assert self.bench.lifecycle(node) == "active", f"{node} is not active"
+
+    # Messages that are answered by the next node -----------------------------------------------------
+
+    def states(self, topic, count, tally):
+        """States to the observer or the controller; each is answered by a torque."""
+        publisher = self.bench.publisher(ArmState, topic, 2)  # the tap is a reader, too
+        for k in range(count):
+            msg = good_state(self.random, self.description)
+            set_stamp(msg.header.stamp, 10**9 + 10**6 * k)
+            spoil_state(self.random, msg)
+            # The answer tells that it was read; by this number it is known.
+            msg.session, msg.sequence = 77, k
+            if self.random.random() < 0.02:
+                msg.session = 78 + k  # the source begins anew
+            publisher.publish(msg)
+            key, tries = (msg.session, msg.sequence), [time.monotonic()]
+
+            def answered(key=key, tries=tries, msg=msg):
+                if self.arm.torques.answers(*key) or len(tries) > MOST_TRIES:
+                    return True
+                if time.monotonic() > tries[-1] + 0.5:  # overtaken: the line keeps the newest alone
+                    tries.append(time.monotonic())
+                    publisher.publish(msg)
+                return False
+
+            self.wait(f"an answer to {topic} {k}", answered)
+            answers = self.arm.torques.answers(*key)
+            tally.inputs += 1
+            if not answers:
+                tally.failures += 1
+                tally.first.setdefault("silence", f"{topic} {k}: no torque answers it: {msg}")
+            for answer in answers:
+                finite = all(abs(u) < 1e9 for u in answer.torque)
+                tally.refused += answer.mode == JointTorque.DISABLED
+                if not finite:
+                    tally.failures += 1
+                    tally.first.setdefault(
+                        "torque", f"{topic} {k}: a torque of {list(answer.torque)}"
+                    )
+                break
+
+    # Messages without an answer ------------------------------------------------------------------------
+
+    def torques(self, count, tally):
+        """Torques to the simulator, of its own session or not."""
+        publisher = self.bench.publisher(JointTorque, "joint_torque", 2)
+        for k in range(count):
+            msg = spoil_torque(self.random, good_torque(self.random, self.description))
+            if self.random.random() < 0.5 and self.arm.measured.newest is not None:
+                newest = self.arm.measured.newest
+                msg.session, msg.sequence = newest.session, newest.sequence
+            publisher.publish(msg)
+            self._sometimes(k, "simulator")
+            tally.inputs += 1
+
+    def trajectories(self, count, tally):
+        """Trajectories to the controller."""
+        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+        joints = list(self.description.joint_names)
+        for k in range(count):
+            msg = JointTrajectory(joint_names=joints)
+            for point in spoil_points(self.random, good_points(self.random, joints)):
+                try:
+                    out = JointTrajectoryPoint()
+                    out.time_from_start.sec, out.time_from_start.nanosec = divmod(point[0], 10**9)
+                    out.positions, out.velocities, out.accelerations, out.effort = point[1:]
+                except Exception:  # what no message holds can't be sent
+                    continue
+                msg.points.append(out)
+            if self.random.random() < 0.3:
+                msg.joint_names = odd.names(self.random, joints)
+            if self.random.random() < 0.2:
+                msg.header.stamp.sec = odd.unsigned(self.random) - 2**31
+            self.bench.publisher(JointTrajectory, "joint_trajectory").publish(msg)
+            self._sometimes(k, "controller")
+            tally.inputs += 1
+
+    def _sometimes(self, k, node):
+        if k % AT_ONCE == AT_ONCE - 1:
+            self.alive(node)
+
+    # Parameters ------------------------------------------------------------------------------------------
+
+    def _parameters(self):
+        """Values of the controller's and observer's own parameters that may be changed."""
+        out = {}
+        for prefix, group in declared().items():
+            node = "observer" if prefix == "observer." else "controller"
+            if prefix == "simulator ":
+                continue
+            for p in group:
+                if not p.read_only and (p.kind not in ("string_array",)):
+                    name = prefix.replace("controller ", "") + p.name
+                    out[node, name] = self.bench.get(node, name)
+        return out
+
+    def parameters(self, count, tally):
+        """Values of any type and size for the declared parameters."""
+        groups = {k.replace(" ", ""): v for k, v in declared().items()}
+        for _ in range(count):
+            prefix = self.random.choice(tuple(groups))
+            node = {"simulator": "simulator", "observer.": "observer"}.get(prefix, "controller")
+            parameter = self.random.choice(groups[prefix])
+            name = parameter.name if prefix in NODES else prefix + parameter.name
+            try:
+                value = RosParameter(name, value=Parameters.value(self.random, parameter))
+                request = [value.to_parameter_msg()]
+            except Exception:  # what no message holds can't be sent
+                continue
+            answer = self.bench.call(SetParameters, f"{node}/set_parameters", parameters=request)
+            result = answer.results[0]
+            tally.inputs += 1
+            tally.refused += not result.successful
+            if not result.successful and not result.reason:
+                tally.failures += 1
+                tally.first.setdefault("reason", f"{name}: refused without a reason")
+
+    # The end -----------------------------------------------------------------------------------------------
+
+    def prove(self):
+        """The same processes hold the arm and follow a motion, with the parameters that they began with."""
+        self.alive()
+        for node in ("observer", "controller"):
+            mine = {
+                name.replace(".", "__"): v for (of, name), v in self.given.items() if of == node
+            }
+            answer = self.bench.set_atomically(node, **mine)
+            assert answer.successful, f"{node}: {answer.reason}"
+        self.bench.call(SetBool, "simulator/pause", data=False)
+        answer = self.bench.call(Trigger, "simulator/reset")
+        session, again = int(answer.message.split()[-1]), [0.0]
+
+        def healthy():
+            state = self.arm.state
+            if state.session != session or state.supervisor_state == CompositeState.FAULT:
+                if time.monotonic() > again[0]:
+                    again[0] = time.monotonic() + 2.0
+                    self.bench.call(Trigger, "controller/recover")
+                return False
+            return self.arm.ready()
+
+        self.wait(f"torque in session {session}", healthy)
+        n, before, again = (
+            len(self.description.joints),
+            self.arm.state.accepted_trajectory_id,
+            [0.0],
+        )
+        point = (1.0, [0.3] * n, [0.0] * n, [0.0] * n)
+        message = harness.trajectory(self.description.joint_names, point)
+
+        def arrived():
+            state = self.arm.state
+            if state.accepted_trajectory_id == before and time.monotonic() > again[0]:
+                again[0] = time.monotonic() + 1.0
+                self.arm.publish_trajectory(message)
+            there = all(abs(q - 0.3) < 1e-9 for q in state.reference_position)
+            return there and state.supervisor_state == CompositeState.HOLDING
+
+        self.wait("a healthy motion to end", arrived)
+
+
+def fuzz(count, seed, say, patience=180.0):
+    """Give running nodes so many messages.
+
+    Parameters
+    ----------
+    count : int
+    seed : int
+    say : callable
+        Is told each `Tally` when it is complete.
+    patience : float
+        Longest wait for any one thing [s].
+
+    Returns
+    -------
+    list of Tally
+    """
+    tallies = []
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, harness.Bench(folder) as bench:
+        bench.PATIENCE = max(bench.PATIENCE, patience)
+        nodes = Nodes(bench, seed)
+
+        def part(name, share, action):
+            tally, started = Tally(f"DDS {name}"), time.perf_counter()
+            tallies.append(tally)
+            try:
+                action(max(1, round(share * count)), tally)
+            except Exception as error:
+                tally.failures += 1
+                tally.first["died"] = (
+                    f"{tally.name} {tally.inputs}: {type(error).__name__}: {error}"
+                )
+            tally.seconds = time.perf_counter() - started
+            say(tally)
+
+        part("trajectories", SHARES["joint_trajectory"], nodes.trajectories)
+        part("parameters", 1.0 - sum(SHARES.values()), nodes.parameters)
+        # The nodes that would answer beside this program are told to be still.
+        bench.change("controller", "deactivate")
+        part("torques", SHARES["joint_torque"], nodes.torques)
+        bench.change("controller", "activate")
+        bench.change("simulator", "deactivate")
+        part("states", SHARES["arm_state"], lambda n, t: nodes.states("arm_state", n, t))
+        part(
+            "estimates",
+            SHARES["arm_state_estimate"],
+            lambda n, t: nodes.states("arm_state_estimate", n, t),
+        )
+        bench.change("simulator", "activate")
+        part("afterwards", 0.0, lambda n, t: nodes.prove())
+    return tallies

@@ -1,0 +1,1 @@
+"""A long life of the three nodes with random motions, parameters and faults; see ``python -m soak --help``."""
