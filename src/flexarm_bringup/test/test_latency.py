@@ -55,7 +55,7 @@ def options(*words):
 def test_options_choose_the_cases():
     assert [c.name for c in latency.chosen(options())] == [
         *(f"R, {rate} Hz" for rate in (200, 500, 1000)),
-        "long_reach, 500 Hz",
+        "long_reach, 500 Hz x 0.25",
     ]
     quick = latency.chosen(options("--quick", "--arms", "R"))
     assert [c.rate for c in quick] == [500.0]

@@ -200,18 +200,36 @@ class ModelFeedforward(Feedforward):
     def __init__(self, model, manifold, settings):
         super().__init__(model, manifold, settings)
         n, m = model.n_joints, model.n_modes
-        self._advance = model.stepper(METHODS["rk4"])
+        self._make_stepper()
         self._substeps = substeps(model, settings.period, "rk4")
-        # Compiled code is loaded at its first call: not on the control path.
-        self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
         self.state, self._error = np.zeros(2 * (n + m)), np.zeros(2 * (n + m))
-        parts = np.split(self.state, [n, n + m, 2 * n + m])
-        self.position, self.amplitude, self.velocity, self.rate = parts
+        self._name_parts()
         #: The gain that serves everywhere; None where it depends on the joints.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
         self._prepared, self._first = None, True
         self._ahead = None  # what `look_ahead` has done
         self._held = None  # position, and what `wanted` made of it, while the reference rests
+
+    def _make_stepper(self):
+        n, m = self.model.n_joints, self.model.n_modes
+        self._advance = self.model.stepper(METHODS["rk4"])
+        # Compiled code is loaded at its first call: not on the control path.
+        self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
+
+    def _name_parts(self):
+        n, m = self.model.n_joints, self.model.n_modes
+        parts = np.split(self.state, [n, n + m, 2 * n + m])
+        self.position, self.amplitude, self.velocity, self.rate = parts
+
+    def __getstate__(self):
+        """Without compiled code, and without the views of `state`: for another process."""
+        left = ("_advance", "position", "amplitude", "velocity", "rate", "_ahead")
+        return {name: value for name, value in self.__dict__.items() if name not in left}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state, _ahead=None)
+        self._make_stepper()
+        self._name_parts()
 
     def _same_everywhere(self):
         """Whether the plant at rest does not change with the joints."""

@@ -1,0 +1,80 @@
+"""Designs that come from another process are those made here."""
+
+import os
+import pickle
+import signal
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from flexarm_control import composite, design_process
+from flexarm_control.design_process import DesignProcess
+from flexarm_dynamics import arm_file
+from flexarm_dynamics.errors import DesignError, ParameterError
+from flexarm_dynamics.model import build
+
+FAST, CORRECTED = {"type": "lqr"}, {"type": "corrected"}
+
+
+def torques(control, n, m):
+    """A few samples about a reference that moves."""
+    out, rng = [], np.random.default_rng(2)
+    for k in range(5):
+        state = np.array([np.full(n, 0.1 + 1e-3 * k), np.full(n, 0.2), np.full(n, -0.3)])
+        reference = SimpleNamespace(
+            position=state[0],
+            velocity=state[1],
+            acceleration=state[2],
+            path=None,
+            near=lambda _, s=state: s.copy(),
+        )
+        draw = [1e-3 * rng.standard_normal(size) for size in (n, n, m, m)]
+        q, qd = state[0] + draw[0], state[1] + draw[1]
+        out.append(control.step(q, qd, *draw[2:], reference, 1e-3 if k else 0.0).copy())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("slow", ["linear_model_following", "model_following", "sliding_mode"])
+@pytest.mark.parametrize("kind", ["none", "model", "preview"])
+def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
+    made = composite.design(arm_r, {"type": slow}, FAST, CORRECTED, {"feedforward": kind})
+    data = design_process.dumps(made, arm_r.arm)
+    expected = torques(made, 1, arm_r.n_modes)
+    travelled = design_process.loads(data, arm_r)
+    assert travelled.model is arm_r
+    np.testing.assert_array_equal(torques(travelled, 1, arm_r.n_modes), expected)
+    assert np.ptp(expected) > 0.0
+
+
+def test_a_model_of_another_arm_stays_at_home(arm_r, arm_p3):
+    with pytest.raises(pickle.PicklingError, match="another arm, P3"):
+        design_process.dumps([arm_p3], arm_r.arm)
+
+
+def test_the_process_designs_refuses_and_comes_again_when_it_has_died(arm_r):
+    worker = DesignProcess(arm_r, niceness=0)
+    try:
+        slow, settings = {"type": "linear_model_following"}, {"feedforward": "model"}
+        made = worker.design(slow, FAST, CORRECTED, settings)
+        here = composite.design(arm_r, slow, FAST, CORRECTED, settings)
+        m = arm_r.n_modes
+        np.testing.assert_allclose(torques(made, 1, m), torques(here, 1, m), rtol=1e-12)
+        with pytest.raises(ParameterError, match=r"slow\.kp"):
+            worker.design(slow | {"kp": [-1.0]}, FAST, CORRECTED, settings)
+        (pid,) = worker._pool._processes
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(DesignError, match="has died"):
+            worker.design(slow, FAST, CORRECTED, settings)
+        assert worker.design(slow, FAST).feedforward is None
+    finally:
+        worker.close()
+
+
+def test_a_law_of_many_links_travels():
+    model = build(arm_file.load("two_link"))
+    given = {"type": "model_following", "kp": [2.25], "kv": [3.0]}
+    fast = {"type": "lqr", "alpha": 2.0, "q": [0.0] * 4 + [0.001] * 4, "configuration": [0.8, 0.8]}
+    made = composite.design(model, given, fast, CORRECTED | {"order": 1})
+    travelled = design_process.loads(design_process.dumps(made, model.arm), model)
+    np.testing.assert_array_equal(torques(travelled, 2, 4), torques(made, 2, 4))
