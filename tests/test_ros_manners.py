@@ -28,8 +28,11 @@ def arms(tmp_path_factory):
                 key = f"{side}_{name}"
                 bench.start(name, {**common, **own}, key=key, remaps=[f"__ns:=/{side}"])
         pair = Arm(bench, "a/", pauses_at=100), Arm(bench, "b/", pauses_at=100)
-        for arm in pair:
-            arm.wait_standing()
+
+        def stand():
+            return all(arm.ready() and arm.state.sequence == arm.pauses_at for arm in pair)
+
+        bench.wait_for("both arms to stand", stand, patience=4 * bench.PATIENCE)  # six processes
         yield pair
 
 
