@@ -214,6 +214,8 @@ class ArmObserver:
         self.gauges.update(sample.strain)
         if sample.amplitude is None or self.calibrated:
             sample.amplitude = self.gauges.amplitudes(sample.strain, out=self._mapped)
+            if self.gauges.lost != self.observer.gauges_lost:
+                self.observer.leave_out(self.gauges.lost)
 
     def calibrate(self):
         """Take the gauges' bias from the last samples, on an arm at rest; not on the control path.
@@ -236,7 +238,7 @@ class ArmObserver:
         self.strain_map.bias = new
         self.calibrated = True
         now = self.strain_map.amplitudes(self.calibration.last)
-        self.observer.amplitude += now - self._used
+        self.observer.rest_at(now)
         self._used[:] = now
         return old, new
 

@@ -525,3 +525,63 @@ def test_an_arm_without_payload_has_no_scale_to_estimate(loaded):
     with pytest.raises(DesignError, match=r"payload\.mass is 0.*estimate_payload to false"):
         design_observer("extended_kalman", arm, {})
     design_observer("extended_kalman", arm, {"estimate_payload": False})
+
+
+@pytest.fixture(scope="module")
+def lab():
+    """R with four gauges for two modes."""
+    return model.build(arm_file.load("R_lab"))
+
+
+def listening(arm, **options):
+    """A Kalman filter behind its gauges, and a function that gives it the next sample of strains."""
+    core = observe(arm, "kalman", options)
+
+    def hear(strain):
+        s = ArmSample(1, 2, 4)
+        s.stamp_ns, s.session, s.sequence = (500 + hear.count) * 2 * MS, 1, hear.count
+        s.torque[:], s.strain, s.amplitude = 0.0, np.array(strain), None
+        hear.count += 1
+        core.step(s)
+
+    hear.count = 0
+    return core, hear
+
+
+def test_without_a_gauge_the_filter_knows_that_the_others_tell_less(lab):
+    core, hear = listening(lab, stuck_samples=5)
+    random = np.random.default_rng(0)
+    noise = np.array([g.uncertainty for g in lab.arm.gauges])
+    for _ in range(60):
+        hear(noise * random.standard_normal(4))
+    whole = core.observer.covariance_diagonal.copy()
+    for _ in range(60):
+        hear([np.nan, *(noise[1:] * random.standard_normal(3))])
+    assert core.observer.gauges_lost == (0,)
+    # R is what the amplitudes of the three gauges left scatter.
+    strains = noise * random.standard_normal((20000, 4))
+    left = np.linalg.lstsq(
+        core.strain_map.rows[1:] / noise[1:, None], (strains[:, 1:] / noise[1:]).T, rcond=None
+    )[0]
+    assert_allclose(core.observer.measurement_covariance[1:, 1:], np.cov(left), rtol=0.05)
+    assert (core.observer.covariance_diagonal > 1.05 * whole).all()
+    # It comes back with the gauge.
+    for _ in range(120):
+        hear(noise * random.standard_normal(4))
+    assert core.observer.gauges_lost == ()
+    assert_allclose(core.observer.covariance_diagonal, whole, rtol=0.02)
+
+
+def test_a_calibration_is_no_innovation(lab):
+    core, hear = listening(lab, calibration_samples=20)
+    bias = np.array([20e-6, -35e-6, 5e-6, 3e-6])
+    for _ in range(60):
+        hear(bias)
+    wrong = np.abs(core.observer.amplitude).max()
+    assert wrong > 1e-4
+    core.calibrate()
+    for _ in range(5):
+        hear(bias)
+        assert np.abs(core.observer.innovation).max() < 1e-3 * wrong
+        assert np.abs(core.observer.amplitude).max() < 1e-3 * wrong
+        assert np.abs(core.observer.rate).max() < 1e-5

@@ -198,6 +198,10 @@ class StrainMap:
         difference[list(lost)] = 0.0
         return np.dot(self._inverse_without(lost), difference, out=out)
 
+    def inverse_without(self, lost):
+        """`inverse` of the gauges that are not in `lost`, with zeros for the others; None where they don't suffice."""
+        return self._inverse_without(lost) if lost else self.inverse
+
     def _inverse_without(self, lost):
         """Weighted pseudo-inverse with zero columns for the lost; None where they are needed.
 

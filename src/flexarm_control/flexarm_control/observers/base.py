@@ -35,6 +35,8 @@ class Observer(ABC):
         noise is as assumed; NaN where the observer has none.
     consistent : bool
         False while the innovations are larger than the assumed noise explains.
+    gauges_lost : tuple of int
+        Gauges that the amplitudes are made without, as `leave_out` was told; indices, ascending.
     parameters_estimated : dict of str to float
         What the observer estimates of the arm itself; the name has the unit.
     """
@@ -54,6 +56,7 @@ class Observer(ABC):
         self.innovation = np.zeros(0)
         self.covariance_diagonal = np.zeros(0)
         self.parameters_estimated = {}
+        self.gauges_lost = ()
         self.converged = False
         self._elapsed = -1.0  # [s] since the first sample; negative before it
 
@@ -65,6 +68,14 @@ class Observer(ABC):
         """Go on from another observer's estimate: a redesign does not begin anew."""
         self.amplitude[:], self.rate[:] = other.amplitude, other.rate
         self.converged, self._elapsed = other.converged, other._elapsed
+
+    def leave_out(self, lost):
+        """From the next sample on the amplitudes are made without these gauges: they are noisier."""
+        self.gauges_lost = lost
+
+    def rest_at(self, amplitude):
+        """The arm is at rest, bent by these amplitudes (m,): the gauges' bias has just been found."""
+        self.amplitude[:] = amplitude
 
     @abstractmethod
     def update(self, sample, dt):

@@ -120,7 +120,12 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
-        self.measurement_covariance = measurement_covariance(model, self.parameters)
+        # That of all gauges, and of every set of them that was in use.
+        self._strain_map = StrainMap(model) if model.arm.gauges else None
+        self.measurement_covariance = measurement_covariance(
+            model, self.parameters, self._strain_map
+        )
+        self._covariances = {(): self.measurement_covariance}
         self.density = np.concatenate(
             [
                 np.square(np.asarray(self.parameters["torque_noise"], float)),
@@ -151,6 +156,22 @@ class Kalman(Observer):
         self.state[:] = other.state[:size]
         self.covariance[:] = other.covariance[:size, :size]
         self._forget_gain()
+        self._publish()
+
+    def leave_out(self, lost):
+        """As `Observer.leave_out`: R is that of the gauges that are left."""
+        super().leave_out(lost)
+        if lost not in self._covariances:
+            self._covariances[lost] = measurement_covariance(
+                self.model, self.parameters, self._strain_map, lost
+            )
+        self.measurement_covariance = self._covariances[lost]
+        self._steady = False
+
+    def rest_at(self, amplitude):
+        """As `Observer.rest_at`: the next innovation is none of the bias, which the filter had made motion of."""
+        n, p = self._n, self._p
+        self.state[n:p], self.state[p : 2 * p] = amplitude, 0.0
         self._publish()
 
     def update(self, sample, dt):
@@ -235,7 +256,7 @@ class Kalman(Observer):
         self.covariance_diagonal[m:] = variance[p + n : 2 * p]
 
 
-def measurement_covariance(model, parameters):
+def measurement_covariance(model, parameters, strain_map=None, lost=()):
     """R of joint positions and modal amplitudes, shape (n + m, n + m) [rad^2, m^2].
 
     Parameters
@@ -243,6 +264,10 @@ def measurement_covariance(model, parameters):
     model : ArmModel
     parameters : mapping
         ``strain_noise``, ``position_noise`` and ``amplitude_noise``.
+    strain_map : StrainMap, optional
+        Of the model, where it has been made.
+    lost : tuple of int
+        Gauges that the amplitudes are made without; the others suffice.
     """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))
@@ -255,7 +280,8 @@ def measurement_covariance(model, parameters):
         return out
     gauges, given = model.arm.gauges, parameters["strain_noise"]
     stated = [given or g.uncertainty or UNSTATED_STRAIN for g in gauges]
-    weighted = StrainMap(model).inverse * np.array(stated)
+    inverse = (strain_map or StrainMap(model)).inverse_without(lost)
+    weighted = inverse * np.array(stated)
     out[n:, n:] = weighted @ weighted.T
     return out
 
