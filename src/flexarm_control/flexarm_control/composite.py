@@ -257,14 +257,15 @@ def design(model, slow, fast, manifold=None, settings=None):
     if settings is None:
         return CompositeControl(model, slow_law, fast_law, surface)
     chosen = check_all(PARAMETERS, settings)
+    wanted = chosen["feedforward"]
+    kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
     q = np.array(fast_law.parameters.get("configuration", np.zeros(model.n_joints)))
     control = CompositeControl(model, slow_law, fast_law, surface)
     free = slow_law.drifts  # joints that nothing holds have no pole left of zero
     if not free:
         full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
-    if chosen["feedforward"] == "none" or free or slow_law.learns:
+    if kind is None or free or slow_law.learns:
         return control
-    kind = registry.find(FEEDFORWARD, chosen["feedforward"])
     motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
     return CompositeControl(model, slow_law, fast_law, surface, motion)
 

@@ -8,7 +8,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.arm_observer import design_observer
 from flexarm_control.composite import FAST, SLOW, design, design_law
-from flexarm_dynamics.errors import FlexarmError, ParameterError, UnknownComponentError
+from flexarm_dynamics.errors import (
+    DesignError,
+    FlexarmError,
+    ParameterError,
+    UnknownComponentError,
+)
 
 SLOW_LAW = {"type": "linear_model_following"}
 FAST_LAW = {"type": "lqr", "q": [20.0, 20.0, 1000.0, 6e5], "configuration": [np.pi / 2]}
@@ -162,3 +167,69 @@ def test_one_value_stands_for_all_and_defaults_fill_in(arm_r):
     law = design_law(FAST, "lqr", arm_r, {"q": [2.0]})
     assert law.parameters["q"] == [2.0] * 4
     assert law.parameters["alpha"] == 5.0
+
+
+# --------------------------------------------------------------------------- refused while it runs
+
+
+class Turning:
+    """A reference that turns on at a steady speed."""
+
+    def __init__(self, t):
+        self.t = t
+        self.position, self.velocity, self.acceleration = self.near(0.0)
+
+    def near(self, offset):
+        return np.array([[0.9 * (self.t + offset)], [0.9], [0.0]])
+
+
+RUNNING = {
+    "slow": {"type": "adaptive_model_following"},
+    "fast": {"type": "output_feedback"},
+    "manifold": {"type": "corrected", "order": 2},
+    "settings": {"feedforward": "model", "rate": 1000.0},
+}
+#: What is set in the running design, and what is said of it.
+REFUSED = [
+    ("slow", {"type": "slidingmode"}, UnknownComponentError, "did you mean 'sliding_mode'"),
+    ("slow", {"type": "sliding_mode", "lambda": [-1.0]}, ParameterError, r"slow\.lambda\[0\]"),
+    ("slow", {"adaptation_gain": -1.0}, ParameterError, r"slow\.adaptation_gain: -1\.0 is below"),
+    ("slow", {"type": "model_following", "kp": [1e4], "kv": [1.0]}, DesignError, "1/s"),
+    ("fast", {"type": "scheduledlqr"}, UnknownComponentError, "did you mean 'scheduled_lqr'"),
+    ("fast", {"type": "scheduled_lqr", "grid": 1}, ParameterError, r"fast\.grid: 1 is below"),
+    ("fast", {"type": "scheduled_lqr", "grid": 5.0}, ParameterError, r"fast\.grid: 5\.0 is not an"),
+    ("fast", {"type": "scheduled_lqr", "low": [1.0], "high": [-1.0]}, DesignError, r"fast\.low"),
+    ("fast", {"type": "pole_placement", "damping": [1.0]}, ParameterError, r"fast\.damping\[0\]: 1"),
+    ("fast", {"observer_pole": 0.0}, ParameterError, r"fast\.observer_pole: 0\.0 is below"),
+    ("fast", {"type": "lqr", "alpha": 900.0}, DesignError, "1/s"),
+    ("manifold", {"order": 7}, ParameterError, r"manifold\.order: 7 is above"),
+    ("manifold", {"type": "corected"}, UnknownComponentError, "did you mean 'corrected'"),
+    ("settings", {"feedforward": "previw"}, UnknownComponentError, "did you mean 'preview'"),
+    ("settings", {"rate": 0.0}, ParameterError, r"rate: 0\.0 is below"),
+    ("settings", {"stability_margin": 50.0}, DesignError, "50"),
+]  # fmt: skip
+
+
+def torques(model, between):
+    """Torques of the running design, `between` called between its samples."""
+    law, out = design(model, **RUNNING), []
+    for k in range(12):
+        reference = Turning(1e-3 * k)
+        q = reference.position - 1e-3 * k
+        out.append(law.step(q, 0.8 * reference.velocity, DELTA, None, reference, 1e-3 * (k > 0)))
+        out[-1] = out[-1].copy()
+        between(k)
+    return np.array(out)
+
+
+def test_what_is_refused_leaves_the_running_loop_as_it_was_to_the_last_bit(arm_r):
+    def refuse(k):
+        for part, change, error, message in REFUSED if k == 5 else ():
+            given = {name: dict(values) for name, values in RUNNING.items()}
+            given[part] = change if "type" in change else given[part] | change
+            with pytest.raises(error, match=message):
+                design(arm_r, **given)
+
+    undisturbed = torques(arm_r, lambda k: None)
+    assert_array_equal(torques(arm_r, refuse), undisturbed)
+    assert np.ptp(undisturbed) > 1e-6

@@ -106,6 +106,21 @@ def test_along_the_reference_is_the_manifold_without_a_tracking_error(arm):
     assert_allclose(whole, torque + surface.feedforward, rtol=1e-6)
 
 
+def test_a_tracking_error_does_not_move_the_manifold_of_the_reference(arm):
+    reference = Sine(arm.n_joints).at(0.9)
+    surface = manifold(arm, "reference")
+    delta, rate, whole = surface.along(reference)
+    for off in (0.0, 0.2):
+        updated(surface, reference.position + off, reference.velocity - off, reference)
+        assert_array_equal(surface.amplitude, delta)
+        assert_array_equal(surface.rate, rate)
+        # Beyond it the slow law's torque on the reference: inverse dynamics of the quasi-steady arm.
+        a, B = slow_subsystem(arm.terms(reference.position, reference.velocity))
+        slow = np.linalg.solve(B, reference.acceleration - a)
+        assert_allclose(surface.feedforward, whole - slow, atol=1e-6 * np.abs(whole).max())
+    assert np.abs(rate).max() > 0.0
+
+
 # --------------------------------------------------------------------------- invariance
 
 
