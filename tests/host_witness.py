@@ -14,21 +14,40 @@ import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from harness import Tap, trajectory
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from flexarm_bringup.processes import NODES
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros import qos
 
-JOINTS = ["joint1"]
+NODES = ("simulator", "observer", "controller")
+#: Reliable; deep enough for a witness that falls behind for seconds.
+DEEP = QoSProfile(depth=20_000)
 
 
 def _diagnostics(message):
     return {s.name: [s.level[0], s.message] for s in message.status if s.name in NODES}
+
+
+def _trajectory(goal, duration):
+    """From where the arm is to rest at a goal [rad], in so long [s]."""
+    when = Duration(seconds=duration).to_msg()
+    end = JointTrajectoryPoint(
+        positions=[goal], velocities=[0.0], accelerations=[0.0], time_from_start=when
+    )
+    return JointTrajectory(joint_names=["joint1"], points=[end])
+
+
+def _taken(subscription):
+    """What has come on a topic, in order."""
+    handle = subscription.handle
+    with handle:
+        while (taken := handle.take_message(subscription.msg_type, False)) is not None:
+            yield taken[0]
 
 
 #: Topic to type and to what is of interest in a message; nothing is said of a message without.
@@ -55,15 +74,17 @@ def main():
     quiet = {"start_parameter_services": False, "enable_rosout": False}
     node, tapping = Node("witness", **quiet), Node("witness_taps", **quiet)
     executor = SingleThreadedExecutor()
-    executor.add_node(node)  # not the other: the taps take their messages themselves
-    taps = {topic: Tap(tapping, kind, topic) for topic, (kind, _) in TOPICS.items()}
+    executor.add_node(node)  # not the other, whose messages are taken here
+    taps = {
+        topic: tapping.create_subscription(kind, topic, lambda message: None, DEEP)
+        for topic, (kind, _) in TOPICS.items()
+    }
     mover = node.create_publisher(JointTrajectory, "joint_trajectory", qos.COMMAND)
     recover = node.create_client(Trigger, "controller/recover")
 
     def obey(name, *arguments):
         if name == "move":
-            goal, duration = arguments
-            mover.publish(trajectory(JOINTS, (duration, [goal], [0.0], [0.0])))
+            mover.publish(_trajectory(*arguments))
         elif recover.service_is_ready():
             recover.call_async(Trigger.Request())
 
@@ -75,11 +96,9 @@ def main():
             obey(*json.loads(line))
         executor.spin_once(timeout_sec=0.0)
         for topic, tap in taps.items():
-            tap.poll()
-            for message in tap.messages:
+            for message in _taken(tap):
                 if told := TOPICS[topic][1](message):
                     print(json.dumps([topic, time.monotonic(), told]))
-            tap.messages.clear()
         sys.stdout.flush()
     node.destroy_node()
     tapping.destroy_node()

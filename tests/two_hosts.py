@@ -140,7 +140,7 @@ def _namespace(stack):
 
 #: Where each node runs. A slow machine copes with this rate, and a short sleep of a busy one is no fault.
 HOST_OF = {"simulator": "arm", "observer": "desk", "controller": "desk"}
-RATE, TORQUE_TIMEOUT, STATE_TIMEOUT = 200.0, 0.2, 0.3
+RATE, TORQUE_TIMEOUT, STATE_TIMEOUT = 100.0, 0.2, 0.3
 PARAMETERS = {
     "simulator": {"arm": "R", "rate": RATE, "torque_timeout": TORQUE_TIMEOUT},
     "observer": {"arm": "R"},
@@ -196,9 +196,15 @@ class Witness:
         said = [d[name] for d in self.all("/diagnostics", since) if name in d]
         return tuple(said[-1]) if said else None
 
+    @property
+    def alive(self):
+        """Whether it goes on; why not stands in its log."""
+        return self._process.poll() is None
+
     def close(self):
         """End it."""
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
         try:
             self._process.wait(10.0)
         except subprocess.TimeoutExpired:
@@ -221,7 +227,7 @@ class Loop:
     """
 
     #: Longest wait for any one thing [s]; generous, so that a loaded machine fails no test.
-    PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "60"))
+    PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "120"))
 
     def __init__(self, hosts, directory, settings=SUBNET):
         self.hosts, self.directory = hosts, Path(directory)
@@ -259,12 +265,13 @@ class Loop:
         end = time.monotonic() + self.PATIENCE
         while not (value := condition()):
             self.processes.check()
-            if time.monotonic() > end:
+            late = time.monotonic() > end
+            if late or not all(witness.alive for witness in self.witness.values()):
                 logs = "\n".join(
                     f"--- {path.stem}\n" + "\n".join(path.read_text().splitlines()[-8:])
                     for path in sorted(self.directory.glob("*.log"))
                 )
-                raise AssertionError(f"waited {self.PATIENCE:g} s in vain for {what}\n{logs}")
+                raise AssertionError(f"waited up to {self.PATIENCE:g} s in vain for {what}\n{logs}")
             time.sleep(0.002)
         return value
 
