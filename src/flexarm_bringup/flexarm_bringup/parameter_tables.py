@@ -9,7 +9,7 @@ BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 
 def groups():
     """Node name to its declared parameters by prefix."""
-    from flexarm_control.nodes import controller, observer
+    from flexarm_control.nodes import controller, excite, observer
     from flexarm_ros.node import COMMON
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
@@ -19,6 +19,7 @@ def groups():
         "simulator": {"": (*common[""], *simulator.PARAMETERS, *simulator_node.PARAMETERS)},
         "observer": _with(observer.parameter_groups(), common),
         "controller": _with(controller.parameter_groups(), common),
+        "excite": _with(excite.parameter_groups(), common),
     }
 
 

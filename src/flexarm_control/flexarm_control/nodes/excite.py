@@ -42,11 +42,16 @@ PARAMETERS = (
 LAST_WORD = Duration(seconds=0.2)
 
 
+def parameter_groups():
+    """Declared parameters of this node, by prefix."""
+    return {"": (ARM, *excitation_run.PARAMETERS, *PARAMETERS)}
+
+
 class ExciteNode(ArmNode):
     """Messages to arrays, one call of `ExcitationRun`, arrays to messages."""
 
     def __init__(self):
-        super().__init__("excite", {"": (ARM, *excitation_run.PARAMETERS, *PARAMETERS)})
+        super().__init__("excite", parameter_groups())
 
     def build(self):
         parameters = self.parameters
