@@ -6,6 +6,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import Trigger
 
 from flexarm_bringup.recorder import keep_for_recording
@@ -176,9 +178,13 @@ class Soak:
 
     def put(self, lines):
         """Set the simulator's faults."""
-        if self.faults:
-            # An empty list has no type on the wire.
-            self.bench.set("simulator", faults=lines or [""])
+        if not self.faults:
+            return
+        # Typed: an empty list says nothing of what it might hold.
+        value = RosParameter("faults", RosParameter.Type.STRING_ARRAY, lines).to_parameter_msg()
+        answer = self.bench.call(SetParameters, "simulator/set_parameters", parameters=[value])
+        result = answer.results[0]
+        assert result.successful, f"faults {lines} refused: {result.reason}"
 
     def move(self, to, duration):
         """Publish a motion; it need not be taken."""

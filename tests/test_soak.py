@@ -1,0 +1,77 @@
+"""A short soak and a few malformed messages to running nodes; `make soak` and `make fuzz` do it at length."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(
+    0, str(Path(__file__).resolve().parents[1])
+)  # the folders are no packages of the workspace
+
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_ros.messages import set_stamp
+from soak import __main__ as command
+from soak.invariants import Invariants
+
+
+def test_a_short_life_with_faults_breaks_no_invariant():
+    options = command.parser().parse_args(["--rounds", "2", "--minutes", "60", "--seed", "2"])
+    life, trouble = command.soak(options, lambda text: None)
+    lines, good = command.report(life, trouble)
+    assert good, "\n".join(lines)
+    assert (life.rounds, life.motions) == (2, 2)
+    assert life.invariants.counts["enabled"] > 1000
+
+
+def estimate(sequence, rate=0.0):
+    """An estimate of arm R."""
+    msg = ArmState(session=1, sequence=sequence)
+    msg.joint_position, msg.joint_velocity = [0.0], [0.0]
+    msg.modal_amplitude, msg.modal_rate = [0.0, 0.0], [rate, 0.0]
+    return msg
+
+
+def torque(sequence, value, mode=JointTorque.ENABLED):
+    """The torque that answers it."""
+    msg = JointTorque(session=1, sequence=sequence, mode=mode, torque=[value])
+    set_stamp(msg.header.stamp, 10**9 + 10**6 * sequence)
+    return msg
+
+
+@pytest.mark.parametrize(
+    "wrong, what",
+    [
+        (torque(2, np.nan), "torque finite"),
+        (torque(2, 30.0), "torque within its limit"),
+        (torque(2, 6.5), "torque within its rate"),
+        (torque(2, 1.0, JointTorque.DISABLED), "disabled is zero"),
+        (torque(0, 1.0), "answers in order"),
+        (torque(3, 1.0), "enabled with a valid state alone"),
+    ],
+)
+def test_every_broken_invariant_is_seen(wrong, what):
+    judge = Invariants([20.0], [5000.0])
+    for k in range(3):
+        judge.estimate(estimate(k))
+    judge.estimate(estimate(3, np.nan))
+    judge.torque(torque(1, 1.0))
+    judge.torque(torque(1, 1.0))  # sent again
+    assert not judge.broken
+    judge.torque(wrong)
+    assert judge.broken[what] == 1 and what in judge.first
+
+
+def test_a_fault_with_a_torque_is_seen():
+    judge = Invariants([20.0], [5000.0])
+    judge.state(CompositeState(supervisor_state=CompositeState.FAULT, torque=[1.0]))
+    assert judge.broken == {"no torque in fault": 1}
+
+
+def test_running_nodes_survive_malformed_messages():
+    from fuzz import nodes
+
+    tallies = nodes.fuzz(200, 1, lambda tally: None)
+    assert sum(tally.inputs for tally in tallies) >= 150
+    assert not any(t.failures for t in tallies), [t.first for t in tallies]
