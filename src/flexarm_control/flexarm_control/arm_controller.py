@@ -7,9 +7,9 @@ from flexarm_dynamics.parameters import Parameter
 
 from . import supervisor
 from .arm_observer import check_finite
-from .samples import SampleOrder
+from .samples import ArmSample, SampleOrder
 from .supervisor import State, Supervisor
-from .trajectory import ReferenceGenerator, Verdict
+from .trajectory import ReferenceGenerator, Verdict, validate
 
 #: Time in which the fast control comes back, or goes, when it is switched [s].
 FAST_RAMP = 0.1
@@ -121,7 +121,7 @@ class ArmController:
     def _take_limits(self, settings, limit):
         rate = np.array(settings["torque_rate_limit"])
         rate = np.where(rate > 0.0, rate, np.inf)
-        self._limit, self._rate_limit = limit, rate
+        self._limit, self._rate_limit, self._settings = limit, rate, dict(settings)
         self._rate_limited = bool(np.isfinite(rate).any())
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
@@ -287,6 +287,21 @@ class ArmController:
             return goal
         step = dt / FAST_RAMP
         return min(goal, share + step) if goal > share else max(goal, share - step)
+
+    def rehearse(self):
+        """Go through two samples and a trajectory on the side, so that compiled code is loaded before it counts."""
+        model = self.model
+        other = ArmController(model, self.law, self.supervisor.settings | self._settings)
+        sample = ArmSample(model.n_joints, model.n_modes)
+        sample.rate = np.zeros(model.n_modes)
+        still = np.zeros(model.n_joints)
+        names, point = model.joint_names, (10**9, still, still, still, ())
+        for k in range(3):
+            sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+            other.step(sample)
+            if k == 0:
+                other.offer(validate(names, names, 0, [point]))
+        self.law.reset()
 
     # What a user or a process does beside -------------------------------------------------------
 

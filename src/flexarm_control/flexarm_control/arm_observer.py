@@ -10,7 +10,7 @@ from flexarm_dynamics.strain_map import StrainMap
 from . import gauge_health
 from .composite import sizes
 from .observers.motion import Motion
-from .samples import SampleOrder
+from .samples import ArmSample, SampleOrder
 
 OBSERVERS = "flexarm.observers"
 
@@ -197,6 +197,16 @@ class ArmObserver:
             self.calibration.push(sample)
         self._pass_on(sample)
         return self.observer.converged
+
+    def rehearse(self):
+        """Take three samples of an arm at rest, so that compiled code is loaded before it counts; for a fresh one."""
+        arm = self.model.arm
+        sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
+        sample.velocity_known = False
+        sample.torque[:] = 0.0
+        for k in range(3):
+            sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+            self.step(sample)
 
     def _left_out(self, sample, verdict):
         order = self._order

@@ -751,3 +751,20 @@ def test_limits_are_taken_whole_or_not_at_all():
     with pytest.raises(ParameterError, match=r"strain_limit is 0\.001, but rigid has no gauges"):
         core = controller(build(arm), Scripted(0.0), strain_limit=1e-3)
     assert core is None
+
+
+@pytest.mark.parametrize("slow", ["linear_model_following", "adaptive_model_following"])
+def test_a_rehearsal_leaves_nothing_behind(arm_r, slow):
+    def made():
+        return controller(arm_r, design(arm_r, {"type": slow}, FAST))
+
+    core, clean = made(), made()
+    core.rehearse()
+    assert answer(core) == answer(clean)
+    for c in (core, clean):
+        c.step(sample(0))
+        c.offer(motion())
+    for k in range(1, 40):
+        for c in (core, clean):
+            c.step(sample(k, 1e-4 * k, velocity=[0.1], amplitude=[1e-3, 1e-4]))
+        assert answer(core) == answer(clean)

@@ -107,6 +107,7 @@ class ControllerNode(ArmNode):
         law = self._design(self.model, self._good)
         settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
         self.core = ArmController(self.model, law, settings, parameters["start_tolerance"])
+        self.core.rehearse()
         self._limits_in_force = settings
         parameters.on_change(self._changed)
         arm = self.arm
@@ -186,6 +187,8 @@ class ControllerNode(ArmNode):
             self._state_pub.publish(self._state.fill(sample, core, took))
         if core.state != self._told:
             self._tell()
+        if enabled:
+            core.answered_by.look_ahead()
 
     def _tell(self):
         """Log what the supervisor has come to, where a user is to know it."""

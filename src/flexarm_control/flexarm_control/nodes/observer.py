@@ -51,6 +51,7 @@ class ObserverNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(composite.sizes(self.model))
+        arm_observer.ArmObserver(self.model, self._design(), **self._common()).rehearse()
         self.core = arm_observer.ArmObserver(self.model, self._design(), **self._common())
         parameters.on_change(self._changed)
         arm = self.arm
