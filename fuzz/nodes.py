@@ -150,6 +150,8 @@ class Nodes:
                     fields = [array("d", values) for values in point[1:]]
                 except Exception:  # what no message holds can't be sent
                     continue
+                if len(fields) != 4:
+                    continue
                 # rclpy does not look; what converts the message does, and can't be caught there.
                 sec = (sec + 2**31) % 2**32 - 2**31
                 out.time_from_start.sec, out.time_from_start.nanosec = sec, nanosec
