@@ -337,11 +337,13 @@ class Arm:
         self.bench.wait_for(f"the loop to stand at sample {sequence}", stands)
         return self.now
 
-    def reset(self):
-        """Reset the simulator and wait until the controller answers in the new session."""
+    def reset(self, recover=False):
+        """Reset the simulator and wait until the controller answers in the new session, out of a fault if asked to."""
         answer = self.bench.call(Trigger, f"{self.namespace}simulator/reset")
         assert answer.success, answer.message
         session = int(answer.message.split()[-1])
+        if recover:
+            self.recover()
         self.wait_standing(session=session)
         return session
 

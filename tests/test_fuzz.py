@@ -33,7 +33,7 @@ from fuzz import reader
 
 #: Inputs of each reader here; the dear ones get fewer.
 INPUTS = {"arm file": 10, "arm's model": 5, "written motion": 6, "parameter file": 20}
-READERS = [name for name in command.readers() if name not in ("controller", "design")]
+READERS = list(command.readers())
 
 
 @pytest.mark.parametrize("name", READERS)

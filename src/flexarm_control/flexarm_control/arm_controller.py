@@ -240,6 +240,9 @@ class ArmController:
             return self.enabled
         if self.state == State.FAULT:
             return False
+        if verdict == SampleOrder.REPEAT and sample.stamp_ns != self._order.stamp_ns:
+            self.distrust(f"state {sample.sequence} came again with another stamp")
+            return False
         law = self.answered_by = self.law
         law.limit = self._limit
         if sample.amplitude is None or (sample.rate is None and law.needs_rates):
@@ -441,9 +444,12 @@ class ArmController:
     def _limited(self, u, dt):
         """Torque within its size and rate, into `torque`."""
         self._before[:] = self.torque
-        np.clip(u, -self._limit, self._limit, out=self.torque)
+        np.copyto(self.torque, u)
         if self._rate_limited:
             step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
             np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
             np.clip(self.torque, self._before - step, self._before + step, out=self.torque)
+        np.clip(
+            self.torque, -self._limit, self._limit, out=self.torque
+        )  # last: it holds whatever came before
         self.saturated = bool((self.torque != u).any())

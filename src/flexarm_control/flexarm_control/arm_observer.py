@@ -156,9 +156,9 @@ class ArmObserver:
 
         Returns
         -------
-        bool
+        bool or None
             Whether `velocity`, `amplitude` and `rate` are a converged estimate. A repeated (session, sequence)
-            leaves everything as it was.
+            leaves everything as it was; so does one that comes after a later one, which is None.
 
         Raises
         ------
@@ -172,8 +172,12 @@ class ArmObserver:
         verdict = self._order.judge(sample)
         if verdict == SampleOrder.REPEAT:
             return self.observer.converged
-        if verdict in (SampleOrder.STALE, SampleOrder.FOREIGN):
-            raise MessageError(self._left_out(sample, verdict))
+        if verdict == SampleOrder.STALE:
+            return None
+        if verdict == SampleOrder.FOREIGN:
+            raise MessageError(
+                f"two sources send states (sessions {self._order.session} and {sample.session}): stop one of them"
+            )
         # After a clock that jumped, or a long silence, there is nothing to go on from.
         gap = sample.stamp_ns - last_stamp > LONGEST_GAP
         restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
@@ -207,12 +211,6 @@ class ArmObserver:
         for k in range(3):
             sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
             self.step(sample)
-
-    def _left_out(self, sample, verdict):
-        order = self._order
-        if verdict == SampleOrder.FOREIGN:
-            return f"two sources send states (sessions {order.session} and {sample.session}): stop one of them"
-        return f"state {sample.sequence} is not newer than {order.sequence}: left out"
 
     def _map_strain(self, sample, restart):
         """Judge the gauges, and fill in the amplitudes where they are this observer's to make."""

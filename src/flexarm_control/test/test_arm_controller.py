@@ -768,3 +768,16 @@ def test_a_rehearsal_leaves_nothing_behind(arm_r, slow):
         for c in (core, clean):
             c.step(sample(k, 1e-4 * k, velocity=[0.1], amplitude=[1e-3, 1e-4]))
         assert answer(core) == answer(clean)
+
+
+def test_a_repeat_with_another_stamp_begins_nothing(arm_r):
+    # Found by fuzzing: the stamp of 2**62 ns made the next time step negative, and the torque 1e12 N m.
+    core = controller(arm_r, Scripted(*[5.0] * 9), torque_rate_limit=[100.0])
+    core.step(sample(0))
+    core.fail("for the test")
+    core.recover()
+    assert core.step(sample(0, stamp_ns=2**62)) is False
+    assert "came again with another stamp" in core.reason
+    for k in range(1, 4):
+        assert core.step(sample(k)) is True
+        assert abs(core.torque[0]) <= 0.1 * k

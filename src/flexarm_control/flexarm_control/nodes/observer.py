@@ -116,6 +116,8 @@ class ObserverNode(ArmNode):
             self.report(f"arm_state {msg.sequence}: {error}")
             self._forward_unknown(msg)
             return
+        if known is None:  # older than the last one: the controller has no use for it
+            return
         self._samples += 1
         writer.head(sample.stamp_ns, sample.session, sample.sequence)
         writer.write("joint_position", core.position)
