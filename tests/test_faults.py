@@ -2,6 +2,7 @@
 
 import math
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -549,3 +550,27 @@ def test_a_simulator_that_is_killed_and_restarted_is_a_new_session_and_the_loop_
     works(real_time)
     for name in ("observer", "controller"):
         assert "Traceback" not in bench.log(name)
+
+
+def test_a_controller_that_is_stopped_for_a_while_brings_the_safe_action_and_then_goes_on(
+    real_time,
+):
+    bench, process = real_time.bench, real_time.bench.processes.running["controller"]
+    in_motion(real_time)
+    process.send_signal(signal.SIGSTOP)
+    try:
+        seen = len(real_time.measured.messages)
+
+        def safe():
+            late = [m.joint_torque[0] for m in real_time.measured.messages[seen:]]
+            return len(late) > 60 and set(late[-30:]) == {0.0}  # 300 ms at 200 Hz
+
+        bench.wait_for("the safe action", safe)
+    finally:
+        process.send_signal(signal.SIGCONT)
+    mark = len(real_time.torques.messages)
+    bench.wait_for("torques again", lambda: len(real_time.torques.messages) > mark)
+    # The reference went on meanwhile: the arm catches up, or was too far behind.
+    ends = (CompositeState.HOLDING, CompositeState.FAULT)
+    bench.wait_for("the end", lambda: real_time.state.supervisor_state in ends)
+    works(real_time)
