@@ -121,7 +121,8 @@ class LockstepRun:
 
     def ready(self):
         """Whether the controller sends torque."""
-        return self.controller_state().supervisor_state != CompositeState.INACTIVE
+        without = (CompositeState.INACTIVE, CompositeState.FAULT)
+        return self.controller_state().supervisor_state not in without
 
     def accepted(self):
         """Number of the last accepted trajectory."""
@@ -171,6 +172,7 @@ class LockstepRun:
             if now - last_check > 0.2:
                 last_check = now
                 self.processes.check()
+                self._check_fault()
                 stamp = recorder.latest_ns
                 progress(max(0.0, (stamp - TRAJECTORY_START_NS) / (end - TRAJECTORY_START_NS)))
                 if stamp > newest:
@@ -184,6 +186,11 @@ class LockstepRun:
         samples = recorder.samples(begin, end)
         period = (end - begin) / (len(samples["arm_state"]) - 1)
         return samples, Timing(wall, 1e-9 * (reached - begin), round((reached - begin) / period))
+
+    def _check_fault(self):
+        state = self.controller_state()
+        if state.supervisor_state == CompositeState.FAULT:
+            raise ProcessError(f"the controller is in fault: {state.rejected_reason}")
 
     def close(self):
         """Leave the graph."""
