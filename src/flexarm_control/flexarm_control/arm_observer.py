@@ -206,7 +206,7 @@ class ArmObserver:
         """Take three samples of an arm at rest, so that compiled code is loaded before it counts; for a fresh one."""
         arm = self.model.arm
         sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
-        sample.velocity_known = False
+        sample.velocity_known, sample.rate = False, np.zeros(self.model.n_modes)
         sample.torque[:] = 0.0
         for k in range(3):
             sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k

@@ -368,7 +368,7 @@ class Supervisor:
             return (
                 f"{name} is {value:.3g} rad out of its range, or will be, {limit:g} rad are allowed"
             )
-        return f"{name} is {value:.4g}{unit}, beyond its limit of {limit:.4g}{unit}"
+        return f"{name} is {value:.6g}{unit}, beyond its limit of {limit:.6g}{unit}"
 
 
 def _deceleration(model, torque_limit):

@@ -78,7 +78,7 @@ def test_csv_columns_may_be_in_any_order_with_blanks_and_empty_lines(tmp_path):
         ("t,q1,q2,q1\n0,0,0,0\n", r"motion\.csv:1: column q1 is there 2 times"),
         ("t,q1,q2\n0,0\n", r"motion\.csv:2: 2 values for 3 columns"),
         ("t,q1,q2\n0,0,0\n1,0,x\n", r"motion\.csv:3: q2 is 'x', not a number"),
-        ("t,q1,q2\n0,nan,0\n", r"motion\.csv:2: q1 is nan, not finite"),
+        ("t,q1,q2\n0,nan,0\n", r"motion\.csv:2: q1 is 'nan', not finite"),
         ("t,q1,q2\n1e10,0,0\n", r"motion\.csv:2: t is 1e\+10 s"),
         ("t,q1,q2\n0,0,0\n\n0,1,0\n", r"line 4\.time_from_start is 0 s, not later than line 2"),
         ("t,q1,q2,qdd1,qdd2\n0,0,0,0,0\n", r"line 2 has accelerations but no velocities"),

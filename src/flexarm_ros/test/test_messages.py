@@ -334,7 +334,7 @@ for k, enabled in enumerate((True, False, True)):
     assert (got.header.stamp.sec, got.header.stamp.nanosec) == (5, k), got
 
 law = design(m, {"type": "linear_model_following"}, {"type": "lqr"})
-core = ArmController(m, law, check_all(PARAMETERS, {}, {"joints": 1, "modes": 2}))
+core = ArmController(m, law, check_all(PARAMETERS, {"max_gap": 10.0}, {"joints": 1, "modes": 2}))
 c = CompositeStateWriter(m)
 sample.session, sample.rate = 1, np.array([0.01, -0.02])
 for k in range(3):
