@@ -229,9 +229,9 @@ def test_the_fast_control_can_be_taken_out_and_put_back(moving):
 
 
 def test_recover_without_a_fault_and_stop_without_torque_change_nothing(moving):
-    arm, before = moving, moving.state
+    arm, stands = moving, moving.state.sequence
     assert not arm.recover()
-    assert arm.state == before
+    assert (arm.state.sequence, arm.state.supervisor_state) == (stands, CompositeState.TRACKING)
     arm.bench.set("controller", strain_limit=1e-9)
     arm.pause(False)
     arm.bench.wait_for("a fault", lambda: arm.state.supervisor_state == FAULT)
