@@ -59,6 +59,8 @@ def test_faults_are_refused_unless_allowed(drive):
 def test_a_bad_fault_is_refused_and_nothing_of_the_set_is_taken(drive):
     result = drive.bench.set("simulator", faults=["strain nan", "strain.root break"])[0]
     assert not result.successful and "'break'" in result.reason
+    # Found by fuzzing: a number ended the node.
+    assert not drive.bench.set("simulator", faults=3.5)[0].successful
     state = answer(drive)
     assert np.isfinite(state.strain).all() and list(state.modal_amplitude) == []
     assert list(drive.bench.get("simulator", "faults")) == []

@@ -73,5 +73,5 @@ def test_running_nodes_survive_malformed_messages():
     from fuzz import nodes
 
     tallies = nodes.fuzz(200, 1, lambda tally: None)
-    assert sum(tally.inputs for tally in tallies) >= 150
+    assert sum(tally.inputs for tally in tallies) >= 100
     assert not any(t.failures for t in tallies), [t.first for t in tallies]

@@ -191,7 +191,8 @@ class SimulatorNode(ArmNode):
         """Refuse what the injector would not take; its type has been looked at elsewhere."""
         for parameter in parameters:
             lines = parameter.value if parameter.name == "faults" else None
-            if self._injector is None or not lines or not all(isinstance(x, str) for x in lines):
+            texts = isinstance(lines, list) and lines and all(isinstance(x, str) for x in lines)
+            if self._injector is None or not texts:
                 continue
             try:
                 FaultInjector(self.arm, self._allowed(lines))
