@@ -13,11 +13,11 @@ sys.path.insert(0, str(Path(__file__).parent))  # --import-mode=importlib does n
 
 
 def pytest_collection_modifyitems(items):
-    """What runs processes is at the mercy of the machine's scheduler: it has a second try, which the summary shows."""
+    """What runs processes is at the mercy of the machine's scheduler: it has further tries, which the summary shows."""
     here = Path(__file__).parent
     for item in items:
         if here in item.path.parents:
-            item.add_marker(pytest.mark.flaky(reruns=1))
+            item.add_marker(pytest.mark.flaky(reruns=2))
 
 
 @pytest.fixture

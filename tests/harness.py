@@ -81,7 +81,7 @@ class Bench:
     """
 
     #: Longest wait for any one thing [s]; generous, so that a loaded machine fails no test.
-    PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "30"))
+    PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "60"))
 
     def __init__(self, directory):
         self._stack = contextlib.ExitStack()
