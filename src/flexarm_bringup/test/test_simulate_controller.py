@@ -372,7 +372,9 @@ def test_the_true_tip_is_judged_and_not_the_measured_one(tmp_path, short):
 
 def test_a_loop_that_loses_its_arm_says_why_and_ends_there(tmp_path):
     free = changed_arm(tmp_path, "R", lambda data: data["joints"][0].pop("limits"))
-    record, metrics = run(Scenario(free, PAPER | {"strain_limit": 1.0, "tracking_error_limit": 0.0}, delay=0.1))
+    record, metrics = run(
+        Scenario(free, PAPER | {"strain_limit": 1.0, "tracking_error_limit": 0.0}, delay=0.1)
+    )
     assert metrics["lost"] is True
     assert metrics["reason"].endswith("is bent by more than it is long")
     assert metrics["simulated_s"] == record.time[-1] < 2.0
