@@ -292,9 +292,9 @@ class ArmController:
         return min(goal, share + step) if goal > share else max(goal, share - step)
 
     def rehearse(self):
-        """Go through two samples and a trajectory on the side, so that compiled code is loaded before it counts."""
+        """Go through three samples and a trajectory on the side, so that compiled code is loaded before it counts."""
         model = self.model
-        other = ArmController(model, self.law, self.supervisor.settings | self._settings)
+        other = ArmController(model, self.law, self._settings)
         sample = ArmSample(model.n_joints, model.n_modes)
         sample.rate = np.zeros(model.n_modes)
         still = np.zeros(model.n_joints)
@@ -449,7 +449,6 @@ class ArmController:
             step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
             np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
             np.clip(self.torque, self._before - step, self._before + step, out=self.torque)
-        np.clip(
-            self.torque, -self._limit, self._limit, out=self.torque
-        )  # last: it holds whatever came before
+        # Last: the size holds whatever came before.
+        np.clip(self.torque, -self._limit, self._limit, out=self.torque)
         self.saturated = bool((self.torque != u).any())

@@ -193,13 +193,13 @@ class ArmObserver:
         if not sample.velocity_known:
             sample.velocity[:] = self._joint_velocity(sample, dt)
         self._update(sample, dt)
+        self._pass_on(sample)
         # Only now: a sample that the observer refused has left nothing behind, its time step included.
         self._order.take(sample)
         self._derivative[:], self._measured[:] = sample.velocity, sample.position
         self._used[:] = sample.amplitude
         if sample.strain is not None and self.calibration is not None:
             self.calibration.push(sample)
-        self._pass_on(sample)
         return self.observer.converged
 
     def rehearse(self):
@@ -251,28 +251,38 @@ class ArmObserver:
         return old, new
 
     def _pass_on(self, sample):
-        """Fill in what is passed on: the observer's estimate, or the sample's own, ahead by the delay."""
+        """Fill in what is passed on: the observer's estimate, or the sample's own, ahead by the delay; or refuse."""
         observer = self.observer
         smooth = self.smooth_position and observer.joint_position is not None
         estimated = not sample.velocity_known and observer.joint_velocity is not None
-        self.position[:] = observer.joint_position if smooth else sample.position
-        self.velocity[:] = observer.joint_velocity if estimated else sample.velocity
-        self.amplitude[:], self.rate[:] = observer.amplitude, observer.rate
+        x = np.concatenate(
+            [
+                observer.joint_position if smooth else sample.position,
+                observer.amplitude,
+                observer.joint_velocity if estimated else sample.velocity,
+                observer.rate,
+            ]
+        )
         if self.delay and observer.converged:
-            self._predict(sample.torque)
+            x = self._predicted(x, sample.torque)
+        if not np.isfinite(x).all():
+            # From what is no number it would never come back.
+            observer.reset()
+            raise MessageError(
+                f"observer {type(observer).__name__} has lost the arm: its estimate is not finite; it begins anew"
+            )
+        start = 0
+        for group in (self.position, self.amplitude, self.velocity, self.rate):
+            group[:] = x[start : start + group.size]
+            start += group.size
 
-    def _predict(self, torque):
-        """Move what is passed on ahead by the delay."""
-        groups = (self.position, self.amplitude, self.velocity, self.rate)
-        x = np.concatenate(groups)
+    def _predicted(self, x, torque):
+        """A state ahead by the delay."""
         count = int(np.ceil(self.delay / LONGEST_PREDICTION))
         part = self.delay / count
         for _ in range(count):
             x = self._motion.advance(x, torque, part, self._motion.step_for(part, x[: torque.size]))
-        start = 0
-        for group in groups:
-            group[:] = x[start : start + group.size]
-            start += group.size
+        return x
 
     def _update(self, sample, dt):
         try:
@@ -284,13 +294,6 @@ class ArmObserver:
             raise MessageError(
                 f"observer {name} failed: {type(error).__name__}: {error}"
             ) from error
-        observer = self.observer
-        if not (np.isfinite(observer.amplitude).all() and np.isfinite(observer.rate).all()):
-            # From what is no number it would never come back.
-            observer.reset()
-            raise MessageError(
-                f"observer {type(observer).__name__} has lost the arm: its estimate is not finite; it begins anew"
-            )
 
     def _check(self, sample):
         arm = self.model.arm

@@ -128,6 +128,10 @@ class ExcitationRun:
             return False
         if judged == SampleOrder.RESTART and self._order.session is not None:
             self.stop("the source of arm_state was restarted")
+        elif judged == SampleOrder.JUMP:
+            self.stop("the clock of arm_state went back")
+        elif judged == SampleOrder.FOREIGN:
+            self.stop("two sources send arm_state: stop one of them")
         self._order.take(sample)
         if self.stage is Stage.SETTLING:
             self._settle(sample)

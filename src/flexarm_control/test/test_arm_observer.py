@@ -250,3 +250,17 @@ def test_luenberger_takes_its_friction_from_the_reconstructed_joint_velocity(hea
         unknown.step(sample(k, velocity=[99.0], velocity_known=False, **args))
     assert_allclose(unknown.velocity, [2.0], rtol=1e-6)
     assert_allclose(unknown.observer.rate, known.observer.rate, rtol=1e-4)
+
+
+def test_a_prediction_that_is_no_number_is_refused_and_the_estimate_stays(arm_r):
+    # Found by fuzzing: a huge estimate, predicted over the delay, was passed on as NaN, converged.
+    core = observed(arm_r, delay=0.004)
+    for k in range(5):
+        core.step(sample(k))
+    before = (core.amplitude.copy(), core.rate.copy(), core.position.copy())
+    core._motion.advance = lambda x, *_: np.full_like(x, np.nan)
+    with pytest.raises(MessageError, match="has lost the arm"):
+        core.step(sample(5))
+    for now, then in zip((core.amplitude, core.rate, core.position), before, strict=True):
+        assert_array_equal(now, then)
+    assert not core.observer.converged

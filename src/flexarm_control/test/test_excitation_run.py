@@ -150,6 +150,19 @@ def test_the_arm_files_limits_hold_within_the_travel(one_link):
     assert "the limits -3.14 to 3.14" in run.reason
 
 
+def test_a_clock_that_goes_back_or_a_second_source_ends_it(one_link):
+    run, k = shaking(one_link)
+    back = sample(k)
+    back.stamp_ns = 1
+    assert run.step(back) is False
+    assert run.stage is Stage.STOPPED and "clock of arm_state went back" in run.reason
+    run = run_of(one_link, kind="pulse", amplitude=1.0, duration=0.5, rest=0.5)
+    run._order.take(sample(0, session=7))
+    run._order.take(sample(0, session=1))
+    run.step(sample(1, session=7))
+    assert run.stage is Stage.STOPPED and "two sources" in run.reason
+
+
 def test_a_repeated_state_has_the_same_answer(one_link):
     run, k = shaking(one_link)
     first = (run.step(sample(k, velocity=0.1)), run.torque.copy())
