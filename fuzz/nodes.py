@@ -60,7 +60,7 @@ class Nodes:
         self.arm = harness.Arm(bench, joints=self.description.joint_names)
         self.wait("the controller to be ready", self.arm.ready)
         self.given = self._parameters()
-        self.tallies = []
+        self.session = 0
 
     def wait(self, what, condition):
         """Wait for a condition; messages that nobody will look at are forgotten."""
@@ -84,15 +84,16 @@ class Nodes:
     def states(self, topic, count, tally):
         """States to the observer or the controller; each is answered by a torque."""
         publisher = self.bench.publisher(ArmState, topic, 2)  # the tap is a reader, too
+        self.session += 10**6  # numbers from before are late ones, which nothing answers
         for k in range(count):
             msg = good_state(self.random, self.description)
             set_stamp(msg.header.stamp, 10**9 + 10**6 * k)
             if self.random.random() < 0.7:
                 spoil_state(self.random, msg)
             # The answer tells that it was read; by this number it is known.
-            msg.session, msg.sequence = 77, k
+            msg.session, msg.sequence = self.session, k
             if self.random.random() < 0.02:
-                msg.session = 78 + k  # the source begins anew
+                msg.session += 1 + k  # the source begins anew
             publisher.publish(msg)
             key, tries = (msg.session, msg.sequence), [time.monotonic()]
 

@@ -89,10 +89,14 @@ class StateReader:
         Raises
         ------
         MessageError
-            For names or lengths that are not this arm's.
+            For names or lengths that are not this arm's, or nanoseconds of a second and more.
         """
-        sample.stamp_ns = stamp_ns(msg.header.stamp)
+        stamp = msg.header.stamp
+        # What answers a refused message carries its stamp, which must be one that a message holds.
+        sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
+        if stamp.nanosec >= SECOND:
+            raise MessageError(f"header.stamp.nanosec is {stamp.nanosec}: it must be below {SECOND}")
         joints = self._joints
         order = joints.order(msg.joint_names)
         if not joints.read("joint_position", msg.joint_position, order, sample.position):

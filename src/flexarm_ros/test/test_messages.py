@@ -418,6 +418,17 @@ def test_stamps_are_nanoseconds_to_the_last_one(ns):
     assert stamp_ns(over_the_wire(message).header.stamp) == ns
 
 
+@pytest.mark.parametrize("sec", [-(2**31), 0, 2**31 - 1])
+@pytest.mark.parametrize("nanosec", [10**9, 2**32 - 1])
+def test_a_stamp_with_a_second_of_nanoseconds_is_refused_and_its_answer_can_be_sent(sec, nanosec):
+    message, sample = good(), ArmSample(3, 2, 4)
+    message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+    with pytest.raises(MessageError, match=f"nanosec is {nanosec}: it must be below 1000000000"):
+        StateReader(ARM).read(message, sample)
+    answer = over_the_wire(TorqueWriter(ARM, 5).answer(sample, False, np.zeros(3)))
+    assert (answer.header.stamp.sec, answer.sequence) == (sec, message.sequence)
+
+
 @pytest.mark.parametrize("count", [0, 1, 777])
 @pytest.mark.parametrize("names", [[], ["joint1"], ["a", "", "shoulder"]])
 @pytest.mark.parametrize("frame", ["", "b", "base"])
