@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from flexarm_bringup.markdown import write_between
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
@@ -341,12 +342,7 @@ def write(file, text):
     FlexarmError
         When the file has no markers.
     """
-    path = Path(file)
-    old = path.read_text(encoding="utf-8")
-    if BEGIN not in old or END not in old:
-        raise FlexarmError(f"{file}: no lines {BEGIN} and {END} to write between")
-    head, tail = old.split(BEGIN, 1)[0], old.split(END, 1)[1]
-    path.write_text(f"{head}{BEGIN}\n{text}\n{END}{tail}", encoding="utf-8")
+    write_between(file, BEGIN, END, text)
 
 
 def add_arguments(parser):

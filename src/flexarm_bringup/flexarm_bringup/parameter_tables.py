@@ -1,8 +1,6 @@
 """Tables of all parameters in Markdown, from the declarations that the nodes validate with."""
 
-from pathlib import Path
-
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_bringup.markdown import write_between
 
 BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 
@@ -59,10 +57,4 @@ def write(file):
     FlexarmError
         When the file has no markers.
     """
-    path = Path(file)
-    text = path.read_text(encoding="utf-8")
-    if BEGIN not in text or END not in text:
-        raise FlexarmError(f"{file}: no lines {BEGIN} and {END} to write between")
-    head, rest = text.split(BEGIN, 1)
-    _, tail = rest.split(END, 1)
-    path.write_text(f"{head}{BEGIN}\n{tables()}\n{END}{tail}", encoding="utf-8")
+    write_between(file, BEGIN, END, tables())

@@ -1,8 +1,6 @@
 """Tables of a comparison, for the terminal and for docs/comparison.md."""
 
-from pathlib import Path
-
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_bringup.markdown import write_between
 
 from .contenders import OWN, PID, SHIPPED
 
@@ -147,10 +145,4 @@ def write(found, file):
     FlexarmError
         When the file has no markers.
     """
-    path = Path(file)
-    whole = path.read_text(encoding="utf-8")
-    if BEGIN not in whole or END not in whole:
-        raise FlexarmError(f"{file}: no lines {BEGIN} and {END} to write between")
-    head, rest = whole.split(BEGIN, 1)
-    _, tail = rest.split(END, 1)
-    path.write_text(f"{head}{BEGIN}\n\n{text(found)}\n\n{END}{tail}", encoding="utf-8")
+    write_between(file, BEGIN, END, f"\n{text(found)}\n")
