@@ -100,7 +100,6 @@ class Brakes:
         self._rates = slice(size // 2, size // 2 + n)
         self._has = self.torque > 0.0
         self.side = np.where(self._has, 0, self.FREE)
-        self._more = friction[:, 0] - model.friction_table()[:, 0]
         self._known, self._at = None, np.zeros(n)
 
     def refine(self, factor):
@@ -194,7 +193,9 @@ class Brakes:
         self.side[:] = np.where(self._has, np.sign(rates), self.FREE)
         if not resting.any():
             return
-        pull = self._pull() - self._more * rates
+        viscous, coulomb, smoothing = self.friction.T
+        friction = viscous * rates + coulomb * np.tanh(rates / smoothing)
+        pull = self._pull() - friction + self.model.friction(rates)  # the model has that of its own
         free = self.model.derivative(state, pull)[self._rates]
         where = np.flatnonzero(resting)
         if self._holds(free[where], where, state):

@@ -9,7 +9,10 @@ from flexarm_dynamics.errors import ModelError, ShapeError
 from . import integrators
 from .brakes import Brakes
 
-#: Damping of the safe action `damp` where the arm file gives none: stops the rigid arm with this rate [1/s].
+#: Where the arm file gives no `damp_coefficient`, `damp` is the drive's velocity loop, within the joint's torque limit
+#: T: -T tanh(qd / DAMP_SPEED) [rad/s]. Links that swing on move the joint by a part of that speed.
+DAMP_SPEED = 0.05
+#: Without a torque limit it stops the rigid arm with this rate [1/s].
 DAMP_RATE = 10.0
 #: The safe action is integrated in more substeps where it damps faster than this: rate * substep.
 DAMP_RATE_PER_STEP = 2.0
@@ -41,8 +44,7 @@ class Plant:
         self.substeps = integrators.substeps(model, period, integrator)
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
-        self._safe, brake = self._friction.copy(), self._brake_torques()
-        self._safe[:, 0] += self._damping()
+        self._safe, brake = self._damped(), self._brake_torques()
         refinement = self._refinement(integrator)
         self._safe_substeps = self.substeps * refinement
         self._no_torque = np.zeros(n)
@@ -86,14 +88,22 @@ class Plant:
                 " model holds for; reset the simulator"
             )
 
-    def _damping(self):
-        """What the safe action `damp` adds to viscous friction, shape (n,) [N m s/rad]."""
-        damping, inertia = np.zeros(self.model.n_joints), self._inertia()
-        for i, joint in enumerate(self.model.arm.joints):
-            if joint.safe_action == "damp":
-                given = joint.damp_coefficient
-                damping[i] = DAMP_RATE * inertia[i] if given is None else given
-        return damping
+    def _damped(self):
+        """Friction table, shape (n, 3), with what the safe action `damp` adds to it.
+
+        A joint's own Coulomb friction takes the smoothing of the velocity loop that it acts beside.
+        """
+        table = self._friction.copy()
+        for joint, inertia, row in zip(self.model.arm.joints, self._inertia(), table, strict=True):
+            if joint.safe_action != "damp":
+                continue
+            if joint.damp_coefficient is not None:
+                row[0] += joint.damp_coefficient
+            elif np.isfinite(joint.limits.torque):
+                row[1:] = row[1] + joint.limits.torque, DAMP_SPEED
+            else:
+                row[0] += DAMP_RATE * inertia
+        return table
 
     def _brake_torques(self):
         """Torques of the joints' brakes, shape (n,) [N m]; 0: none."""
@@ -111,7 +121,9 @@ class Plant:
         if integrators.METHODS[integrator] is None:
             return 1
         n = self.model.n_joints
-        damped = self._terms().H[:n, :n] @ np.diag(self._safe[:, 0])
+        viscous, coulomb, speed = self._safe.T
+        slope = viscous + np.where(coulomb > self._friction[:, 1], coulomb / speed, 0.0)
+        damped = self._terms().H[:n, :n] @ np.diag(slope)
         fastest = np.abs(np.linalg.eigvals(damped)).max()
         return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
 
