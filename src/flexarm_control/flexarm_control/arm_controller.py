@@ -7,6 +7,7 @@ from flexarm_dynamics.parameters import Parameter
 
 from . import supervisor
 from .arm_observer import check_finite
+from .arrays import clip
 from .samples import ArmSample, SampleOrder
 from .supervisor import State, Supervisor
 from .trajectory import ReferenceGenerator, Verdict, validate
@@ -266,7 +267,7 @@ class ArmController:
         except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
             self.fail(f"the control law failed: {type(error).__name__}: {error}")
             return False
-        if not np.isfinite(u).all():
+        if not (u.dot(u) < np.inf or np.isfinite(u).all()):
             i = int(np.argmin(np.isfinite(u)))
             self.fail(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
             return False
@@ -448,7 +449,7 @@ class ArmController:
         if self._rate_limited:
             step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
             np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
-            np.clip(self.torque, self._before - step, self._before + step, out=self.torque)
+            clip(self.torque, self._before - step, self._before + step)
         # Last: the size holds whatever came before.
-        np.clip(self.torque, -self._limit, self._limit, out=self.torque)
+        clip(self.torque, -self._limit, self._limit)
         self.saturated = bool((self.torque != u).any())

@@ -338,6 +338,10 @@ HUGE_TORQUE = 1e9
 
 def check_finite(values, names, field):
     """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
+    if (
+        values.dot(values) < HUGE
+    ):  # what every usable sample is; one product costs a third of what follows
+        return
     if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
         i = int(np.argmin(np.abs(values) < HUGE))
         raise MessageError(f"{field} of {names[i]} is {values[i]}: not a usable measurement")

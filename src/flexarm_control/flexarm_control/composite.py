@@ -80,10 +80,15 @@ class CompositeControl:
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_share = 1.0
         self._last = None  # reference and interval of the last step
+        self._nominal = (
+            b"",
+            np.zeros(model.n_joints),
+        )  # of what motion, and the slow law's torque on it
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = feedforward
         if feedforward is not None:
-            self._response = self.manifold.error_response(feedforward.settings.configuration)
+            response = self.manifold.error_response(feedforward.settings.configuration)
+            self._response, self._error = np.vstack(response), np.zeros(2 * model.n_joints)
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
@@ -170,8 +175,11 @@ class CompositeControl:
         The reference at the next stamp is known if it comes as long after this one as this one came after the last;
         otherwise, or without this call, the next step does that work itself, with the same result to the last bit.
         """
-        if self.feedforward is not None and self._last is not None:
-            self.feedforward.look_ahead(*self._last)
+        if self.feedforward is None or self._last is None:
+            return
+        foreseen = self.feedforward.look_ahead(*self._last)
+        if foreseen is not None:
+            self._nominal_torque(*foreseen)
 
     def _on_manifold(self, q, qd, reference, terms):
         """Slow torque, and z_bar of the manifold."""
@@ -185,14 +193,23 @@ class CompositeControl:
         """Slow torque about the feed-forward's motion, and z_bar: its deflections, moved by the tracking error."""
         motion, m = self.feedforward, self.model.n_modes
         motion.update(reference, dt)
-        along = self.model.terms(motion.position, motion.velocity)
         self.slow_torque[:] = self.slow.torque(q, qd, motion, terms)
-        self.slow_torque += motion.torque - self.slow.nominal(along, motion.acceleration)
-        error = np.concatenate([q - motion.position, qd - motion.velocity])
-        L, U = self._response
-        self.slow_torque += U @ error
-        moved = L @ error
-        return motion.amplitude + moved[:m], motion.rate + moved[m:]
+        nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
+        self.slow_torque += motion.torque - nominal
+        error, n = self._error, self.model.n_joints
+        np.subtract(q, motion.position, out=error[:n])
+        np.subtract(qd, motion.velocity, out=error[n:])
+        moved = self._response @ error
+        self.slow_torque += moved[2 * m :]
+        return motion.amplitude + moved[:m], motion.rate + moved[m : 2 * m]
+
+    def _nominal_torque(self, position, velocity, acceleration):
+        """The slow law's torque on a motion, (n,); what was asked for last is remembered."""
+        motion = position.tobytes() + velocity.tobytes() + acceleration.tobytes()
+        if motion != self._nominal[0]:
+            terms = self.model.terms(position, velocity)
+            self._nominal = motion, np.array(self.slow.nominal(terms, acceleration))
+        return self._nominal[1]
 
 
 def sizes(model):

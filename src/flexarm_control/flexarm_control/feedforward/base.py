@@ -93,7 +93,14 @@ class Feedforward(ABC):
         """
 
     def look_ahead(self, reference, dt):
-        """Work beforehand on the sample that will come after `dt` [s], between two samples; changes no result."""
+        """Work beforehand on the sample that will come after `dt` [s], between two samples; changes no result.
+
+        Returns
+        -------
+        position, velocity, acceleration : ndarray, shape (n,)
+            Of the motion then, as far as can be foreseen; or None.
+        """
+        return None
 
     def warnings(self):
         """What a person should know of it on this arm; each a sentence."""

@@ -30,6 +30,7 @@ from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.fixed_step import METHODS, substeps
 from flexarm_dynamics.model import build
 
+from ..arrays import clip
 from ..full_order import linear_plant, sampled
 from ..trajectory.path import Path
 from ..trajectory.values import SECOND
@@ -315,7 +316,7 @@ class ModelFeedforward(Feedforward):
         np.copyto(self.torque, torque)
         if K is not None:
             self.torque += K @ self._error
-        np.clip(self.torque, -self.limit, self.limit, out=self.torque)
+        clip(self.torque, -self.limit, self.limit)
         self.acceleration[:] = reference.acceleration
 
     def _move(self, state, dt):
@@ -325,13 +326,15 @@ class ModelFeedforward(Feedforward):
 
     def look_ahead(self, reference, dt):
         if self._first or dt <= 0.0 or reference.path is None:
-            return
+            return None
         ahead = _Ahead(reference, dt)
         ahead.state = self.state.copy()
         self._move(ahead.state, dt)
         ahead.prepared, ahead.elapsed = self._preparation(ahead)
         ahead.wanted = self.wanted(ahead, ahead.prepared, ahead.elapsed)
         self._ahead = ahead
+        n, size = self.model.n_joints, ahead.state.size // 2
+        return ahead.state[:n], ahead.state[size : size + n], ahead.acceleration
 
     def _begins_anew(self, reference, K):
         """Whether the simulated arm is put where it is wanted."""
