@@ -108,7 +108,9 @@ def test_brake_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_damp_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s_though_the_links_swing_on(name):
+def test_damp_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s_though_the_links_swing_on(
+    name,
+):
     speeds, _ = coasting(built(name, joint={"safe_action": "damp"}), 2.0)
     assert 0.0 < speeds[999:].max() < 1.0 * DEGREE
 
