@@ -59,8 +59,8 @@ class Subject:
 
 
 SUBJECTS = (
-    Subject("R", "composite", "paper:duration=2", 500.0, 16, "pairs"),
-    Subject("one_link", "composite", "paper:duration=2", 500.0, 16, "none"),
+    Subject("R", "composite", "paper:duration=2", 500.0, 32, "full"),
+    Subject("one_link", "composite", "paper:duration=2", 500.0, 32, "none"),
     Subject("two_link", "two_link", SIXTY, 1000.0, 16, "star"),
     Subject("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star"),
 )
