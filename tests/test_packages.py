@@ -20,6 +20,7 @@ OURS = {path.name for path in (*PACKAGES, TEMPLATE)}
 KEYS = {
     "control": "python-control-pip",
     "hypothesis": "python3-hypothesis",
+    "jinja2": "python3-jinja2",
     "matplotlib": "python3-matplotlib",
     "mujoco": "python3-mujoco-pip",
     "numba": "python3-numba",
@@ -32,11 +33,18 @@ KEYS = {
 }
 #: Packages of Jazzy, whose key is their name.
 JAZZY = {"builtin_interfaces", "diagnostic_msgs", "launch", "launch_ros", "rcl_interfaces", "rclpy"}
-JAZZY |= {"sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs"}
+JAZZY |= {
+    "geometry_msgs",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+    "trajectory_msgs",
+    "visualization_msgs",
+}
 #: Needed and not imported.
 USED_OTHERWISE = {("flexarm_bringup", "ros2launch")}
-#: An option that only its own command needs, without a key.
-WITHOUT = {"distributed"}
+#: Options that only their own commands need, without a key.
+WITHOUT = {"distributed", "viser"}
 #: Tests of a package below that look at one above: a key would make a circle, which colcon refuses.
 CIRCLES = {("flexarm_ros", "flexarm_control")}
 

@@ -16,6 +16,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
         (f"share/{name}", ["package.xml"]),
         (f"share/{name}/launch", sorted(glob("launch/*.py") + glob("launch/*.yaml"))),
+        (f"share/{name}/layouts", sorted(glob("layouts/*"))),
         # `config` here is a link to the project's own: setuptools takes no file from above the package.
         (f"share/{name}/config/arms", sorted(glob("config/arms/*.yaml"))),
         (f"share/{name}/config/controllers", sorted(glob("config/controllers/*.yaml"))),
@@ -25,6 +26,7 @@ setup(
         "console_scripts": [
             "flexarm = flexarm_bringup.cli:entry",
             "publish_trajectory = flexarm_bringup.publish_trajectory:entry",
+            "shape = flexarm_bringup.shape:start_shape",
             "ros2_control_adapter = flexarm_bringup.adapters:start_ros2_control_adapter",
         ],
     },

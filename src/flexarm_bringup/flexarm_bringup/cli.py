@@ -48,6 +48,18 @@ def _show(options):
     show(options)
 
 
+def _urdf(options):
+    from .urdf_file import urdf
+
+    urdf(options)
+
+
+def _view(options):
+    from .view.command import view
+
+    view(options)
+
+
 def _gauges(options):
     from .gauges import gauges
 
@@ -100,6 +112,18 @@ def _latency(options):
     from .latency import latency
 
     latency(options)
+
+
+def _record(options):
+    from .record import record
+
+    record(options)
+
+
+def _report(options):
+    from .report.command import report
+
+    report(options)
 
 
 def _parameters(options):
@@ -161,6 +185,18 @@ def parser():
 
     _add_identification(commands)
 
+    from .view.command import add_arguments as add_view_arguments
+
+    view = commands.add_parser(
+        "view",
+        help="an arm in the browser, live: its shape, errors, torques; gains, motions and stops by hand",
+        description="Starts simulator, observer and controller in real time, and a page on this machine that shows"
+        " and handles them; with --attach, the page alone, of nodes that run.",
+        epilog="examples: flexarm view two_link; flexarm view R --attach --namespace left",
+    )
+    add_view_arguments(view)
+    view.set_defaults(function=_view)
+
     run = commands.add_parser(
         "run",
         help="start one node, as `ros2 run` does, without a ROS installation",
@@ -196,7 +232,7 @@ def parser():
 
 def _add_arm_commands(commands):
     """What needs an arm file and no ROS."""
-    from . import gauges, inspect_arm, observer_table, robustness, simulate
+    from . import gauges, inspect_arm, observer_table, robustness, simulate, urdf_file
 
     command = commands.add_parser(
         "simulate",
@@ -224,6 +260,14 @@ def _add_arm_commands(commands):
     )
     inspect_arm.add_show_arguments(command)
     command.set_defaults(function=_show)
+    command = commands.add_parser(
+        "urdf",
+        help="the arm as a URDF whose links bend: chains of short rigid pieces",
+        description="Writes a URDF; the node shape publishes the joint states that bend it as the arm is bent.",
+        epilog="example: flexarm urdf two_link --out two_link.urdf",
+    )
+    urdf_file.add_arguments(command)
+    command.set_defaults(function=_urdf)
     command = commands.add_parser(
         "gauges",
         help="how well the strain gauges tell the modes, and where they would do it best",
@@ -297,6 +341,30 @@ def _add_identification(commands):
     )
     excite.add_arguments(shake)
     shake.set_defaults(function=_excite)
+
+
+def _add_record_and_report(commands):
+    from . import record
+    from .report import command
+
+    take = commands.add_parser(
+        "record",
+        help="record the topics of a running arm to a bag, driver or simulator, until Ctrl-C",
+        description="Subscribes to the arm's topics and writes what comes to a rosbag2 bag (MCAP), with the arm file in"
+        " it; nothing of the running nodes changes.",
+        epilog="example: flexarm record --out results/run1 --duration 20",
+    )
+    record.add_arguments(take)
+    take.set_defaults(function=_record)
+    tell = commands.add_parser(
+        "report",
+        help="what recorded runs show, on one page of HTML: numbers, figures, animation; several are compared",
+        description="Reads bags of `flexarm record`, `flexarm simulate --bag`, `flexarm demo` or `ros2 bag record`, and"
+        " writes one page that needs no network.",
+        epilog="example: flexarm report results/run1 results/run2 --out results/report.html",
+    )
+    command.add_arguments(tell)
+    tell.set_defaults(function=_report)
 
 
 #: Options whose value may begin with a minus.
