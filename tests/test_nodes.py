@@ -387,6 +387,23 @@ def test_the_last_of_many_sets_is_the_law_in_the_end(running):
     assert obeys(running.state, 6.25, gain(alpha=4.0))
 
 
+def test_a_law_that_another_process_designs_is_taken_and_a_bad_one_refused(bench):
+    file = parameter_files.find("paper_composite")
+    bench.start("simulator", {**LOCKSTEP, "pause_at": -1.0}, file=file)
+    bench.start("observer", file=file)
+    bench.start("controller", {**PATIENT, "design_process": True}, file=file)
+    arm = Arm(bench)
+    arm.wait_ready()
+    assert bench.set("controller", fast__alpha=8.0)[0].successful
+    bench.wait_for("the new law", lambda: obeys(arm.state, 6.25, gain(alpha=8.0)))
+    assert bench.set_atomically("controller", fast__alpha=0.0, fast__q=[0.0]).successful
+    bench.wait_for("the refusal", lambda: "design refused" in bench.log("controller"))
+    bench.wait_for("the old value", lambda: bench.get("controller", "fast.alpha") == 8.0)
+    goes_on(arm)
+    assert obeys(arm.state, 6.25, gain(alpha=8.0))
+    assert bench.stop("controller", signal.SIGTERM) == 0
+
+
 def test_fast_type_none_takes_the_fast_control_out_and_lqr_puts_it_back(running):
     bench, nothing = running.bench, np.zeros((1, 4))
     assert bench.set("controller", fast__type="none")[0].successful

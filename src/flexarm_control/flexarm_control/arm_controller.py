@@ -156,7 +156,7 @@ class ArmController:
         """Whether a trajectory is worth a `prepare` before it is offered."""
         return self.law.feedforward is not None and self.law.feedforward.plans
 
-    def prepare(self, trajectory, law):
+    def prepare(self, trajectory, law, prepare=None):
         """Design work for a trajectory that is about to be offered; off the control path, in any thread.
 
         Parameters
@@ -164,6 +164,9 @@ class ArmController:
         trajectory : JointTrajectoryData
         law : CompositeControl
             The one in force.
+        prepare : callable, optional
+            Does that work, called with the feed-forward, the trajectory and the state (3, n) that it starts from:
+            in another process, say. Not given: here.
 
         Returns
         -------
@@ -178,7 +181,11 @@ class ArmController:
         if law.feedforward is None:
             return None
         start = self.reference.resting
-        return None if start is None else law.feedforward.prepare(trajectory, start)
+        if start is None:
+            return None
+        if prepare is not None:
+            return prepare(law.feedforward, trajectory, start)
+        return law.feedforward.prepare(trajectory, start)
 
     def offer(self, trajectory, plan=None):
         """Offer a trajectory.

@@ -15,6 +15,7 @@ import signal
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from threading import Lock
 
 from flexarm_dynamics import model as models
 from flexarm_dynamics.errors import DesignError
@@ -24,6 +25,10 @@ from . import composite
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 _MODEL = "model"
+
+
+class AwayError(DesignError):
+    """The other process did not make it: it died, or what was to be made can't travel. It can be made here."""
 
 
 class _Pickler(pickle.Pickler):
@@ -90,6 +95,10 @@ def _work(function, data):
     return dumps(function(model, *loads(data, model)), model.arm)
 
 
+def _nothing(model):
+    return None
+
+
 def _design(model, slow, fast, manifold, settings):
     return composite.design(model, slow, fast, manifold, settings)
 
@@ -114,6 +123,11 @@ class DesignProcess:
 
     def __init__(self, model, niceness=10):
         self.model, self.niceness, self._pool = model, niceness, None
+        self._starting = Lock()
+
+    def begin(self):
+        """Start the process, and let it import what it will need: the first design comes sooner."""
+        self.call(_nothing)
 
     def design(self, slow, fast, manifold=None, settings=None):
         """As `composite.design`, of this arm; warnings of the laws are still theirs to ask for.
@@ -134,7 +148,7 @@ class DesignProcess:
 
         Raises
         ------
-        DesignError
+        AwayError
             When the process died, or what it made can't travel: design here instead.
         """
         try:
@@ -143,21 +157,22 @@ class DesignProcess:
             return loads(result, self.model)
         except BrokenProcessPool:
             self.close()
-            raise DesignError(
+            raise AwayError(
                 "the process that designs has died (killed, or out of memory); it is started anew for the next one"
             ) from None
         except (pickle.PicklingError, TypeError, AttributeError) as error:
-            raise DesignError(f"this design can't be made in another process: {error}") from error
+            raise AwayError(f"this design can't be made in another process: {error}") from error
 
     def _running(self):
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                1,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_begin,
-                initargs=(self.model.arm, os.getpid(), self.niceness),
-            )
-        return self._pool
+        with self._starting:
+            if self._pool is None:
+                self._pool = ProcessPoolExecutor(
+                    1,
+                    mp_context=multiprocessing.get_context("spawn"),
+                    initializer=_begin,
+                    initargs=(self.model.arm, os.getpid(), self.niceness),
+                )
+            return self._pool
 
     def close(self):
         """End the process, whatever it is at."""

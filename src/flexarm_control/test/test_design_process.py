@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flexarm_control import composite, design_process
-from flexarm_control.design_process import DesignProcess
+from flexarm_control.design_process import AwayError, DesignProcess
 from flexarm_dynamics import arm_file
-from flexarm_dynamics.errors import DesignError, ParameterError
+from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.model import build
 
 FAST, CORRECTED = {"type": "lqr"}, {"type": "corrected"}
@@ -64,7 +64,7 @@ def test_the_process_designs_refuses_and_comes_again_when_it_has_died(arm_r):
             worker.design(slow | {"kp": [-1.0]}, FAST, CORRECTED, settings)
         (pid,) = worker._pool._processes
         os.kill(pid, signal.SIGKILL)
-        with pytest.raises(DesignError, match="has died"):
+        with pytest.raises(AwayError, match="has died"):
             worker.design(slow, FAST, CORRECTED, settings)
         assert worker.design(slow, FAST).feedforward is None
     finally:

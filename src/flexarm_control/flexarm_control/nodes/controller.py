@@ -15,6 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 from flexarm_control import arm_controller, composite, trajectory
 from flexarm_control.arm_controller import ArmController
 from flexarm_control.composite import FAST, MANIFOLD, PREFIX, SLOW
+from flexarm_control.design_process import AwayError, DesignProcess
 from flexarm_control.samples import ArmSample
 from flexarm_control.supervisor import State
 from flexarm_dynamics import arm_file, model, registry
@@ -63,6 +64,14 @@ STATE_TIMEOUT = Parameter(
     high=3600.0,
     read_only=True,
 )
+DESIGN_PROCESS = Parameter(
+    "design_process",
+    "bool",
+    True,
+    "Whether laws are designed anew, and motions planned, in a process of their own, which takes memory, rather than"
+    " in a thread, which may hold up a sample for some milliseconds.",
+    read_only=True,
+)
 
 #: Longer trajectories are refused: their points are read in one go.
 MOST_POINTS = 10_000
@@ -76,7 +85,12 @@ def parameter_groups():
     def laws(group):
         return merge(*(law.PARAMETERS for law in registry.importable(group).values()))
 
-    common = (*arm_controller.PARAMETERS, arm_controller.START_TOLERANCE, STATE_TIMEOUT)
+    common = (
+        *arm_controller.PARAMETERS,
+        arm_controller.START_TOLERANCE,
+        STATE_TIMEOUT,
+        DESIGN_PROCESS,
+    )
     kinds = {SLOW: SLOW_TYPE, FAST: FAST_TYPE, MANIFOLD: MANIFOLD_TYPE}
     return {
         "": (ARM, *common, *composite.PARAMETERS),
@@ -96,6 +110,7 @@ class ControllerNode(ArmNode):
         # goes back to the control path within this time, where 5 ms are usual.
         sys.setswitchinterval(1e-4)
         self._designer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
+        self._design_process, self._ending = None, False
         self._receiver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="trajectory")
 
     def build(self):
@@ -103,6 +118,7 @@ class ControllerNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(composite.sizes(self.model))
+        self._design_process = DesignProcess(self.model) if parameters["design_process"] else None
         self._good = self._law_parameters()
         law = self._design(self.model, self._good)
         settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
@@ -271,8 +287,10 @@ class ControllerNode(ArmNode):
         plan = None
         try:
             if self.core.plans:
-                plan = self.core.prepare(data, law)
+                plan = self.core.prepare(data, law, self._prepare)
         except Exception as error:
+            if self._ending:
+                return
             what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self.get_logger().warning(f"trajectory without preview: {what}{error}")
         self.hand_over(self._offer, data, plan)
@@ -320,17 +338,24 @@ class ControllerNode(ArmNode):
 
     def _design(self, arm_model, values):
         """The control that parameters describe, each law with those that it declares."""
+        made = composite.design(arm_model, *self._chosen(values))
+        self._warn(made)
+        return made
+
+    def _chosen(self, values):
+        """What `composite.design` wants to know."""
         chosen = []
         for group in (SLOW, FAST, MANIFOLD):
             given = values[PREFIX[group]]
             law = registry.find(group, given["type"])
             declared = {"type", *(p.name for p in law.PARAMETERS)}
             chosen.append({k: v for k, v in given.items() if k in declared})
-        made = composite.design(arm_model, *chosen, values[""])
+        return *chosen, values[""]
+
+    def _warn(self, made):
         for part in (made.slow, made.fast, made.feedforward):
             for warning in part.warnings() if part is not None else ():
                 self.get_logger().warning(warning)
-        return made
 
     def _changed(self, names):
         if names & {p.name for p in arm_controller.PARAMETERS}:
@@ -363,15 +388,50 @@ class ControllerNode(ArmNode):
     def _redesign(self, values):
         """In the design thread: a new law swaps whole, or the parameters go back to what they were."""
         try:
-            # A model of its own: the loop goes on with the old one meanwhile.
-            law = self._design(model.build(self.arm), values)
+            law = self._designed_anew(values)
             self.hand_over(self._swap, law)
             self._good = values
         except Exception as error:
+            if self._ending:
+                return
             # A law may be anybody's, and this thread would drop its error without a word.
             what = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self.get_logger().error(f"design refused, the old law goes on: {what}{error}")
             self._put_back(values, self._good)
+
+    def _designed_anew(self, values):
+        chosen = self._chosen(values)
+        law = self._elsewhere(
+            lambda process: process.design(*chosen),
+            # A model of its own: the loop goes on with the old one meanwhile.
+            lambda: composite.design(model.build(self.arm), *chosen),
+        )
+        self._warn(law)
+        return law
+
+    def _prepare(self, feedforward, trajectory, start):
+        return self._elsewhere(
+            lambda process: process.prepare(feedforward, trajectory, start),
+            lambda: feedforward.prepare(trajectory, start),
+        )
+
+    def _elsewhere(self, away, here):
+        """What is made in the process for designs, or in this thread where that can't be."""
+        if self._design_process is not None:
+            try:
+                return away(self._design_process)
+            except AwayError as error:
+                if self._ending:
+                    raise
+                self.get_logger().warning(f"{error}; it is made in a thread of the controller")
+        return here()
+
+    def _warm_up(self):
+        try:
+            self._design_process.begin()
+        except AwayError as error:
+            if not self._ending:
+                self.get_logger().warning(str(error))
 
     def _swap(self, law):
         """Between two samples: the new law goes on from where the old one is."""
@@ -381,6 +441,8 @@ class ControllerNode(ArmNode):
     # Life cycle ------------------------------------------------------------------------------
 
     def start(self):
+        if self.core.plans and self._design_process is not None:
+            self._receiver.submit(self._warm_up)  # or the first motion would wait for it
         slow, fast = self.parameters["slow.type"], self.parameters["fast.type"]
         self.get_logger().info(
             f"arm {self.arm.name}, slow {slow}, fast {fast}: torque with the first valid state"
@@ -393,8 +455,11 @@ class ControllerNode(ArmNode):
         self._torque_pub.wait_for_all_acked(LAST_WORD)
 
     def destroy_node(self):
+        self._ending = True
         for worker in (self._designer, self._receiver):
             worker.shutdown(wait=False, cancel_futures=True)
+        if self._design_process is not None:
+            self._design_process.close()
         super().destroy_node()
 
     def diagnose(self):
