@@ -1,1 +1,1 @@
-"""``flexarm view``: an arm in the browser. `link` talks to the nodes, `page` shows what it hears, `command` has both."""
+"""``flexarm view``: an arm in the browser. `link` speaks with the nodes, `page` is the page, `command` joins them."""

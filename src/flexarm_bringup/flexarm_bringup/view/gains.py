@@ -1,0 +1,108 @@
+"""Which of a controller's parameters are gains to turn by hand, and from where to where. No ROS."""
+
+import re
+from dataclasses import dataclass, replace
+
+#: Prefixes of the laws' parameters.
+LAWS = {"slow.": "flexarm.slow_laws", "fast.": "flexarm.fast_laws"}
+#: A slider goes to so many times the value at the start, within the declared range.
+SPAN = 4.0
+#: To where it goes from a value of zero.
+FROM_ZERO = 1.0
+STEPS = 400
+
+
+@dataclass(frozen=True)
+class Gain:
+    """One number of a parameter, with its slider.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter.
+    index : int or None
+        Which element of an array; None: the parameter is one number.
+    value, low, high, step : float
+        Of the slider, in the parameter's unit.
+    hint : str
+        What it does.
+    """
+
+    name: str
+    index: int | None
+    value: float
+    low: float
+    high: float
+    step: float
+    hint: str
+
+    @property
+    def label(self):
+        """As it is shown, such as ``slow.kp[0]``."""
+        return self.name if self.index is None else f"{self.name}[{self.index}]"
+
+
+def of_parameters(values, ranges, hints, laws=None):
+    """Gains of a controller's parameters.
+
+    Parameters
+    ----------
+    values : mapping of str to object
+        Parameters with their values; of these, floats and arrays of floats with a range.
+    ranges : mapping of str to (low, high)
+    hints : mapping of str to str
+    laws : mapping of str to set of str, optional
+        Prefix to the names that the law in use declares; others are left out.
+
+    Returns
+    -------
+    list of Gain
+        In the order of `values`, fast.alpha first.
+    """
+    out = []
+    for name, value in sorted(values.items(), key=lambda item: item[0] != "fast.alpha"):
+        prefix = name.split(".")[0] + "."
+        if prefix not in LAWS or name not in ranges:
+            continue
+        if laws and name[len(prefix) :] not in laws.get(prefix, ()):
+            continue
+        many = isinstance(value, (list, tuple))
+        for i, number in enumerate(value if many else [value]):
+            if isinstance(number, float):
+                low, high = span(number, *ranges[name])
+                gain = Gain(name, i if many else None, number, low, high, 0.0, hints.get(name, ""))
+                out.append(replace(gain, step=(high - low) / STEPS))
+    return out
+
+
+def span(value, low, high):
+    """Where a slider begins and ends: a range to turn by hand, within the declared one."""
+    size = SPAN * abs(value) or FROM_ZERO
+    return max(low, -size if low < 0.0 else 0.0), min(high, size)
+
+
+def range_of(constraints):
+    """(low, high) of a descriptor's text, as ``from 0.0 to 100.0; length joints``; None without one."""
+    found = re.search(r"from (\S+) to ([^\s;]+)", constraints)
+    return (float(found[1]), float(found[2])) if found else None
+
+
+def changed(values, changes):
+    """Whole values of parameters after numbers of them were changed.
+
+    Parameters
+    ----------
+    values : mapping of str to float or list
+    changes : mapping of (name, index) to float
+
+    Returns
+    -------
+    dict of str to float or list
+    """
+    out = {}
+    for (name, index), number in changes.items():
+        if index is None:
+            out[name] = float(number)
+        else:
+            out.setdefault(name, list(values[name]))[index] = float(number)
+    return out

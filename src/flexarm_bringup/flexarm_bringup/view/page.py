@@ -1,0 +1,394 @@
+"""The page: a scene, plots, gains and buttons, by viser. It knows no ROS: what is done on it goes into a queue."""
+
+import html
+import queue
+from collections import deque
+
+import numpy as np
+
+#: Colour of each state of the supervisor.
+STATES = {
+    "INACTIVE": "#6c757d",
+    "READY": "#1c7ed6",
+    "TRACKING": "#2b8a3e",
+    "HOLDING": "#0c8599",
+    "STOPPING": "#e67700",
+    "FAULT": "#c92a2a",
+}
+COLOURS = ("#1c7ed6", "#e8590c", "#2b8a3e", "#ae3ec9", "#c92a2a", "#0c8599", "#e67700", "#495057")
+BEAM, GHOST, TRAIL, TIP = (28, 126, 214), (173, 181, 189), (224, 49, 49), (224, 49, 49)
+SLOW, FAST, HUB = (247, 103, 7), (47, 158, 68), (52, 58, 64)
+#: Span of the plots [s], and how often they are drawn [Hz].
+WINDOW, PLOT_RATE = 10.0, 6.0
+#: Largest factor of the deflections.
+EXAGGERATION = 20.0
+
+
+class History:
+    """The last seconds of some numbers.
+
+    Parameters
+    ----------
+    columns : int
+    """
+
+    def __init__(self, columns):
+        self._rows = deque()
+        self._columns, self._session = columns, None
+
+    def add(self, time, values, session=0):
+        """Add a row; what is older than `WINDOW`, or of another session, is dropped."""
+        if session != self._session or (self._rows and time < self._rows[-1][0]):
+            self._rows.clear()
+            self._session = session
+        if not self._rows or time > self._rows[-1][0]:
+            self._rows.append((time, *values))
+        while self._rows[0][0] < time - WINDOW:
+            self._rows.popleft()
+
+    def columns(self):
+        """Time before now [s], then the numbers: arrays of one length, two or more."""
+        if len(self._rows) < 2:
+            return (np.array([-WINDOW, 0.0]), *np.full((self._columns, 2), np.nan))
+        table = np.array(self._rows).T
+        return (table[0] - table[0, -1], *table[1:])
+
+
+class Page:
+    """The page of one arm.
+
+    Parameters
+    ----------
+    arm : Arm
+    reach : float
+        Length of the arm [m].
+    port : int
+        On 127.0.0.1; another one where it is taken.
+
+    Attributes
+    ----------
+    done : queue.Queue
+        What was done on the page: (name, arguments...).
+    exaggeration : float
+    """
+
+    def __init__(self, arm, reach, port):
+        import viser
+
+        self.arm, self.reach = arm, reach
+        self.done = queue.SimpleQueue()
+        self.exaggeration, self.trail_shown = 1.0, True
+        self.server = viser.ViserServer(
+            "127.0.0.1", port, label=f"flexarm {arm.name}", verbose=False
+        )
+        self.url = f"http://127.0.0.1:{self.server.get_port()}"
+        self._gains, self._plotted = {}, 0.0
+        modes = len(arm.mode_names)
+        self._histories = {
+            "tip": History(1),
+            "modes": History(modes),
+            "torques": History(2 * len(arm.joints)),
+        }
+        self._make_scene()
+        self._make_panel()
+
+    # Scene -----------------------------------------------------------------------------------
+
+    def _make_scene(self):
+        scene, r = self.server.scene, self.reach
+        flat = all(abs(j.axis[2]) > 0.99 and not any(j.origin_rpy) for j in self.arm.joints)
+        self.server.gui.configure_theme(
+            control_layout="fixed",
+            control_width="large",
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(28, 126, 214),
+        )
+        eye = (0.3, -0.85, 1.35) if flat else (0.9, -1.3, 0.7)
+        look = (0.3, 0.1, 0.0) if flat else (0.25, 0.0, 0.1)
+        camera = self.server.initial_camera
+        camera.position, camera.look_at = (tuple(r * np.array(v)) for v in (eye, look))
+        scene.set_up_direction("+z")
+        # Plain colours: a picture of an arm needs no reflections, and many machines have no GPU.
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(cast_shadow=False)
+        scene.add_grid(
+            "/grid",
+            width=4.0 * r,
+            height=4.0 * r,
+            cell_size=0.1 * r,
+            section_size=0.5 * r,
+            cell_color=(233, 236, 239),
+            section_color=(206, 212, 218),
+        )
+        line = np.zeros((1, 2, 3))
+        self._beam = scene.add_line_segments("/beam", line, BEAM, thickness=0.018 * r)
+        self._ghost = scene.add_line_segments("/ghost", line, GHOST, thickness=0.006 * r)
+        self._trail = scene.add_line_segments("/trail", line, TRAIL, thickness=0.005 * r)
+        self._joints = self._dots("/joints", len(self.arm.joints), HUB, 0.036)
+        self._tip = self._dots("/tip", 1, TIP, 0.03)
+        size = {"shaft_radius": 0.008 * r, "head_radius": 0.018 * r, "head_length": 0.035 * r}
+        arrows = np.zeros((len(self.arm.joints), 2, 3))
+        self._slow = scene.add_arrows("/slow", arrows, SLOW, **size)
+        self._fast = scene.add_arrows("/fast", arrows, FAST, **size)
+
+    def _dots(self, name, count, colour, size):
+        return self.server.scene.add_point_cloud(
+            name,
+            np.zeros((count, 3), np.float32),
+            colour,
+            point_size=size * self.reach,
+            point_shape="circle",
+            precision="float32",
+        )
+
+    def _draw(self, picture, trail):
+        self._beam.points = segments(picture.beam)
+        self._ghost.points = segments(picture.ghost)
+        self._trail.visible = self.trail_shown and len(trail) > 1
+        if self._trail.visible:
+            self._trail.points = segments(trail)
+        # Points like the lines, so that a browser that is late draws both of the same instant.
+        self._joints.points = picture.joints.astype(np.float32)
+        self._tip.points = picture.tip[None].astype(np.float32)
+        for handle, arrows in ((self._slow, picture.slow), (self._fast, picture.fast)):
+            long = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > 1e-3 * self.reach
+            handle.visible = bool(long.any())
+            if handle.visible:
+                handle.points = arrows[long].astype(np.float32)
+
+    # Panel -----------------------------------------------------------------------------------
+
+    def _make_panel(self):
+        gui = self.server.gui
+        self._head = gui.add_html(header("", "", "waiting for the nodes"))
+        self._numbers = gui.add_html("")
+        self._button("Stop", lambda: ("stop",), "red")
+        self._button("Recover", lambda: ("recover",), "orange")
+        self._message = gui.add_html("")
+        with gui.add_folder("Move"):
+            self._targets = [
+                gui.add_slider(
+                    joint.name,
+                    *(round(v, 2) for v in reachable(joint)),
+                    step=0.01,
+                    initial_value=0.0,
+                    hint="where the joint goes [rad]",
+                )
+                for joint in self.arm.joints
+            ]
+            self._duration = gui.add_slider(
+                "duration", 0.5, 10.0, step=0.1, initial_value=2.0, hint="of the motion [s]"
+            )
+            self._button("Move there", lambda: ("move", self.target(), self._duration.value))
+            self._button("Move back", lambda: ("back", self._duration.value), "gray")
+            fast = gui.add_checkbox(
+                "fast control", True, hint="off: slow control alone, the arm rings"
+            )
+            fast.on_update(self._by_hand(lambda: ("enable_fast", fast.value)))
+        plots = gui.add_panel()
+        with plots.add_tab("Plots"):
+            self._plots = self._make_plots()
+        plots.dock_left()
+        plots.set_width(340)
+        with gui.add_folder("Picture"):
+            larger = gui.add_slider(
+                "exaggerate",
+                1.0,
+                EXAGGERATION,
+                step=0.5,
+                initial_value=self.exaggeration,
+                hint="deflections are drawn so many times as large",
+            )
+            larger.on_update(lambda _: self._look(larger.value, trail.value))
+            trail = gui.add_checkbox("trail", True)
+            trail.on_update(lambda _: self._look(larger.value, trail.value))
+        self._folder = gui.add_folder("Gains")
+
+    def _look(self, exaggeration, trail):
+        if exaggeration != self.exaggeration:
+            self.done.put(("clear_trail",))
+        self.exaggeration, self.trail_shown = float(exaggeration), trail
+
+    def _button(self, label, action, color=None):
+        button = self.server.gui.add_button(label, color=color)
+        button.on_click(lambda _: self.done.put(action()))
+
+    def _by_hand(self, action):
+        """A callback of a person's changes, not of the page's own."""
+
+        def updated(event):
+            if event.client is not None:
+                self.done.put(action())
+
+        return updated
+
+    def _make_plots(self):
+        joints, modes = self.arm.joint_names, self.arm.mode_names
+        torques = [f"{joint} {kind}" for kind in ("slow", "fast") for joint in joints]
+        return {
+            "tip": self._plot("tip", "tip from the rigid arm's [mm]", ["error"]),
+            "modes": self._plot("modes", "modal amplitudes [mm, mrad]", modes),
+            "torques": self._plot("torques", "torques [N m]", torques, len(joints)),
+        }
+
+    def _plot(self, name, title, labels, solid=100):
+        """A plot of a history; lines from number `solid` on are dashed."""
+        series = [{"label": "t"}]
+        for i, label in enumerate(labels):
+            line = {"label": label, "stroke": COLOURS[i % solid % len(COLOURS)], "width": 1.5}
+            series.append(line | ({"dash": (4.0, 3.0)} if i >= solid else {}))
+        plot = self.server.gui.add_uplot(
+            self._histories[name].columns(),
+            tuple(series),
+            title=title,
+            scales={"x": {"time": False, "range": (-WINDOW, 0.0)}},
+            axes=({"size": 26}, {"size": 46}),
+            legend={"show": False},
+            height=190,
+        )
+        if len(labels) > 1:
+            self.server.gui.add_html(legend(labels, solid))
+        return plot
+
+    # What is shown ---------------------------------------------------------------------------
+
+    def target(self):
+        """Where the sliders say that the joints go [rad]."""
+        return [float(slider.value) for slider in self._targets]
+
+    def aim(self, q):
+        """Set the sliders of the target."""
+        for slider, value in zip(self._targets, q, strict=True):
+            slider.value = float(np.clip(round(value, 2), slider.min, slider.max))
+
+    def say(self, text, bad):
+        """Show a message to the person."""
+        colour = "#c92a2a" if bad else "#495057"
+        self._message.content = (
+            f'<div id="message" style="margin:0 0.8em 0.6em;font-size:0.8em;color:{colour};'
+            f'overflow-wrap:anywhere">{html.escape(text)}</div>'
+        )
+
+    def show(self, heard, picture, trail, tip_error):
+        """Show a state.
+
+        Parameters
+        ----------
+        heard : link.Heard
+        picture : Picture
+        trail : (k, 3) ndarray
+        tip_error : float
+            [m]
+        """
+        self._histories["tip"].add(heard.time, [1e3 * tip_error], heard.session)
+        self._histories["modes"].add(heard.time, 1e3 * heard.delta, heard.session)
+        self._histories["torques"].add(heard.time, (*heard.slow, *heard.fast), heard.session)
+        with self.server.atomic():
+            self._draw(picture, trail)
+            put(self._head, header(heard.state, heard.reason))
+            put(self._numbers, numbers(self.arm, heard, tip_error))
+
+    def plot(self, now):
+        """Draw the plots, if it is time to; `now` in seconds of any steady clock."""
+        if now < self._plotted + 1.0 / PLOT_RATE:
+            return
+        self._plotted = now
+        for name, plot in self._plots.items():
+            plot.data = self._histories[name].columns()
+
+    def silence(self, seconds):
+        """Nothing has been heard for so long."""
+        text = f"nothing heard for {seconds:.0f} s" if seconds >= 2.0 else "waiting for the nodes"
+        put(self._head, header("", "", text))
+
+    def offer_gains(self, found):
+        """Make a slider for each `Gain`."""
+        with self._folder:
+            for gain in found:
+                slider = self.server.gui.add_slider(
+                    gain.label,
+                    gain.low,
+                    gain.high,
+                    step=gain.step,
+                    initial_value=gain.value,
+                    hint=gain.hint,
+                )
+                slider.on_update(self._turned(gain, slider))
+                self._gains[gain.name, gain.index] = slider
+            if not found:
+                self.server.gui.add_markdown("none: both laws are `none`")
+
+    def _turned(self, gain, slider):
+        return self._by_hand(lambda: ("turn", gain.name, gain.index, float(slider.value)))
+
+    def take_values(self, values):
+        """Parameters have these values now, whoever set them."""
+        for name, value in values.items():
+            for i, number in enumerate(value if isinstance(value, list) else [value]):
+                slider = self._gains.get((name, i if isinstance(value, list) else None))
+                if slider is None or slider.value == number:
+                    continue
+                slider.min, slider.max = min(slider.min, number), max(slider.max, number)
+                slider.value = number
+
+    def close(self):
+        """End the server."""
+        self.server.stop()
+
+
+def put(handle, content):
+    """Change an element if it says something else."""
+    if handle.content != content:
+        handle.content = content
+
+
+def segments(points):
+    """A line through points (k, 3) as pairs of ends (k - 1, 2, 3)."""
+    return np.stack((points[:-1], points[1:]), axis=1).astype(np.float32)
+
+
+def reachable(joint):
+    """Range of a joint's slider [rad]."""
+    low, high = joint.limits.position
+    return (low, high) if np.isfinite(low) and np.isfinite(high) else (-np.pi, np.pi)
+
+
+def legend(labels, solid):
+    """Names of a plot's lines in their colours, as HTML."""
+    words = "".join(
+        f'<span style="color:{COLOURS[i % solid % len(COLOURS)]};margin-right:0.9em;white-space:nowrap">'
+        f"{'┅' if i >= solid else '━'} {html.escape(label)}</span> "
+        for i, label in enumerate(labels)
+    )
+    return f'<div style="font-size:0.75em;margin:0 0.8em 0.8em">{words}</div>'
+
+
+def header(state, reason, other=""):
+    """State of the supervisor and its reason, in its colour, as HTML."""
+    colour = STATES.get(state, "#6c757d")
+    return (
+        f'<div style="margin:0.6em 0.8em;padding:0.5em 0.8em;border-radius:6px;background:{colour};color:white">'
+        f'<b id="state" style="font-size:1.15em">{html.escape(state or other)}</b>'
+        f'<div id="reason" style="font-size:0.8em;overflow-wrap:anywhere">{html.escape(reason)}</div></div>'
+    )
+
+
+def numbers(arm, heard, tip_error):
+    """What the state says in numbers, as HTML."""
+    rows = "".join(
+        f"<tr><td>{html.escape(name)}</td><td>{q:.3f}</td><td>{1e3 * (r - q):.2f}</td>"
+        f"<td>{s:.2f}</td><td>{f:.2f}</td></tr>"
+        for name, q, r, s, f in zip(
+            arm.joint_names, heard.q, heard.reference, heard.slow, heard.fast, strict=True
+        )
+    )
+    saturated = ' <b style="color:#e67700">torque at its limit</b>' if heard.saturated else ""
+    return (
+        '<div style="margin:0 0.8em 0.4em;font-size:0.8em">'
+        f'<span id="time">{heard.time:.2f}</span> s, motion <span id="trajectory">{heard.trajectory}</span>,'
+        f' tip error <span id="tip">{1e3 * tip_error:.2f}</span> mm{saturated}'
+        '<table id="joints" style="width:100%;text-align:right;font-variant-numeric:tabular-nums">'
+        '<tr style="color:#868e96"><td></td><td>[rad]</td><td>error [mrad]</td><td>slow [N m]</td><td>fast</td></tr>'
+        f"{rows}</table></div>"
+    )
