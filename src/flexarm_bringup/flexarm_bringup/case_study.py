@@ -190,7 +190,7 @@ def run_nodes(run, directory, progress=lambda fraction: None):
             raise FlexarmError(f"{run.name}: exit codes {codes}; logs in {directory / 'log'}")
     bag = directory / "bag"
     shutil.rmtree(bag, ignore_errors=True)
-    recorder.write_bag(bag, samples)
+    recorder.write_bag(bag, samples, run.arm)
     return recorder.to_record(recorder.decode(samples), start), timing
 
 

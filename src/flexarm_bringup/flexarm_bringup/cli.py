@@ -184,6 +184,7 @@ def parser():
     check.set_defaults(function=_check_driver)
 
     _add_identification(commands)
+    _add_record_and_report(commands)
 
     from .view.command import add_arguments as add_view_arguments
 

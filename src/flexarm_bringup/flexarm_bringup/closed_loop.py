@@ -50,6 +50,8 @@ class ClosedLoop:
         Why the last run of `follow` ended early; empty if it did not.
     unprepared : str
         Why its trajectory went without preview; empty if it did not, or none was asked for.
+    bag : LoopBag or None
+        Where every sample and its answer are written.
     """
 
     def __init__(
@@ -89,6 +91,12 @@ class ClosedLoop:
         self._set_delay(delay)
         self._reach = sum(link.length for link in model.arm.links)
         self.lost = self.unprepared = ""
+        self.bag = None
+
+    @property
+    def estimated(self):
+        """The last sample that the observer passed on."""
+        return self._estimate
 
     def _set_delay(self, delay):
         if not 0.0 <= delay <= self.LONGEST_DELAY:
@@ -110,6 +118,8 @@ class ClosedLoop:
         s.strain = sim.strain if has_gauges else None
         s.amplitude = sim.amplitude if has_gauges and self._publish_amplitude else None
         s.rate = sim.rate if self._publish_rates else None
+        if self.bag is not None:
+            self.bag.measured(s)
         return s
 
     def estimate(self, measured):
@@ -143,10 +153,13 @@ class ClosedLoop:
     def _answer_to(self, measured):
         """Estimate and control; as `_answer`."""
         try:
-            return self.controller.step(self.estimate(measured))
+            enabled = self.controller.step(self.estimate(measured))
         except MessageError as error:
             self.controller.distrust(str(error))
-            return False
+            enabled = False
+        if self.bag is not None:
+            self.bag.answered(measured, enabled)
+        return enabled
 
     def _advance(self, torque):
         """One period of the plant under what has arrived by then."""

@@ -1,6 +1,8 @@
 """Records the line as serialised messages; reads them back; writes a bag that common viewers open."""
 
+import functools
 import struct
+from pathlib import Path
 
 import numpy as np
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
@@ -151,7 +153,65 @@ def to_record(messages, start_ns):
     )
 
 
-def write_bag(path, samples):
+class BagWriter:
+    """A rosbag2 bag with MCAP storage that is written message by message.
+
+    Parameters
+    ----------
+    path : Path
+        Directory of the bag; must not exist.
+    arm : str, optional
+        Shipped name or path of the arm file: its name and its text go into the bag's metadata (``custom_data``), so
+        that whoever reads the bag knows the arm.
+    namespace : str
+        In front of the topics' names.
+    """
+
+    def __init__(self, path, arm="", namespace=""):
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        self._store, self._connections = typestore(), {}
+        self._before = f"/{namespace.strip('/')}" if namespace.strip("/") else ""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._writer.open()
+        if arm:
+            self.tell_arm(arm)
+
+    def tell_arm(self, arm):
+        """Have the bag say which arm it is of; any time before it is closed."""
+        from flexarm_dynamics import arm_file
+
+        from .report.bag import ARM_NAME, ARM_TEXT
+
+        path = arm_file.find(arm)
+        self._writer.set_custom_data(ARM_NAME, path.stem)
+        self._writer.set_custom_data(ARM_TEXT, path.read_text(encoding="utf-8"))
+
+    def add(self, topic, kind):
+        """Name a topic that is not the line's, and its type, such as ``trajectory_msgs/msg/JointTrajectory``."""
+        self._connections[topic] = self._writer.add_connection(
+            f"{self._before}/{topic}", kind, typestore=self._store
+        )
+
+    def write(self, topic, time_ns, raw):
+        """Write a serialised message."""
+        if topic not in self._connections:
+            self.add(topic, f"flexarm_msgs/msg/{TOPICS[topic].__name__}")
+        self._writer.write(self._connections[topic], time_ns, raw)
+
+    def close(self):
+        """Write index and metadata."""
+        self._writer.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def write_bag(path, samples, arm=""):
     """Write `Recorder.samples` as a rosbag2 bag with MCAP storage, log times from the stamps.
 
     Parameters
@@ -160,26 +220,22 @@ def write_bag(path, samples):
         Directory of the bag; must not exist.
     samples : dict
         Topic to {stamp_ns: bytes}.
+    arm : str, optional
+        See `BagWriter`.
     """
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    store = typestore()
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {
-            topic: writer.add_connection(
-                f"/{topic}", f"flexarm_msgs/msg/{TOPICS[topic].__name__}", typestore=store
-            )
-            for topic in samples
-        }
+    with BagWriter(path, arm) as bag:
         rows = sorted(
             ((stamp, i, topic) for i, topic in enumerate(samples) for stamp in samples[topic]),
         )
+        for topic in samples:
+            bag.add(topic, f"flexarm_msgs/msg/{TOPICS[topic].__name__}")
         for stamp, _, topic in rows:
-            writer.write(connections[topic], stamp, samples[topic][stamp])
+            bag.write(topic, stamp, samples[topic][stamp])
 
 
+@functools.cache
 def typestore():
-    """Jazzy's types with flexarm's beside them, for `rosbags`."""
+    """Jazzy's types with flexarm's beside them, for `rosbags`; the same one each time."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)

@@ -67,6 +67,11 @@ def add_arguments(parser):
     add("--delay", type=float, help="from a measurement until its torque acts [s] (0)")
     add("--repeat", type=int, metavar="N", help="the motion N times, and back in between (1)")
     add("--window", type=float, help="time after the motion that the rest is judged over [s] (3)")
+    add(
+        "--bag",
+        metavar="FOLDER",
+        help="record the run as the nodes' topics: a rosbag2 bag for `flexarm report`, PlotJuggler, Foxglove",
+    )
     add("--settle-within", type=float, help="tolerance of the tip for settling [mm] (1)")
 
 
@@ -78,7 +83,7 @@ def check_arguments(options):
     FlexarmError
     """
     if options.controller is None:
-        wrong = [k for k in (*FIELDS, "set") if k not in SHARED and getattr(options, k) is not None]
+        wrong = [k for k in (*FIELDS, "set", "bag") if k not in SHARED and getattr(options, k) is not None]
         why = "only with --controller"
     else:
         wrong = [k for k in OPEN_LOOP if getattr(options, k)]
@@ -110,7 +115,7 @@ def scenario_of(options):
 def run_controller(options):
     """Run the sub-command; exit code 1 when the loop lost the arm."""
     scenario = scenario_of(options)
-    record, metrics, loop = scenarios.run_loop(scenario)
+    record, metrics, loop = scenarios.run_loop(scenario, options.bag)
     plant = loop.simulator.plant_model
     for warning in warnings(scenario, loop):
         print(f"flexarm simulate: {warning}", file=sys.stderr)
@@ -124,6 +129,8 @@ def run_controller(options):
         print(json.dumps(result, allow_nan=False))
     else:
         print("\n".join(report(scenario, loop.model, metrics)))
+    if options.bag:
+        print(f"bag {options.bag}; look at it with: flexarm report {options.bag}", file=sys.stderr)
     if metrics["lost"]:
         print(f"flexarm simulate: the arm was lost: {metrics['reason']}", file=sys.stderr)
         sys.exit(1)

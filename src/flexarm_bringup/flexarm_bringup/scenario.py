@@ -278,8 +278,15 @@ def run(scenario):
     return run_loop(scenario)[:2]
 
 
-def run_loop(scenario):
-    """As `run`, and the `ClosedLoop` in which it ran."""
+def run_loop(scenario, bag=None):
+    """As `run`, and the `ClosedLoop` in which it ran.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    bag : str or Path, optional
+        Folder of a rosbag2 bag that the run is written to, as the nodes would send it; must not exist.
+    """
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
         raise ParameterError(f"repeat {scenario.repeat}: an integer not below 1 is wanted")
     loop = loop_of(scenario)
@@ -290,6 +297,18 @@ def run_loop(scenario):
     end = 1e-9 * int(motion.times_ns[-1])
     duration = end + scenario.window if scenario.duration is None else scenario.duration
     _check_times(scenario, duration)
+    if bag is None:
+        return _passes(scenario, loop, motion, back, end, duration)
+    from .loop_bag import LoopBag
+
+    # An `Arm` that was read has no file any more.
+    arm = scenario.arm if isinstance(scenario.arm, str) else ""
+    with LoopBag(bag, loop, arm, type_of("observer", scenario.controller)):
+        return _passes(scenario, loop, motion, back, end, duration)
+
+
+def _passes(scenario, loop, motion, back, end, duration):
+    """Carry the motion out as often as it is wanted; as `run_loop`."""
     passes = []
     for i in range(scenario.repeat):
         if i and back is not None and not loop.lost:

@@ -65,7 +65,7 @@ def excite(options):
         kept = between(graph.tap.messages(), graph.tap.raw)
     if not kept["joint_torque"]:
         raise FlexarmError(f"no torque was sent:\n{said}")
-    write_bag(out, kept)
+    write_bag(out, kept, options.arm)
     print(f"{len(kept['arm_state'])} states in {out}")
     if "excitation complete" not in said:
         raise FlexarmError(f"{_ending(said) or said}; what came before is in {out}")

@@ -1,0 +1,363 @@
+"""What is told of a run: tracking, vibration after motions, torque, losses, spectra. Plain numbers, no drawing."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from .run import ENABLED, FAULT, HOLDING, READY, STATES, STOPPING, TRACKING
+from .timeline import stretches
+
+#: The vibration that a motion leaves is judged over so long after it, if the arm rests for at least so long [s].
+WINDOW, SHORTEST = 3.0, 0.5
+#: A spectrum is taken of so long at a time, and of nothing shorter [s].
+SEGMENT, SHORTEST_SEGMENT = 8.0, 1.0
+#: Spectra are padded to so many times their length: that draws a line between the frequencies they resolve.
+PADDED = 4
+#: A measured frequency is told when it stands out of its neighbourhood by this factor of power.
+OUTSTANDING = 10.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A stretch of samples in which a reference moved, and the rest that followed.
+
+    Attributes
+    ----------
+    start, end : int
+        Samples: the first one of the motion, and the first one after it.
+    rest : int
+        The first one that does not belong to the rest; `end` where there was none.
+    """
+
+    start: int
+    end: int
+    rest: int
+
+
+def motions(run):
+    """The motions of a run: the supervisor TRACKING or STOPPING; rests: HOLDING or READY, for `WINDOW` at most."""
+    moving = (run.state == TRACKING) | (run.state == STOPPING)
+    resting = (run.state == HOLDING) | (run.state == READY)
+    resting[1:] &= run.timeline.epoch[1:] == run.timeline.epoch[:-1]
+    found = []
+    for start, end in zip(*stretches(moving), strict=True):
+        most = end + int(np.searchsorted(run.time[end:], run.time[end - 1] + WINDOW, "right"))
+        stops = np.flatnonzero(~resting[end:most])
+        rest = end + int(stops[0]) if stops.size else int(most)
+        if rest > end and run.time[rest - 1] - run.time[end] < SHORTEST:
+            rest = end
+        found.append(Motion(int(start), int(end), rest))
+    return found
+
+
+def summary(run, moves=None):
+    """All numbers of the summary table.
+
+    Parameters
+    ----------
+    run : Run
+    moves : list of Motion, optional
+
+    Returns
+    -------
+    dict
+        Numbers in SI, lists with one number per joint or link; None for what the bag does not tell.
+    """
+    moves = motions(run) if moves is None else moves
+    found = {
+        "arm": run.arm.name if run.arm is not None else None,
+        "sessions": run.sessions,
+        "samples": int(run.time.size),
+        "duration_s": float(run.time[-1] - run.time[0]),
+        "rate_hz": 1.0 / run.period if run.period > 0.0 else None,
+        "lost": run.timeline.lost,
+        "lost_by_recorder": _lost_by_recorder(run),
+        "repeated": run.timeline.repeated,
+        "clock_jumps": len(run.timeline.jumps),
+        "motions": len(moves),
+    }
+    return found | _supervision(run) | _tracking(run) | _vibration(run, moves) | _torque(run)
+
+
+def _lost_by_recorder(run):
+    """Samples of which the bag has the answering torque alone: the recorder missed them, not the line."""
+    table, base = run.contents.tables.get("joint_torque"), run.contents.tables[run.base]
+    if table is None or not run.timeline.lost:
+        return 0
+    pair = lambda t: np.asarray(t.session) * 2**32 + np.asarray(t.sequence)  # noqa: E731
+    return int(np.setdiff1d(pair(table), pair(base)).size)
+
+
+def _supervision(run):
+    if not run.has("controller/state"):
+        return {"faults": None, "first_fault": None, "compute_time_s": None}
+    entered = _entered(run, FAULT)
+    reasons = run.contents.reasons
+    first = None
+    if entered.size:
+        first = (
+            f"{run.time[entered[0]]:.3f} s: {reasons[run.reason[entered[0]]] or 'no reason given'}"
+        )
+    took = run.column("controller/state", "compute_time")
+    took = None if took is None else took[took > 0.0]  # 0: an answer repeated without a new sample
+    share = None
+    if took is not None and took.size:
+        share = np.percentile(took, [50.0, 99.0, 100.0]).tolist()
+    return {"faults": int(entered.size), "first_fault": first, "compute_time_s": share}
+
+
+def _entered(run, state):
+    """Samples at which the supervisor went into a state."""
+    return stretches(run.state == state)[0]
+
+
+def followed(run):
+    """Samples over which tracking is judged, shape (k,) bool: a motion or the end of one; else what was held."""
+    judged = (run.state >= TRACKING) & (run.state <= STOPPING)
+    return judged if judged.any() else run.state == READY
+
+
+def _tracking(run):
+    judged = followed(run)
+    if not run.has("controller/state", "reference_position") or not judged.any():
+        return {"peak_error_rad": None, "rms_error_rad": None}
+    peak, rms = [], []
+    for j in range(len(run.joint_names)):
+        error = run.error(j)[judged]
+        error = error[np.isfinite(error)]
+        peak.append(float(np.abs(error).max()) if error.size else None)
+        rms.append(float(np.sqrt(np.mean(error**2))) if error.size else None)
+    return {"peak_error_rad": peak, "rms_error_rad": rms}
+
+
+def _vibration(run, moves):
+    found = {"residual_m": None, "residual_windows": 0, "peak_deflection_m": None}
+    if not run.amplitude_source or run.model is None:
+        return found
+    rows, names = tip_rows(run.model)
+    if len(names):
+        peaks = np.zeros(len(names))
+        for part in _parts(run):
+            bent = run.deflections(part) @ rows.T
+            peaks = np.maximum(peaks, np.abs(bent).max(axis=0))
+        found["peak_deflection_m"] = dict(zip(names, peaks.tolist(), strict=True))
+    squares, count, windows = 0.0, 0, 0
+    for move in moves:
+        if move.rest == move.end:
+            continue
+        window = slice(move.end, move.rest)
+        moved = residual(run, window)
+        squares, count, windows = squares + (moved**2).sum(), count + moved.size, windows + 1
+    if windows:
+        found |= {"residual_m": float(np.sqrt(squares / count)), "residual_windows": windows}
+    return found
+
+
+def residual(run, window):
+    """Distance of the tip from its mean place that bending alone makes, over a rest, shape (window,) [m].
+
+    With the tip's Jacobian with respect to the amplitudes at the mean joint angles.
+    """
+    bent = run.deflections(window)
+    q = np.nanmean(run.positions(window), axis=0)
+    jacobian = tip_jacobian(run.model, q)
+    return np.linalg.norm((bent - bent.mean(axis=0)) @ jacobian.T, axis=1)
+
+
+def tip_jacobian(model, q, step=1e-6):
+    """Derivative of the tip's position by the modal amplitudes of the straight arm, shape (3, m)."""
+    m = model.n_modes
+    columns = [
+        (model.tip_position(q, step * e) - model.tip_position(q, -step * e)) / (2.0 * step)
+        for e in np.eye(m)
+    ]
+    return np.array(columns).reshape(m, 3).T
+
+
+def tip_rows(model):
+    """What makes the deflection of each link's tip, across it, of the amplitudes: rows (r, m) and their names."""
+    rows, names, modes = [], [], model.arm.modes
+    for link in model.arm.links:
+        for direction in sorted(set(link.flexible) - {"twist"}):
+            shapes = np.atleast_1d(model.mode_shapes(link.name, direction)(1.0))
+            row = np.zeros(model.n_modes)
+            for j, mode in enumerate(modes):
+                if (mode.link, mode.direction) == (link.name, direction):
+                    row[j] = shapes[mode.number - 1]
+            rows.append(row)
+            names.append(f"{link.name} {direction}")
+    return np.array(rows).reshape(len(rows), model.n_modes), names
+
+
+def _parts(run, size=200_000):
+    """Slices over all samples, so that no table of all of them is in memory."""
+    return [slice(a, a + size) for a in range(0, run.time.size, size)]
+
+
+def torque_column(run, j):
+    """The torque of a joint as it was sent, else as it was applied [N m]; NaN while it was not enabled."""
+    mode = run.column("joint_torque", "mode")
+    sent = run.column("joint_torque", "torque", j)
+    if sent is not None and mode is not None:
+        return np.where(mode == ENABLED, sent, np.nan)
+    sent = run.column("controller/state", "torque", j)
+    return sent if sent is not None else run.column(run.base, "joint_torque", j)
+
+
+def _torque(run):
+    limits = [None] * len(run.joint_names)
+    if run.arm is not None:
+        limits = [j.limits.torque if np.isfinite(j.limits.torque) else None for j in run.arm.joints]
+    peaks = []
+    for j in range(len(run.joint_names)):
+        torque = torque_column(run, j)
+        known = torque is not None and np.isfinite(torque).any()
+        peaks.append(float(np.nanmax(np.abs(torque))) if known else None)
+    saturated, share = run.column("controller/state", "saturated"), None
+    if saturated is not None:
+        active = (run.state >= READY) & (run.state <= STOPPING)
+        share = float(np.mean(saturated[active] > 0.0)) if active.any() else None
+    return {"peak_torque_Nm": peaks, "torque_limit_Nm": limits, "saturation_share": share}
+
+
+# Spectra ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """How strongly the links' tips (or, without a model, the modes) vibrate at which frequency.
+
+    Attributes
+    ----------
+    frequency : ndarray, shape (f,)
+        [Hz]
+    density : ndarray, shape (f, signals)
+        Amplitude spectral density [m / sqrt(Hz)], or [m, rad / sqrt(Hz)] of modes.
+    names : list of str
+    configuration : ndarray, shape (n,)
+        Mean joint angles meanwhile [rad].
+    seconds : float
+        Of how long it was taken.
+    """
+
+    frequency: np.ndarray
+    density: np.ndarray
+    names: list
+    configuration: np.ndarray
+    seconds: float
+
+
+def spectrum(run, mask):
+    """Welch's estimate over the gapless stretches of some samples; None where none is long enough.
+
+    Parameters
+    ----------
+    run : Run
+    mask : ndarray of bool, shape (k,)
+    """
+    from scipy.signal import welch
+
+    if not run.amplitude_source or not run.period > 0.0:
+        return None
+    rate = 1.0 / run.period
+    pieces = [(a, b) for a, b in _gapless(run, mask) if (b - a) * run.period >= SHORTEST_SEGMENT]
+    if not pieces:
+        return None
+    if run.model is not None:
+        rows, names = tip_rows(run.model)
+    else:
+        rows, names = np.eye(len(run.mode_names)), list(run.mode_names)
+    if not names:
+        return None
+    longest = max(b - a for a, b in pieces)
+    length = int(min(longest, round(SEGMENT * rate)))
+    power, weight, q = 0.0, 0, 0.0
+    for a, b in pieces:
+        if b - a < length / 2 or b - a < 8:
+            continue
+        signal = run.deflections(slice(a, b)) @ rows.T
+        # A shorter piece is padded to the same frequencies; its own length is what is averaged over.
+        f, p = welch(
+            signal, rate, nperseg=min(length, b - a), nfft=PADDED * length, detrend="linear", axis=0
+        )
+        power, weight = power + p * (b - a), weight + b - a
+        q = q + np.nanmean(run.positions(slice(a, b)), axis=0) * (b - a)
+    if not weight:
+        return None
+    return Spectrum(f[1:], np.sqrt(power[1:] / weight), names, q / weight, weight * run.period)
+
+
+def _gapless(run, mask):
+    """Stretches of samples in `mask` that follow one another without a loss."""
+    starts, ends = stretches(mask)
+    cuts = np.flatnonzero(~run.timeline.joined) + 1
+    for a, b in zip(starts, ends, strict=True):
+        edges = [a, *cuts[(cuts > a) & (cuts < b)], b]
+        yield from ((int(x), int(y)) for x, y in itertools.pairwise(edges))
+
+
+def rest_mask(run, moves):
+    """The samples of all rests after motions, shape (k,) bool."""
+    mask = np.zeros(run.time.size, bool)
+    for move in moves:
+        mask[move.end : move.rest] = True
+    return mask
+
+
+def predicted(run, q):
+    """Natural frequencies by the model at joint angles q: joints locked, and joints free, each ascending [Hz]."""
+    if run.model is None or not run.model.n_modes:
+        return {}
+    both = {"joints locked": True, "joints free": False}
+    return {name: run.model.frequencies(q, locked) / (2.0 * np.pi) for name, locked in both.items()}
+
+
+def peaks(spectrum_, most=4):
+    """Frequencies that stand out in the sum of all signals, the strongest first [Hz]."""
+    from scipy.signal import find_peaks
+
+    power = (spectrum_.density**2).sum(axis=1)
+    if power.size < 3 or not power.max() > 0.0:
+        return []
+    at = find_peaks(
+        np.log10(power + 1e-300), prominence=np.log10(OUTSTANDING), distance=4 * PADDED
+    )[0]
+    order = np.argsort(power[at])[::-1][:most]
+    return [float(spectrum_.frequency[i]) for i in at[order]]
+
+
+# The supervisor --------------------------------------------------------------------------------
+
+
+def episodes(run):
+    """Stretches in one state of the supervisor: (start [s], end [s], state, reason), state -1 where not known."""
+    if not run.has("controller/state"):
+        return []
+    change = np.flatnonzero(np.diff(run.state) != 0) + 1
+    starts = np.concatenate([[0], change])
+    ends = np.concatenate([change, [run.time.size - 1]])
+    reasons = run.contents.reasons
+    out = []
+    for a, b in zip(starts, ends, strict=True):
+        why = reasons[run.reason[a]] if run.reason[a] >= 0 else ""
+        out.append((float(run.time[a]), float(run.time[b]), int(run.state[a]), why))
+    return out
+
+
+def refusals(run):
+    """Where a reason of refusal came up: (time [s], state, reason)."""
+    if not run.has("controller/state"):
+        return []
+    reasons = run.contents.reasons
+    change = np.flatnonzero(np.diff(run.reason) != 0) + 1
+    rows = [int(i) for i in np.concatenate([[0], change]) if run.reason[i] >= 0]
+    return [
+        (
+            float(run.time[i]),
+            STATES[run.state[i]] if run.state[i] >= 0 else "?",
+            reasons[run.reason[i]],
+        )
+        for i in rows
+        if reasons[run.reason[i]]
+    ]

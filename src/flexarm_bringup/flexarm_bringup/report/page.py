@@ -1,0 +1,388 @@
+"""Writes the report's page: sentences and tables from the numbers, with the figures and the animation."""
+
+import json
+import math
+
+from jinja2 import Environment
+
+from flexarm_dynamics.errors import FlexarmError
+
+from . import analysis, animation, figures, template
+from .run import STATES
+
+#: A page is to be sent by mail: larger than this it must not be [bytes].
+LARGEST = 5_000_000
+#: Rows of the table of events.
+MOST_EVENTS = 200
+#: More runs than this can't be told apart.
+MOST_RUNS = len(figures.COLOURS)
+DEGREES = 180.0 / math.pi
+
+TERMS = (
+    (
+        "Tracking error",
+        "Reference less measured joint angle, over all samples in which the supervisor was TRACKING, HOLDING or"
+        " STOPPING (READY, if it was nothing else).",
+    ),
+    (
+        "Residual vibration",
+        f"Rms distance of the tip from its mean place that the links' bending makes, over up to {analysis.WINDOW:g} s"
+        f" of rest after each motion (rests shorter than {analysis.SHORTEST:g} s don't count), all motions together."
+        " From the modal amplitudes in the bag and the arm file's mode shapes.",
+    ),
+    (
+        "Peak deflection",
+        "The tip of a link against the straight line that its base points along, across the link.",
+    ),
+    (
+        "Samples lost",
+        "Numbers missing in the sequence that the source counts. The recorder's are those of which the bag has the"
+        " answering torque: the control loop had them.",
+    ),
+    (
+        "Compute time",
+        "As the controller told it in controller/state: its median, 99th percentile and maximum.",
+    ),
+    (
+        "Figures",
+        "Of long series the least and the greatest value of each of some hundred bins are drawn: peaks are kept. Lines"
+        " are broken where samples are missing.",
+    ),
+)
+
+
+def write(runs):
+    """The page as text.
+
+    Parameters
+    ----------
+    runs : list of Run
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    FlexarmError
+        For more runs than can be told apart, or a page that can't be made small enough.
+    """
+    if len(runs) > MOST_RUNS:
+        raise FlexarmError(f"{len(runs)} runs: at most {MOST_RUNS} can be told apart on a page")
+    moves = [analysis.motions(run) for run in runs]
+    label = _align(runs, moves)
+    numbers = [analysis.summary(run, m) for run, m in zip(runs, moves, strict=True)]
+    spectra = [_spectrum(run, m) for run, m in zip(runs, moves, strict=True)]
+    film = animation.data(runs)
+    for png in (False, True):
+        drawn = figures.draw(runs, moves, spectra, label, png)
+        page = _page(runs, numbers, spectra, drawn, film, label)
+        if len(page.encode()) <= LARGEST:
+            return page
+    raise FlexarmError(f"the page would be larger than {LARGEST} bytes: give fewer bags at once")
+
+
+def _align(runs, moves):
+    """Put time zero at the first motion, where every run has one; what the time counts from."""
+    if all(moves):
+        for run, m in zip(runs, moves, strict=True):
+            run.start_at(m[0].start)
+        return "from the start of the first motion"
+    return "from the first sample"
+
+
+def _spectrum(run, moves):
+    mask = analysis.rest_mask(run, moves)
+    found = analysis.spectrum(run, mask) if mask.any() else None
+    if found is None:
+        mask[:] = True
+        found = analysis.spectrum(run, mask)
+    return found
+
+
+def _page(runs, numbers, spectra, drawn, film, label):
+    shown = [
+        {
+            "label": run.label,
+            "colour": figures.colour(i),
+            "path": str(run.contents.path),
+            "description": f"arm {run.arm.name}" if run.arm is not None else "",
+        }
+        for i, run in enumerate(runs)
+    ]
+    filmed = [
+        s for s, run in zip(shown, runs, strict=True) if run.arm is not None and run.time.size > 1
+    ]
+    if film is not None:
+        film |= {
+            "colours": [s["colour"] for s in filmed],
+            "states": STATES,
+            "stateColours": figures.STATE_COLOURS,
+        }
+    events = _events(runs)
+    environment = Environment(autoescape=True, trim_blocks=True)
+    several = len(runs) > 1
+    return environment.from_string(template.PAGE).render(
+        title=f"{len(runs)} runs side by side" if several else f"Report of {runs[0].label}",
+        style=template.STYLE,
+        script=template.SCRIPT,
+        runs=shown,
+        short=short(runs, numbers),
+        notes=[f"{run.label}: {note}" if several else note for run in runs for note in run.notes],
+        rows=rows(runs, numbers),
+        film=None if film is None else json.dumps(film, allow_nan=False).replace("<", "\\u003c"),
+        film_runs=filmed,
+        film_caption=_film_caption(film, label),
+        figures=drawn,
+        frequencies=_frequencies(runs, spectra),
+        events=events[:MOST_EVENTS],
+        events_left=max(len(events) - MOST_EVENTS, 0),
+        time_label=label,
+        terms=TERMS,
+    )
+
+
+# Words and tables ------------------------------------------------------------------------------
+
+
+def digits(value, count=3):
+    """A number for reading; a dash for none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    text = f"{value:#.{count}g}"
+    if "e" in text and 1e-3 <= abs(value) < 1e6:
+        text = f"{value:.0f}"
+    return text.rstrip(".")
+
+
+def _several(count, noun):
+    return f"no {noun}s" if not count else f"one {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def short(runs, numbers):
+    """The story in sentences, one for each run, and what differs between them."""
+    lines = []
+    for run, m in zip(runs, numbers, strict=True):
+        parts = [f"{digits(m['duration_s'])} s at {digits(m['rate_hz'], 4)} Hz"]
+        parts.append(f"{_several(m['lost'], 'sample')} lost")
+        if m["motions"] or run.has("controller/state"):
+            parts.append(_several(m["motions"], "motion"))
+        text = f"{run.label}: {', '.join(parts)}."
+        if m["peak_error_rad"] and None not in m["peak_error_rad"]:
+            worst = max(range(len(m["peak_error_rad"])), key=lambda j: m["peak_error_rad"][j])
+            error = DEGREES * m["peak_error_rad"][worst]
+            text += f" Off the reference by at most {digits(error)}° ({run.joint_names[worst]})."
+        if m["residual_m"] is not None:
+            text += (
+                f" At rest after it, the tip vibrated by {digits(1e3 * m['residual_m'])} mm rms."
+            )
+        text += _torque_words(run, m)
+        if m["faults"]:
+            text += (
+                f" {_several(m['faults'], 'fault').capitalize()}, the first at {m['first_fault']}."
+            )
+        elif m["faults"] == 0:
+            text += " No faults."
+        lines.append(text)
+    return lines + _differences(runs, numbers)
+
+
+def _torque_words(run, m):
+    shares = [
+        (peak / limit, j)
+        for j, (peak, limit) in enumerate(
+            zip(m["peak_torque_Nm"], m["torque_limit_Nm"], strict=True)
+        )
+        if peak is not None and limit
+    ]
+    if not shares:
+        return ""
+    share, j = max(shares)
+    text = f" Up to {digits(100.0 * share)} % of the torque limit ({run.joint_names[j]})"
+    if m["saturation_share"]:
+        text += f"; it was met in {digits(100.0 * m['saturation_share'])} % of the samples"
+    return f"{text}."
+
+
+def _differences(runs, numbers):
+    """How much the best run is better than the worst."""
+    if len(runs) < 2:
+        return []
+    lines = []
+    for name, value in (
+        ("Residual vibration", lambda m: m["residual_m"]),
+        ("Peak tracking error", lambda m: _worst(m["peak_error_rad"])),
+    ):
+        known = [(value(m), run.label) for run, m in zip(runs, numbers, strict=True) if value(m)]
+        if len(known) > 1:
+            (low, best), (high, worst) = min(known), max(known)
+            ratio = high / low
+            if ratio >= 1.05:
+                lines.append(f"{name}: {best} has {digits(ratio)} times less than {worst}.")
+            else:
+                lines.append(f"{name}: the same within 5 % in all of them.")
+    return lines
+
+
+def _worst(values):
+    return max((v for v in values or () if v is not None), default=None)
+
+
+def _cell(text, small="", bad=False):
+    return {"text": text, "small": small, "bad": bad}
+
+
+def rows(runs, numbers):
+    """Rows of the summary table, a cell for each run."""
+    out = []
+
+    def group(name):
+        out.append({"group": name})
+
+    def row(name, cell):
+        cells = [cell(run, m) for run, m in zip(runs, numbers, strict=True)]
+        if any(c["text"] != "–" for c in cells):
+            out.append({"name": name, "cells": cells})
+
+    group("Record")
+    row("arm", lambda r, m: _cell(m["arm"] or "not known"))
+    row(
+        "duration [s]",
+        lambda r, m: _cell(digits(m["duration_s"], 4), f"in {_several(m['sessions'], 'session')}"),
+    )
+    row("rate [Hz]", lambda r, m: _cell(digits(m["rate_hz"], 4)))
+    row("samples", lambda r, m: _cell(str(m["samples"]), _repeats(m)))
+    row("samples lost", _lost)
+    row("motions", lambda r, m: _cell(str(m["motions"]) if r.has("controller/state") else "–"))
+    row("faults", _faults)
+    group("Tracking and vibration")
+    for key, name in (
+        ("peak_error_rad", "peak tracking error [deg]"),
+        ("rms_error_rad", "rms tracking error [deg]"),
+    ):
+        row(name, lambda r, m, key=key: _per_joint(r, m[key], DEGREES))
+    row("residual vibration of the tip, rms [mm]", _residual)
+    row("peak deflection of a link's tip [mm]", _deflection)
+    group("Torque and time")
+    row("peak torque [N m]", _peak_torque)
+    row("samples with the torque at a limit [%]", _saturation)
+    row("compute time, median / 99 % / most [ms]", _compute)
+    return [
+        r
+        for k, r in enumerate(out)
+        if "group" not in r or (k + 1 < len(out) and "group" not in out[k + 1])
+    ]
+
+
+def _repeats(m):
+    words = []
+    if m["repeated"]:
+        words.append(f"{m['repeated']} sent again")
+    if m["clock_jumps"]:
+        words.append(f"{_several(m['clock_jumps'], 'jump')} of the clock")
+    return ", ".join(words)
+
+
+def _lost(run, m):
+    if not m["lost"]:
+        return _cell("0")
+    share = f"({digits(100.0 * m['lost'] / (m['lost'] + m['samples']))} %"
+    missed = (
+        f", {m['lost_by_recorder']} missed by the recorder alone" if m["lost_by_recorder"] else ""
+    )
+    return _cell(str(m["lost"]), f"{share}{missed})", bad=m["lost"] > m["lost_by_recorder"])
+
+
+def _faults(run, m):
+    if m["faults"] is None:
+        return _cell("–")
+    return _cell(str(m["faults"]), m["first_fault"] or "", bad=m["faults"] > 0)
+
+
+def _per_joint(run, values, scale):
+    if not values:
+        return _cell("–")
+    if len(values) == 1:
+        return _cell(digits(None if values[0] is None else scale * values[0]))
+    texts = [digits(None if v is None else scale * v) for v in values]
+    return _cell(", ".join(texts), f"({', '.join(run.joint_names)})")
+
+
+def _residual(run, m):
+    if m["residual_m"] is None:
+        return _cell("–")
+    count = m["residual_windows"]
+    return _cell(digits(1e3 * m["residual_m"]), f"after {_several(count, 'motion')}")
+
+
+def _deflection(run, m):
+    if not m["peak_deflection_m"]:
+        return _cell("–")
+    values = m["peak_deflection_m"]
+    names = f"({', '.join(values)})" if len(values) > 1 else ""
+    return _cell(", ".join(digits(1e3 * v) for v in values.values()), names)
+
+
+def _peak_torque(run, m):
+    cell = _per_joint(run, m["peak_torque_Nm"], 1.0)
+    if any(m["torque_limit_Nm"]):
+        limits = ", ".join(digits(v) for v in m["torque_limit_Nm"])
+        cell["small"] = f"of {limits}"
+    return cell
+
+
+def _saturation(run, m):
+    share = m["saturation_share"]
+    return _cell("–" if share is None else digits(100.0 * share), bad=bool(share))
+
+
+def _compute(run, m):
+    if m["compute_time_s"] is None:
+        return _cell("–")
+    late = m["rate_hz"] is not None and m["compute_time_s"][1] * m["rate_hz"] > 1.0
+    return _cell(" / ".join(digits(1e3 * v) for v in m["compute_time_s"]), bad=late)
+
+
+def _frequencies(runs, spectra):
+    out = []
+    for run, s in zip(runs, spectra, strict=True):
+        if s is None:
+            continue
+        top = 0.5 / run.period
+        known = analysis.predicted(run, s.configuration)
+        cells = [
+            [f for f in known.get(f"joints {case}", ()) if f < top][:6]
+            for case in ("locked", "free")
+        ]
+        measured = [digits(f, 4) for f in analysis.peaks(s)] or ["none stands out"]
+        out.append(
+            [
+                run.label,
+                ", ".join(measured),
+                *(", ".join(digits(f, 4) for f in c) or "–" for c in cells),
+            ]
+        )
+    return out
+
+
+def _events(runs):
+    found = []
+    for run in runs:
+        told = [(a, state, why) for a, _, state, why in analysis.episodes(run) if state >= 0]
+        told += [(t, STATES.index(s), why) for t, s, why in analysis.refusals(run) if s in STATES]
+        for t, state, why in dict.fromkeys(told):
+            found.append((run.label, t, STATES[state], why))
+    found.sort(key=lambda e: (e[1], e[0]))
+    return [(label, f"{t:.3f}", state, why) for label, t, state, why in found]
+
+
+def _film_caption(film, label):
+    if film is None:
+        return ""
+    return (
+        f"From {film['start']:.2f} s to {film['end']:.2f} s {label}. Coloured: the arm, its deflection exaggerated by"
+        " the factor shown; grey: the same joint angles without bending; dashed: the reference. Drag to turn, double"
+        " click to turn back, space to play, click into a figure to go to that time."
+    )

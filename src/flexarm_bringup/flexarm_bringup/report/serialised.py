@@ -1,0 +1,234 @@
+"""Columns of numbers out of serialised messages, many at a time.
+
+Messages of one topic have nearly always the same layout: the same names, arrays as long as the last time. The
+first one of a layout is walked field by field (XCDR1, as ROS 2 writes it: a number is aligned to its size,
+counted from the end of the four bytes of encapsulation); of the others it is checked only that every byte which
+is neither a number nor in a text of its own is the same, and the numbers are taken out of all of them at once.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.errors import MessageError
+
+_SIZES = {"bool": 1, "uint8": 1, "int8": 1, "byte": 1, "char": 1, "uint16": 2, "int16": 2}
+_SIZES |= {"uint32": 4, "int32": 4, "float32": 4, "uint64": 8, "int64": 8, "float64": 8}
+_CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2"}
+_CODES |= {"int16": "i2", "uint32": "u4", "int32": "i4", "float32": "f4", "uint64": "u8"}
+_CODES |= {"int64": "i8", "float64": "f8"}
+#: A message with more numbers in an array than this is broken.
+LONGEST = 100_000
+#: So many layouts of messages of one length are remembered: orders of names.
+MOST_LAYOUTS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the numbers of a message are.
+
+    Attributes
+    ----------
+    numbers : dict
+        Field to (offset, dtype, count); count is None for a single number.
+    texts : dict
+        Field to the (start, end) of a text, which is as long, but need not be the same, in every message.
+    names : dict
+        Field to a tuple of str, the same in every message.
+    fixed : ndarray of int
+        Offsets of the bytes that are the same in every message of this layout: lengths and names.
+    pattern : ndarray of uint8
+        Those bytes.
+    length : int
+    """
+
+    numbers: dict
+    texts: dict
+    names: dict
+    fixed: np.ndarray
+    pattern: np.ndarray
+    length: int
+
+    def matches(self, block):
+        """Which rows of bytes (k, length) have this layout, shape (k,) bool."""
+        return (block[:, self.fixed] == self.pattern).all(axis=1)
+
+    def column(self, block, field):
+        """A field of all rows: shape (k,) or (k, count)."""
+        offset, dtype, count = self.numbers[field]
+        width = dtype.itemsize * (1 if count is None else count)
+        bytes_ = np.ascontiguousarray(block[:, offset : offset + width])
+        values = bytes_.view(dtype)
+        return values[:, 0] if count is None else values
+
+    def text(self, block, field):
+        """The different texts of a field, and which one each row has, shape (k,)."""
+        start, end = self.texts[field]
+        if end == start:
+            return [""], np.zeros(len(block), int)
+        bytes_ = np.ascontiguousarray(block[:, start:end]).view(f"V{end - start}")[:, 0]
+        different, which = np.unique(bytes_, return_inverse=True)
+        return [readable(t.tobytes()) for t in different], which.reshape(-1)
+
+
+def readable(raw):
+    """The text of a string's bytes."""
+    return bytes(raw).rstrip(b"\0").decode(errors="replace")
+
+
+class _Walker:
+    def __init__(self, raw, store):
+        self.raw, self.store = raw, store
+        self.order = "<" if raw[1] & 1 else ">"
+        self.at, self.numbers, self.texts, self.names, self.moving = 4, {}, {}, {}, []
+
+    def message(self, kind, prefix=""):
+        for name, field in self.store.fielddefs[kind][1]:
+            self.field(prefix + name, *field)
+
+    def field(self, path, node, what):
+        kind = node.name
+        if kind == "NAME":
+            self.message(what, f"{path}.")
+        elif kind == "BASE":
+            if what[0] == "string":
+                start, end = self.text()
+                self.texts[path] = (start, end)
+                self.moving.append((start, end))
+            else:
+                self.number(path, what[0], None)
+        else:
+            (node, what), size = what
+            count = size if kind == "ARRAY" else self.length()
+            if count > LONGEST:
+                raise MessageError(f"{path} has {count} entries")
+            if node.name == "BASE" and what[0] != "string":
+                self.number(path, what[0], count)
+            elif node.name == "BASE":
+                parts = [self.text() for _ in range(count)]
+                self.names[path] = tuple(readable(self.raw[a:b]) for a, b in parts)
+            else:
+                for i in range(count):
+                    self.field(f"{path}[{i}]", node, what)
+
+    def align(self, size):
+        start = self.at
+        self.at += -(self.at - 4) % size
+        self.moving.append((start, self.at))  # padding holds anything
+
+    def length(self):
+        self.align(4)
+        self.at += 4
+        return struct.unpack_from(self.order + "I", self.raw, self.at - 4)[0]
+
+    def text(self):
+        """Where a string's bytes are, with the zero at their end."""
+        length = self.length()
+        self.at += length
+        if self.at > len(self.raw):
+            raise MessageError("a text goes beyond the message's end")
+        return self.at - length, self.at
+
+    def number(self, path, kind, count):
+        size = _SIZES[kind]
+        if count != 0:
+            self.align(size)
+        end = self.at + size * (1 if count is None else count)
+        if end > len(self.raw):
+            raise MessageError(f"{path} goes beyond the message's end")
+        self.numbers[path] = (self.at, np.dtype(self.order + _CODES[kind]), count)
+        self.moving.append((self.at, end))
+        self.at = end
+
+
+def layout_of(raw, kind, store):
+    """The layout of one serialised message.
+
+    Parameters
+    ----------
+    raw : bytes
+    kind : str
+        Such as ``flexarm_msgs/msg/ArmState``.
+    store : rosbags.typesys.store.Typestore
+
+    Raises
+    ------
+    MessageError
+        When these bytes are no such message.
+    """
+    if len(raw) < 4:
+        raise MessageError(f"no {kind}: {len(raw)} bytes")
+    walker = _Walker(raw, store)
+    try:
+        walker.message(kind)
+    except (struct.error, IndexError, KeyError) as error:
+        raise MessageError(f"no {kind}: {error}") from None
+    fixed = np.ones(len(raw), bool)
+    for start, end in walker.moving:
+        fixed[start:end] = False
+    fixed[:4] = fixed[walker.at :] = False  # encapsulation; padding at the end
+    fixed[1] = True  # the order of bytes
+    data = np.frombuffer(raw, np.uint8)
+    where = np.flatnonzero(fixed)
+    return Layout(walker.numbers, walker.texts, walker.names, where, data[where].copy(), len(raw))
+
+
+class Decoder:
+    """Turns serialised messages of one type into columns, remembering their layouts.
+
+    Parameters
+    ----------
+    kind : str
+    store : Typestore
+    """
+
+    def __init__(self, kind, store):
+        self.kind, self.store, self._layouts = kind, store, {}
+        self.broken = 0
+
+    def groups(self, messages):
+        """Yield (rows, layout, block) for messages that are alike; what can't be read is counted in `broken`.
+
+        Parameters
+        ----------
+        messages : list of bytes
+
+        Yields
+        ------
+        rows : ndarray of int
+            Which of the messages.
+        layout : Layout
+        block : ndarray of uint8, shape (rows, length)
+        """
+        lengths = np.array([len(m) for m in messages])
+        for length in np.unique(lengths):
+            rows = np.flatnonzero(lengths == length)
+            block = np.frombuffer(b"".join(messages[i] for i in rows), np.uint8)
+            block = block.reshape(len(rows), length)
+            for layout in list(self._layouts.get(length, ())):
+                if rows.size:
+                    same = layout.matches(block)
+                    if same.any():
+                        yield rows[same], layout, block[same]
+                        rows, block = rows[~same], block[~same]
+            while rows.size:
+                layout = self._new(block[0].tobytes())
+                if layout is None:  # each of them costs a walk
+                    self.broken += 1
+                    rows, block = rows[1:], block[1:]
+                    continue
+                same = layout.matches(block)
+                yield rows[same], layout, block[same]
+                rows, block = rows[~same], block[~same]
+
+    def _new(self, raw):
+        try:
+            layout = layout_of(raw, self.kind, self.store)
+        except MessageError:
+            return None
+        known = self._layouts.setdefault(len(raw), [])
+        known.append(layout)
+        if len(known) > MOST_LAYOUTS:
+            known.pop(0)
+        return layout
