@@ -229,7 +229,7 @@ SCRIPT = r"""
   scrub.addEventListener("input", function () {
     time = film.start + (film.end - film.start) * scrub.value / (film.frames - 1); draw();
   });
-  factorBar.max = Math.log10(5 * film.factor); factorBar.value = Math.log10(film.factor);
+  factorBar.max = Math.log10(20 * film.factor); factorBar.value = Math.log10(film.factor);
   function setFactor() { factor = Math.pow(10, factorBar.value); factorText.textContent = "× " + shown(factor); }
   factorBar.addEventListener("input", function () { setFactor(); draw(); });
   document.getElementById("true").addEventListener("click", function () {
