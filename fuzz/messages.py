@@ -105,7 +105,11 @@ class States(Reader):
     """`StateReader`: names in any order, lengths, everything beside."""
 
     name, share, error = "state message", 18.0, MessageError
-    words = tuple(STATE_FIELDS) + tuple(f for fields in STATE_FIELDS.values() for f in fields)
+    words = (
+        "header.stamp",
+        *STATE_FIELDS,
+        *(field for fields in STATE_FIELDS.values() for field in fields),
+    )
 
     def __init__(self, arm="two_link"):
         self.arm = arm_file.load(arm)
