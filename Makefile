@@ -15,13 +15,14 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test bench compare latency fuzz soak lint clean distclean
+.PHONY: help build demo test docs bench compare latency fuzz soak lint clean distclean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make build      set up .venv and build the workspace; again: only what changed'
 	@echo 'make demo       build, then run the case study'
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
+	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then tune rivals on the same arms, and compare; COMPARE_ARGS=--quick'
 	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
@@ -48,6 +49,16 @@ test: build
 	python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS) $(wildcard src/*/test); units=$$?; \
 	python -m pytest -q $(PYTEST_ARGS) tests; nodes=$$?; \
 	case $$units$$nodes in 00|05|50) ;; *) exit 1 ;; esac
+
+# In a directory of its own: what Sphinx needs does not go with what colcon needs.
+DOCS_TOOLS := results/docs/tools
+docs: build $(DOCS_TOOLS)/.installed
+	@. tools/env.sh && PYTHONPATH="$(CURDIR)/$(DOCS_TOOLS):$$PYTHONPATH" python docs/build_site.py --out results/docs
+
+$(DOCS_TOOLS)/.installed: requirements/docs.txt | build
+	@rm -rf $(DOCS_TOOLS) && mkdir -p $(DOCS_TOOLS)
+	@. tools/env.sh && python -m pip install -q --disable-pip-version-check --no-deps --target $(DOCS_TOOLS) -r requirements/docs.txt
+	@touch $@
 
 # Its peers are no business of the other targets.
 bench: build

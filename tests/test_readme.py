@@ -1,4 +1,4 @@
-"""Every command of the README: what it starts exists, what it publishes moves the arm."""
+"""Every command of the README and the guide: what it starts exists, what it publishes moves the arm."""
 
 import contextlib
 import os
@@ -24,7 +24,10 @@ from flexarm_bringup.processes import Processes, executable, installed, own_doma
 from flexarm_msgs.msg import CompositeState
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = "".join(
+    (ROOT / page).read_text(encoding="utf-8") for page in ("README.md", "docs/guide.md")
+)
+PARAMETERS = ROOT / "docs" / "parameters.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
 COMMANDS = [line for kind, text in BLOCKS if kind == "sh" for line in text.splitlines() if line]
 
@@ -34,7 +37,7 @@ def words_of(command):
 
 
 def starting(*prefix):
-    """Commands of the README that begin with these words."""
+    """Commands of README and guide that begin with these words."""
     return [c for c in COMMANDS if words_of(c)[: len(prefix)] == list(prefix)]
 
 
@@ -83,16 +86,15 @@ def test_executables_and_launch_files_named_in_the_text_are_installed():
 
 
 def test_paths_named_in_the_text_exist():
-    for path in re.findall(r"\]\((docs/[^)#]+)\)", README):
-        assert (ROOT / path).is_file(), path
     for path in re.findall(r"`((?:src|config|tools|docs)/[\w/.]+)`", README):
         assert (ROOT / path).exists(), path
 
 
 def test_parameter_tables_are_those_of_the_declarations():
-    between = README.split(parameter_tables.BEGIN)[1].split(parameter_tables.END)[0]
+    text = PARAMETERS.read_text(encoding="utf-8")
+    between = text.split(parameter_tables.BEGIN)[1].split(parameter_tables.END)[0]
     assert between.strip() == parameter_tables.tables(), (
-        "run: ./flexarm parameters --write README.md"
+        "run: ./flexarm parameters --write docs/parameters.md"
     )
 
 
@@ -101,7 +103,7 @@ PATIENCE = ["-p", "state_timeout:=60.0", "-p", "max_gap:=60.0"]
 
 @contextlib.contextmanager
 def started(commands, directory):
-    """The three nodes, by the README's own commands, in real time."""
+    """The three nodes, by the guide's own commands, in real time."""
     with own_domain() as domain, Processes(domain, directory) as processes:
         for command in commands:
             _, _, package, name, *rest = words_of(command)
@@ -182,7 +184,7 @@ def test_param_set_example_is_taken(arm, command):
 
 
 def publish(line, command):
-    """Run a publish command of the README beside a running controller."""
+    """Run a publish command of the guide beside a running controller."""
     before = line.accepted()
     done = subprocess.run(
         [sys.executable, "-m", "flexarm_bringup.cli", *words_of(command)[1:]],

@@ -224,7 +224,7 @@ def parser():
         "parameters",
         help="tables of all parameters, from their declarations",
         description="Prints every node's parameters as Markdown, or writes them between a file's markers.",
-        epilog="example: flexarm parameters --write README.md",
+        epilog="example: flexarm parameters --write docs/parameters.md",
     )
     parameters.add_argument("--write", metavar="FILE", help="rewrite the tables of this file")
     parameters.set_defaults(function=_parameters)

@@ -122,7 +122,7 @@ def arc(model, start, via, end, law, bent=True) -> TipPath:
 def circle(begin, via, end):
     """Return the circle through three points as a function of s: `begin` at 0, `end` at 1.
 
-    The centre c is where |c - begin| = |c - via| = |c - end| in the plane of the three.
+    The centre c is where ``|c - begin| = |c - via| = |c - end|`` in the plane of the three.
     """
     a, b = via - begin, end - begin
     normal = np.cross(a, b)

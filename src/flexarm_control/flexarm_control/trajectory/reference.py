@@ -313,10 +313,10 @@ class ReferenceGenerator:
 
         Each joint's velocity follows the cubic from its present velocity v and acceleration a to
         rest, the position its integral, over the shortest time T in which no acceleration
-        exceeds D = max(deceleration, |a|): with w = v / T and v >= 0 that is
-        (3 w + a)^2 = 3 D (2 w + a), from a = 0 T = 1.5 |v| / D. T is rounded up to the next
+        exceeds ``D = max(deceleration, |a|)``: with w = v / T and v >= 0 that is
+        (3 w + a)^2 = 3 D (2 w + a), from a = 0 ``T = 1.5 |v| / D``. T is rounded up to the next
         `BRAKING_STEP`: a joint that is nearly at rest while it accelerates may move on by up to
-        |a| T^2 / 12.
+        ``|a| T^2 / 12``.
 
         All trajectories are cancelled; offered again, they are new.
 

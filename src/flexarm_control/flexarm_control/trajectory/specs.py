@@ -3,9 +3,9 @@
 A family's name, a colon, and its settings; where a setting has a value per joint (or per axis), they are
 separated by semicolons. Everything but a family's required settings may be left out:
 
-=============  =============================  ==========================================================
+============== ============================== ==========================================================
 family         settings                       motion
-=============  =============================  ==========================================================
+============== ============================== ==========================================================
 paper          to, duration                   the case study's, `profiles.paper_profile`
 quintic        to, duration                   `profiles.quintic`
 smooth         to, duration, smoothness       `profiles.smooth`
@@ -13,7 +13,7 @@ least-exciting to, duration, torque-limit,    `least_exciting.least_exciting`
                velocity-limit
 line           tip, duration, smoothness      the tip on a straight line, `tip_paths`
 arc            tip, via, duration, smoothness the tip on a circle through a point on the way
-=============  =============================  ==========================================================
+============== ============================== ==========================================================
 
 All of them take ``from`` (joint angles where the motion starts), ``shaper`` (zv, zvd), ``shape-modes`` (how many of
 the arm's lowest modes it is for) and ``points``.
