@@ -13,8 +13,8 @@ from flexarm_bringup.shape.drawing import Drawer, Trail
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
 
-#: Pictures per second.
-RATE = 30.0
+#: Pictures per second, and the most of them.
+RATE, MOST = 30.0, 100.0
 #: Points of the tip's way.
 TRAIL = 300
 #: How far the first target is from where the arm is [rad].
@@ -48,7 +48,13 @@ def add_arguments(parser):
         help="the simulator waits for each torque: for a machine too busy for real time",
     )
     add("--namespace", default="", help="with --attach: of the nodes that run")
-    add("--port", type=int, default=8080, help="of the page, on 127.0.0.1 (default 8080)")
+    add(
+        "--port",
+        type=int,
+        default=8080,
+        help="of the page, on 127.0.0.1 (default 8080; 0: a free one)",
+    )
+    add("--rate", type=float, default=RATE, help=f"pictures per second (default {RATE:g}) [Hz]")
     add("--no-open", action="store_true", help="open no browser, only say where the page is")
 
 
@@ -81,11 +87,12 @@ def check(options):
     ------
     FlexarmError
     """
+    if not 0.1 <= options.rate <= MOST:
+        raise ParameterError(f"--rate {options.rate:g}: from 0.1 to {MOST:g} pictures per second")
     if options.attach:
-        if options.controller:
-            raise ParameterError(
-                "--controller: not with --attach, where the controller runs already"
-            )
+        for name in ("controller", "lockstep"):
+            if getattr(options, name):
+                raise ParameterError(f"--{name}: not with --attach, where the nodes run already")
         return
     if options.namespace:
         raise ParameterError("--namespace: only with --attach")
@@ -154,7 +161,7 @@ class View:
             print("flexarm view: asking the controller for its arm", flush=True)
             self.link.find_arm(self._open)
         while True:
-            self.link.serve(1.0 / RATE)
+            self.link.serve(1.0 / self.options.rate)
             if self.processes is not None:
                 self.processes.check()
             if self.page is not None:

@@ -52,7 +52,7 @@ def of_parameters(values, ranges, hints, laws=None):
     ranges : mapping of str to (low, high)
     hints : mapping of str to str
     laws : mapping of str to set of str, optional
-        Prefix to the names that the law in use declares; others are left out.
+        Prefix to the names that the law in use declares; others are left out. All of a prefix that is not in it stay.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def of_parameters(values, ranges, hints, laws=None):
         prefix = name.split(".")[0] + "."
         if prefix not in LAWS or name not in ranges:
             continue
-        if laws and name[len(prefix) :] not in laws.get(prefix, ()):
+        if laws and prefix in laws and name[len(prefix) :] not in laws[prefix]:
             continue
         many = isinstance(value, (list, tuple))
         for i, number in enumerate(value if many else [value]):

@@ -104,8 +104,8 @@ class Page:
             show_share_button=False,
             brand_color=(28, 126, 214),
         )
-        eye = (0.3, -0.85, 1.35) if flat else (0.9, -1.3, 0.7)
-        look = (0.3, 0.1, 0.0) if flat else (0.25, 0.0, 0.1)
+        eye = (0.35, -1.05, 1.7) if flat else (0.9, -1.5, 0.8)
+        look = (0.35, 0.1, 0.0) if flat else (0.25, 0.0, 0.1)
         camera = self.server.initial_camera
         camera.position, camera.look_at = (tuple(r * np.array(v)) for v in (eye, look))
         scene.set_up_direction("+z")
