@@ -313,8 +313,12 @@ def demo(directory, show, nodes=True):
         }
     with open(directory / "summary.json", "w", encoding="utf-8") as file:
         json.dump(summary, file, indent=1, allow_nan=False)
+    report = None
+    if nodes:
+        show.step("report of the composite and the slow control")
+        report = _report(directory)
     show.done()
-    _print_tables(summary, references, figures, directory)
+    _print_tables(summary, references, figures, directory, report)
     return summary
 
 
@@ -338,6 +342,14 @@ def _relay(directory):
     return relay.measure("R", directory / "relay_log", recorder=LockstepRun)
 
 
+def _report(directory):
+    """A page of the story's two runs, from their bags."""
+    from .report.command import make
+
+    bags = [directory / f"R_m11_{control}" / "bag" for control in ("composite", "slow")]
+    return make(bags, directory / "report.html")
+
+
 def _figures(directory, records):
     from . import figures
 
@@ -354,7 +366,7 @@ def _figures(directory, records):
     return made
 
 
-def _print_tables(summary, references, figures, directory):
+def _print_tables(summary, references, figures, directory, report):
     print("\n".join(["", *linear_table(summary["runs"]), ""]))
     print("\n".join([*nonlinear_table(summary["runs"], references), ""]))
     if "lockstep" in summary:
@@ -363,9 +375,18 @@ def _print_tables(summary, references, figures, directory):
             f"Lockstep: {1e3 * l['seconds_per_sample']:.2f} ms a sample; a bare relay of the same messages:"
             f" {1e3 * l['bare_relay_seconds_per_sample']:.2f} ms; ratio {l['ratio']:.2f}\n"
         )
+    if report is not None:
+        print(f"Look at  {report} in a browser: composite beside slow control, with an animation")
     print(f"Look at  {figures[-1]}")
     print(f"         {len(figures)} figures, PNG and SVG, in {directory / 'figures'}")
     if (directory / "R_m11_composite" / "bag").is_dir():
         print(f"Bags     {directory}/<run>/bag (MCAP): open in PlotJuggler or Foxglove")
     print(f"Numbers  {directory / 'summary.json'}")
-    print("Next     start the nodes yourself and move the arm: README.md, 'Run the nodes yourself'")
+    print("Next     flexarm view two_link: an arm in the browser, to handle")
+    bag = directory.parent / "mine"
+    print(f"         flexarm simulate R --controller composite --trajectory paper --bag {bag}")
+    if report is not None:
+        print(
+            f"         flexarm report {bag} {directory / 'R_m11_composite'}: yours beside the paper's"
+        )
+    print("         README.md, 'Run the nodes yourself'; docs/ for the rest")

@@ -14,6 +14,8 @@ WINDOW, SHORTEST = 3.0, 0.5
 SEGMENT, SHORTEST_SEGMENT = 8.0, 1.0
 #: Spectra are padded to so many times their length: that draws a line between the frequencies they resolve.
 PADDED = 4
+#: So many natural frequencies count.
+LOWEST = 6
 #: A measured frequency is told when it stands out of its neighbourhood by this factor of power.
 OUTSTANDING = 10.0
 
@@ -313,11 +315,18 @@ def predicted(run, q):
     return {name: run.model.frequencies(q, locked) / (2.0 * np.pi) for name, locked in both.items()}
 
 
-def peaks(spectrum_, most=4):
-    """Frequencies that stand out in the sum of all signals, the strongest first [Hz]."""
+def highest(run, cases):
+    """Up to which frequency there is something to tell: well above the lowest of `predicted` [Hz]."""
+    nyquist = 0.5 / run.period
+    known = [f for values in cases.values() for f in values[:LOWEST]]
+    return float(min(nyquist, 2.0 * max(known)) if known else min(nyquist, 100.0))
+
+
+def peaks(spectrum_, top=np.inf, most=4):
+    """Frequencies up to `top` that stand out in the sum of all signals, the strongest first [Hz]."""
     from scipy.signal import find_peaks
 
-    power = (spectrum_.density**2).sum(axis=1)
+    power = (spectrum_.density[spectrum_.frequency <= top] ** 2).sum(axis=1)
     if power.size < 3 or not power.max() > 0.0:
         return []
     at = find_peaks(

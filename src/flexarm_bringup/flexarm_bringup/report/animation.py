@@ -121,7 +121,7 @@ def window(runs):
         start, end = middle - 2.0, middle + LONGEST
     start = max(start, min(run.time[0] for run in runs))
     end = min(end, start + LONGEST, max(run.time[-1] for run in runs))
-    return float(start), float(end)
+    return float(round(start, 6)) + 0.0, float(end)
 
 
 def film(run, times):

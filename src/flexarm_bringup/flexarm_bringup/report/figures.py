@@ -298,7 +298,7 @@ class _Paper:
         columns = 2 if len(names) > 1 else 1
         figure, axes = self._grid(-(-len(names) // columns), columns, 2.3)
         lines = [(i, r, analysis.predicted(r, s.configuration)) for i, r, s in there]
-        top = _highest(there, lines)
+        top = min(analysis.highest(r, cases) for _, r, cases in lines)
         low = max(min(s.frequency[0] for _, _, s in there) * analysis.PADDED / 2.0, 0.05)
         entries = self._entries()
         for j, name in enumerate(names):
@@ -498,13 +498,6 @@ def _source(run):
         "arm_state": "as arm_state has it",
         "strain": "from the strains, by the arm file",
     }[run.amplitude_source]
-
-
-def _highest(there, lines):
-    """Up to which frequency spectra are drawn [Hz]."""
-    nyquist = min(0.5 / r.period for _, r, _ in there)
-    known = [f for _, _, cases in lines for values in cases.values() for f in values[:6]]
-    return min(nyquist, 2.0 * max(known)) if known else min(nyquist, 100.0)
 
 
 def _darker(name):

@@ -341,8 +341,8 @@ def _saturation(run, m):
 def _compute(run, m):
     if m["compute_time_s"] is None:
         return _cell("–")
-    late = m["rate_hz"] is not None and m["compute_time_s"][1] * m["rate_hz"] > 1.0
-    return _cell(" / ".join(digits(1e3 * v) for v in m["compute_time_s"]), bad=late)
+    period = "" if m["rate_hz"] is None else f"period {digits(1e3 / m['rate_hz'])}"
+    return _cell(" / ".join(digits(1e3 * v) for v in m["compute_time_s"]), period)
 
 
 def _frequencies(runs, spectra):
@@ -350,13 +350,13 @@ def _frequencies(runs, spectra):
     for run, s in zip(runs, spectra, strict=True):
         if s is None:
             continue
-        top = 0.5 / run.period
         known = analysis.predicted(run, s.configuration)
+        top = analysis.highest(run, known)
         cells = [
-            [f for f in known.get(f"joints {case}", ()) if f < top][:6]
+            [f for f in known.get(f"joints {case}", ()) if f < top][: analysis.LOWEST]
             for case in ("locked", "free")
         ]
-        measured = [digits(f, 4) for f in analysis.peaks(s)] or ["none stands out"]
+        measured = [digits(f, 4) for f in analysis.peaks(s, top)] or ["none stands out"]
         out.append(
             [
                 run.label,
