@@ -174,6 +174,11 @@ def run_nodes(run, directory, progress=lambda fraction: None):
     -------
     record : Record
     timing : Timing
+
+    Raises
+    ------
+    FlexarmError
+        Where a node fails, or the arm is lost.
     """
     from . import lockstep, recorder
     from .processes import Processes, own_domain

@@ -246,6 +246,10 @@ def best_sets(rows, count, criterion):
     ----------
     rows : ndarray, shape (candidates, modes)
         Weighted.
+    count : int
+        Gauges of a set.
+    criterion : callable
+        Of the rows of a set: the less the better.
     """
     candidates = rows.shape[0]
     if comb(candidates, count) > MOST_SETS:

@@ -265,6 +265,8 @@ def measure(case, rounds, chains=tuple(CHAINS), relay_spin="executor", moving=Tr
 def summary(case, found):
     """Rows of the table of one case, and what they are made of.
 
+    `found` has the windows that were measured, by chain.
+
     Returns
     -------
     list of dict
@@ -336,6 +338,8 @@ def table(rows):
 
 def write(file, text):
     """Put the tables between the markers of a Markdown file.
+
+    `text` is the tables in Markdown.
 
     Raises
     ------

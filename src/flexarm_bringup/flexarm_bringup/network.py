@@ -85,6 +85,8 @@ class NetworkedLoop(ClosedLoop):
 
     Parameters
     ----------
+    *args
+        Those of `ClosedLoop`.
     network : Network
     **others
         Those of `ClosedLoop`, without `delay`.

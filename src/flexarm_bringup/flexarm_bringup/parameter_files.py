@@ -42,6 +42,11 @@ def load(name):
     -------
     dict
         Node name to flat parameters (``{"controller": {"slow.kp": [6.25], …}, …}``), wildcards applied.
+
+    Raises
+    ------
+    ParameterError
+        For a file that can't be read, or is none of parameters.
     """
     path = find(name)
     try:

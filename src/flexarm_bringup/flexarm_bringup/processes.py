@@ -29,6 +29,8 @@ class ProcessError(FlexarmError):
 def installed(*parts):
     """Path of an installed file, looked for in every sourced prefix.
 
+    The `parts` are of its path below the prefix.
+
     Raises
     ------
     ProcessError

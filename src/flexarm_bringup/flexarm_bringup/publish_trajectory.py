@@ -216,6 +216,8 @@ def publish(options, ros_args=None):
 
     With ``--dry-run`` or ``--out`` nothing is published: `prepare`.
 
+    `ros_args` go to rclpy as they are.
+
     Raises
     ------
     FlexarmError

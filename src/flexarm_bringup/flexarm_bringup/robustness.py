@@ -136,6 +136,8 @@ class Judge:
     def run(self, **disturbance):
         """One run; what `sweep` tells of each.
 
+        The `disturbance` is of fields of the scenario.
+
         Returns
         -------
         tuple of (float, float, float, str)

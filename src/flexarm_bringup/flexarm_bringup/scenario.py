@@ -286,6 +286,11 @@ def run_loop(scenario, bag=None):
     scenario : Scenario
     bag : str or Path, optional
         Folder of a rosbag2 bag that the run is written to, as the nodes would send it; must not exist.
+
+    Raises
+    ------
+    ParameterError
+        For a `repeat` that is no count; and as `run`.
     """
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
         raise ParameterError(f"repeat {scenario.repeat}: an integer not below 1 is wanted")

@@ -319,6 +319,8 @@ class ArmController:
     def brake(self, reason):
         """Bring the reference to rest smoothly, and hold it there; trajectories are given up.
 
+        The `reason` is what the log and the controller's state then give.
+
         Returns
         -------
         bool

@@ -290,6 +290,8 @@ def design(model, slow, fast, manifold=None, settings=None):
 def typed(given, prefix):
     """Split a mapping into its `type` and the parameters.
 
+    `given` is ``{"type": ..., parameters...}``, `prefix` that of its parameters, for the message.
+
     Raises
     ------
     ParameterError

@@ -59,6 +59,8 @@ class _Unpickler(pickle.Unpickler):
 def dumps(thing, arm):
     """A law, plan or the like as bytes; models of `arm` are left out.
 
+    The `thing` may hold the model many times over.
+
     Raises
     ------
     pickle.PicklingError, TypeError, AttributeError
@@ -131,6 +133,8 @@ class DesignProcess:
 
     def design(self, slow, fast, manifold=None, settings=None):
         """As `composite.design`, of this arm; warnings of the laws are still theirs to ask for.
+
+        `slow`, `fast`, `manifold` and `settings` as there.
 
         Raises
         ------

@@ -68,6 +68,8 @@ def least_travel(rows, gauges):
     """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
 
     Zero for gauges of different links or directions, and for a gauge beside itself.
+
+    `rows` are the gauges' rows of the strain map, (gauges, modes).
     """
     count = len(gauges)
     least = np.zeros((count, count))

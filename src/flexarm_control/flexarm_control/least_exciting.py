@@ -97,6 +97,8 @@ def least_exciting(
         If no time law keeps within the limits; names the least torque and the least duration that would do.
     DesignError
         If the programme does not settle.
+    ShapeError
+        For limits or a configuration of another length.
     """
     base = quintic(start, end, duration)
     if base.start.shape != (model.n_joints,):

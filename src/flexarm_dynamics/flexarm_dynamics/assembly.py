@@ -47,6 +47,8 @@ def packed(values, specs, sizes):
 
     Shapes are part of a record's type: with them fixed no array is passed or counted. Arrays are padded with
     zeros to the sizes given.
+
+    `specs` has the axes of each field, by the names of `sizes`.
     """
     fields = {name: np.asarray(value) for name, value in values._asdict().items()}
     shapes = {name: _shape(specs[name], sizes) for name in fields}
@@ -146,6 +148,8 @@ def shapes_of(link, direction, flexibility, load):
 
     The load of an inner link is averaged over the turns of the joints beyond: its mass sits at the tip, its
     inertia about the tip counts, its first moment does not.
+
+    `flexibility` is the arm file's for that direction: kind of shape and number of modes.
     """
     L, rho, modes = link.length, link.mass_per_length, flexibility.modes
     if direction == "twist":

@@ -331,6 +331,8 @@ class Chain(ArmModel):
         """Jacobian of a point's velocity and of its section's angular velocity, shape (6, n + m).
 
         Rows: linear [m/s], angular [rad/s], in the base frame; columns: (qd, delta_d).
+
+        The point is at `position` [m] along the link's axis, and off it by `offset` [m] in the section's frame.
         """
         return self._point(link, position, q, delta, offset)[1]
 

@@ -138,6 +138,8 @@ class ArmModel(ABC):
     def lockable_stepper(self, method):
         """As `stepper`, with `Stepper.lock`: for brakes.
 
+        `method` as there.
+
         Raises
         ------
         ModelError
@@ -159,6 +161,11 @@ class ArmModel(ABC):
         -------
         ArmModel
             Of the same class.
+
+        Raises
+        ------
+        ModelError
+            Where the model takes no other payload.
         """
         raise ModelError(f"model {self.arm.model} takes no other payload than its arm file's")
 
@@ -178,6 +185,11 @@ class ArmModel(ABC):
         Returns
         -------
         ndarray, shape (2 (n + m),)
+
+        Raises
+        ------
+        ShapeError
+            For a state of another length.
         """
         n, m = self.n_joints, self.n_modes
         if np.shape(state) != (2 * (n + m),):
@@ -426,6 +438,11 @@ def damping_matrix(M22, K, ratios):
     Returns
     -------
     ndarray, shape (m, m)
+
+    Raises
+    ------
+    ModelError
+        For more ratios than modes, or one that is not allowed.
     """
     m = K.shape[0]
     if not len(ratios):

@@ -18,6 +18,8 @@ def importable(group):
     """Name to class of what can be imported; one broken package does not take the others with it.
 
     What can't be imported is an error when it is asked for, by `find`.
+
+    `group` is an entry-point group, ``flexarm.slow_laws`` say.
     """
     found = {}
     for name in names(group):

@@ -184,10 +184,12 @@ class TimeScales:
 
     @property
     def mu(self):
+        """The paper's estimate of the perturbation parameter [-]."""
         return float(np.max(np.abs(self.slow)) / np.min(np.abs(self.fast)))
 
     @property
     def separation(self):
+        """1/mu [-]; infinite where the slow subsystem stands still."""
         return float("inf") if self.mu == 0.0 else 1.0 / self.mu
 
 
@@ -230,6 +232,11 @@ def perturbation_parameter(slow_frequency, terms_along):
     Returns
     -------
     float
+
+    Raises
+    ------
+    DesignError
+        Where a fast eigenvalue is zero.
     """
     smallest = min(np.abs(np.linalg.eigvals(fast_subsystem(t)[0])).min() for t in terms_along)
     if smallest == 0.0:
@@ -281,6 +288,8 @@ def frequencies_and_damping(eigenvalues):
 
     Real poles are paired by ascending magnitude; one that is left alone counts as a pair of equal ones.
     Unstable pairs have a negative damping ratio.
+
+    The `eigenvalues` are of a real matrix, in any order [rad/s].
     """
     eigenvalues = np.asarray(eigenvalues)
     pairs = eigenvalues[eigenvalues.imag > 0.0]

@@ -187,6 +187,8 @@ class StrainMap:
         lost : tuple of int
             Indices of gauges, ascending, for which `possible_without` holds.
         strain : ndarray, shape (gauges,)
+        out : ndarray, shape (modes,), optional
+            Written and returned, where given.
 
         Returns
         -------

@@ -148,6 +148,7 @@ class ArmNode(LifecycleNode):
     # Life cycle ------------------------------------------------------------------------------
 
     def on_configure(self, state):
+        """Build the node's objects from its parameters; without success the node stays unconfigured."""
         try:
             self.build()
         except Exception as error:  # what is not ours, a user's law say, rclpy drops without a word
@@ -160,6 +161,7 @@ class ArmNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state):
+        """Let the node answer."""
         self.active, self.line = True, self._line
         self.start()
         # The objects made so far stay for good: the collector need not look at them on the control path.
@@ -168,15 +170,18 @@ class ArmNode(LifecycleNode):
         return super().on_activate(state)
 
     def on_deactivate(self, state):
+        """Stop answering; what was built stays."""
         self._halt()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state):
+        """Drop what was built."""
         self._unmake()
         self._line = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state):
+        """Stop, and drop what was built."""
         if self.active:
             self._halt()
         self._unmake()

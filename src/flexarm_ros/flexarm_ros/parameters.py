@@ -97,6 +97,8 @@ class NodeParameters:
     def resolve(self, sizes):
         """Check again with the lengths that are known once the arm is.
 
+        `sizes` maps the names that declarations give as lengths, ``joints`` say, to numbers.
+
         Raises
         ------
         ParameterError
@@ -147,6 +149,8 @@ class NodeParameters:
 
 def merge(*groups):
     """Declarations of several components under one prefix; a name means one thing.
+
+    `groups` are sequences of `Parameter`.
 
     Raises
     ------

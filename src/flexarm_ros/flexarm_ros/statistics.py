@@ -111,6 +111,8 @@ class Gaps:
         """Note the number of one sample.
 
         A new session begins anew; a sample that was sent again, or comes late, takes nothing back.
+
+        `sequence` is the sample's number in its `session`.
         """
         if session != self._session:
             self._session, self._sequence = session, sequence

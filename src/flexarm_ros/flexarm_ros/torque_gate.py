@@ -129,6 +129,8 @@ class TorqueGate:
     def offer(self, message, now):
         """Take a `JointTorque` message, or say why not.
 
+        `now` is the driver's own steady clock [s].
+
         Returns
         -------
         str

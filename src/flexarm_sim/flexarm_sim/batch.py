@@ -35,6 +35,11 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
     -------
     ndarray, shape (b, s + 1, 2 (n + m))
         What is no longer finite went beyond what the model or the step holds for.
+
+    Raises
+    ------
+    ShapeError
+        For arrays that don't fit the models.
     """
     states = np.atleast_2d(np.asarray(states, float))
     count, size = states.shape

@@ -110,6 +110,8 @@ PARAMETERS = (
 def permutation(what, given, wanted):
     """Where each of the `wanted` names stands in `given`; as it is where no names are given.
 
+    `what` is the parameter's name, for the message.
+
     Raises
     ------
     ParameterError

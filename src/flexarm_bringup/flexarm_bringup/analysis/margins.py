@@ -147,6 +147,8 @@ def _beside(kind, value, share):
 def by_runs(subject, kind, value):
     """What nonlinear runs say of a margin.
 
+    `kind` is the margin's name, `value` what the linear loop says.
+
     Returns
     -------
     dict

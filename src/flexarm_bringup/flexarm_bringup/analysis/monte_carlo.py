@@ -88,6 +88,8 @@ def draw(spec, number):
 def sample(spec, number):
     """Run a sample; for other processes, too.
 
+    `spec` says what is drawn, `number` which sample it is.
+
     Returns
     -------
     dict

@@ -156,6 +156,8 @@ def spectra(subject, slow):
 def gain_sweep(subject, factors=GAINS):
     """What a faster slow loop does to the bending: full-order poles over slow.kp, kv critically damped.
 
+    `factors` are of slow.kp [-].
+
     Returns
     -------
     dict

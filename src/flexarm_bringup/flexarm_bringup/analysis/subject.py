@@ -166,6 +166,8 @@ def first_loss(stable, start, end, scan=12, steps=20):
         Of the value; a bool.
     start, end : float
         Both above 0: the scan is geometric; otherwise even.
+    scan, steps : int
+        Intervals of the scan, and halvings of the one that holds the loss.
 
     Returns
     -------

@@ -161,6 +161,7 @@ class Conversation:
         return self._publisher.get_subscription_count() > 0
 
     def close(self):
+        """Leave the domain."""
         import rclpy
 
         self._executor.shutdown()
@@ -202,6 +203,8 @@ class Examination:
 
     def move(self, angle):
         """Push every joint; then see what the driver does without torque and with wrong ones.
+
+        `angle` is about how far a push leads [rad].
 
         Raises
         ------

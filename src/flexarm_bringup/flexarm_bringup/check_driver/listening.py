@@ -354,6 +354,8 @@ def check_frozen_strain(arm, samples, span=None):
 
     Parameters
     ----------
+    arm : Arm
+    samples : Samples
     span : ndarray, shape (gauges,), optional
         What the model's strains vary by over these samples; not given: a joint in motion bends every link.
     """
@@ -380,6 +382,8 @@ def check_frozen_strain(arm, samples, span=None):
 
 def check_listening(model, samples, tolerances):
     """All that listening can tell; `check_layout` has been passed.
+
+    The `samples` are what was heard, the `tolerances` those of the command line.
 
     Returns
     -------

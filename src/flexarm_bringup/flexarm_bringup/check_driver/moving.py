@@ -197,6 +197,8 @@ def replay(model, samples, sent, reported_holds):
 def match(measured, predicted):
     """Which prediction each measured signal is, up to its sign: the assignment with the least squares.
 
+    `measured` and `predicted` are (N, k), a column per signal.
+
     Returns
     -------
     order : ndarray of int, shape (k,)
@@ -241,6 +243,12 @@ def check_response(arm, push, samples, position, gain_error):
 
     Parameters
     ----------
+    arm : Arm
+    push : Push
+    samples : Samples
+        Since the push began.
+    gain_error : float
+        How far measured over predicted motion may be off 1 [-].
     position : ndarray, shape (N, n)
         Of the model [rad], see `replay`.
     """

@@ -241,6 +241,8 @@ def _shaped_screen(subject, values):
 def shaper_for(subject, gains, kind):
     """Shaper of the lowest modes that ring under the PID law, at the motion's end.
 
+    `kind` is zv or zvd.
+
     Raises
     ------
     DesignError
@@ -349,6 +351,8 @@ def allowed(subject):
 
 def prepared(subject, name, values):
     """Setup of a contender; a rival has no more torque than the shipped controller takes on this motion.
+
+    `name` is the contender's, `values` its tuned numbers.
 
     Raises
     ------

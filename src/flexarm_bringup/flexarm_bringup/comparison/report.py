@@ -140,6 +140,8 @@ def _table(head, rows):
 def write(found, file):
     """Put the tables between the markers of a Markdown file.
 
+    `found` is what the comparison gave, as in its JSON.
+
     Raises
     ------
     FlexarmError

@@ -88,6 +88,8 @@ class JointPid(Rival):
     gains : mapping of str to ndarray, shape (n,)
         ``p`` [N m/rad], ``i`` [N m/(rad s)], ``d`` [N m s/rad], ``i_clamp`` [N m], ``velocity`` [N m s/rad],
         ``acceleration`` [kg m^2].
+    seen : callable, optional
+        As in `Rival`.
     """
 
     def __init__(self, model, gains, seen=None):
@@ -143,6 +145,8 @@ class FullStateLqr(Rival):
         alpha, the prescribed degree of stability [1/s].
     feedforward : float
         Share of the rigid arm's torque for the reference's acceleration [-].
+    seen : callable, optional
+        As in `Rival`.
 
     Raises
     ------

@@ -100,6 +100,8 @@ def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
 def run(arms, seed=0, rate=250.0, settings=SETTINGS, progress=None):
     """Identify so many arms; one dict per parameter and derived value.
 
+    `settings` are those of the identification.
+
     Returns
     -------
     dict

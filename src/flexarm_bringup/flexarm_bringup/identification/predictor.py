@@ -131,6 +131,8 @@ def stepper(built):
 
     The straight-line code of a chain is written for its numbers: to compile it anew for each set of parameters
     would take longer than the motion.
+
+    `built` is the model.
     """
     method = integrators.METHODS[METHOD]
     return built.stepper(method, False) if isinstance(built, Chain) else built.stepper(method)

@@ -106,6 +106,8 @@ def _of(arm, name, kind, where, unit, dimension, least, low=0.0):
 def held(found, patterns):
     """Names of the quantities that match one of the patterns.
 
+    `found` has the quantities by name.
+
     Raises
     ------
     FlexarmError

@@ -151,6 +151,8 @@ def data(runs):
     """What the page's script draws: a mapping for JSON; None where no arm is known.
 
     Numbers are whole multiples of a `unit`, two bytes each, little endian, in base 64; -32768 is none.
+
+    The `runs` are drawn side by side.
     """
     runs = [run for run in runs if run.arm is not None and run.time.size > 1]
     if not runs:

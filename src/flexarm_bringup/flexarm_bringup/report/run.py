@@ -76,14 +76,17 @@ class Run:
 
     @property
     def joint_names(self):
+        """Of the arm file, in its order."""
         return self.contents.names["joint_names"]
 
     @property
     def gauge_names(self):
+        """Of the arm file, in its order."""
         return self.contents.names["gauge_names"]
 
     @property
     def mode_names(self):
+        """Of the arm file, in its order."""
         return self.contents.names["mode_names"]
 
     @property

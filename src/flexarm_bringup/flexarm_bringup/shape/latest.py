@@ -16,12 +16,15 @@ class Unserved(CallbackGroup):
     """Of subscriptions that no executor looks at."""
 
     def can_execute(self, entity):
+        """Whether an executor may take it: never."""
         return False
 
     def beginning_execution(self, entity):
+        """Nothing is begun."""
         return False
 
     def ending_execution(self, entity):
+        """Nothing has ended."""
         pass
 
 

@@ -17,4 +17,5 @@ class NoFastLaw(FastLaw):
 
     @property
     def K_f(self):
+        """Zeros, shape (n, 2m)."""
         return np.zeros((self.model.n_joints, 2 * self.model.n_modes))

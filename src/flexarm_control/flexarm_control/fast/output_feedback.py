@@ -170,6 +170,7 @@ class OutputFeedback(FastLaw):
 
     @property
     def K_f(self):
+        """Gain on the law's own estimate, shape (n, 2m) [N m/m, N m s/m]."""
         return self._K_f
 
     def gain(self, q):

@@ -118,6 +118,7 @@ class PolePlacement(FastLaw):
 
     @property
     def K_f(self):
+        """Gain of (15), shape (n, 2m) [N m/m, N m s/m]."""
         return self._K_f
 
 

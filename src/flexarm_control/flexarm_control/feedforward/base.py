@@ -77,6 +77,8 @@ class Feedforward(ABC):
         """Design work for a trajectory that will begin from a state of rest, (3, n); off the control path.
 
         Returns None where there is none to do.
+
+        `start` has position, velocity and acceleration of the reference where it begins [rad, rad/s, rad/s^2].
         """
         return None
 

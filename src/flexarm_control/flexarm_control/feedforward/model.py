@@ -125,6 +125,8 @@ class Preparation:
 def path_of(trajectory, start):
     """The path of a trajectory from a state of rest.
 
+    `start` has position, velocity and acceleration of the reference, (3, n).
+
     Raises
     ------
     DesignError

@@ -96,6 +96,8 @@ class Preview(ModelFeedforward):
     def prepare(self, trajectory, start):
         """Plan the motion of a trajectory; off the control path.
 
+        `start` as in the class above.
+
         Raises
         ------
         DesignError

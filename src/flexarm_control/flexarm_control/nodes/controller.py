@@ -455,6 +455,7 @@ class ControllerNode(ArmNode):
         self._torque_pub.wait_for_all_acked(LAST_WORD)
 
     def destroy_node(self):
+        """End the threads and the process of the designs, then the node."""
         self._ending = True
         for worker in (self._designer, self._receiver):
             worker.shutdown(wait=False, cancel_futures=True)

@@ -121,6 +121,7 @@ class AdaptiveModelFollowing(SlowLaw):
 
     @property
     def payload_scale(self):
+        """The estimate, in parts of the arm file's payload [-]."""
         return self.model.scale
 
     def _rates(self):

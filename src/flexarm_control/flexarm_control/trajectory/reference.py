@@ -258,6 +258,8 @@ class ReferenceGenerator:
         The same stamps after the same calls give the same bits. An earlier stamp than the last
         is allowed; before the start of what is followed, the state at that start is given.
 
+        `stamp_ns` is on the arm's clock [ns].
+
         Raises
         ------
         TrajectoryError

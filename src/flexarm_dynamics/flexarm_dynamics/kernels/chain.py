@@ -665,6 +665,8 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
     """Generalised forces that give the accelerations asked for (recursive Newton-Euler), after `prepare`.
 
     Joint friction, modal stiffness and modal damping are not in them.
+
+    `gravity` is (3,) [m/s^2]; `torque` (N,) and `modal` (N, K) are written.
     """
     N = d.links
     start(w, gravity)
@@ -896,6 +898,8 @@ def forward_dynamics(
 
     Joints with `driven` are moved with the given qdd; of the others qdd is written. `joint_extra` (N,) and
     `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix: the implicit integrator's.
+
+    `joint_force` is (N,) [N m], `modal_force` (N, K) [N, N m].
     """
     N = d.links
     payload(d, w)

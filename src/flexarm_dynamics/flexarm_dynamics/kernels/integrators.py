@@ -112,6 +112,8 @@ def low_storage(
 
     Parameters
     ----------
+    state, torque, change, step, substeps, weights, nodes, net, friction, data
+        As there.
     below : ndarray, shape (p,)
         Butcher coefficient of stage i - 1 in stage i; the first is not used.
     work : tuple of three ndarray, shape (2 (n + m),)

@@ -160,12 +160,15 @@ class Symbol:
         return 0.0 if _is(other, 0.0) else self._pair("/", other, self)
 
     def sin(self):
+        """The sine, as numpy asks it of an object."""
         return self.graph.symbol("np.sin", self)
 
     def cos(self):
+        """The cosine, as numpy asks it of an object."""
         return self.graph.symbol("np.cos", self)
 
     def sqrt(self):
+        """The square root, as numpy asks it of an object."""
         return self.graph.symbol("np.sqrt", self)
 
 
