@@ -1,6 +1,10 @@
-"""Draws the figures of docs/dynamics.md: ``. tools/env.sh; python docs/figures.py``."""
+"""Draws the figures of docs/dynamics.md and docs/tutorial/tuning.md: ``. tools/env.sh; python docs/figures.py``.
+
+``python docs/figures.py tuning`` draws one alone.
+"""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from flexarm_bringup import scenario
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.arm import Arm, Flexibility, Joint, Link, Payload
 from flexarm_sim.integrators import METHODS
@@ -109,6 +114,56 @@ def reference_arm(p, modes):
     return Arm("reference", joints, links, Payload(p["Mp"]))
 
 
+#: Title, and label to settings, of each row of the figure of gains.
+GAINS = (
+    (
+        "slow.kp, slow.kv: critically damped",
+        {f"kp {kp:g}, kv {2 * kp**0.5:.3g}": {"slow.kp": [kp], "slow.kv": [2 * kp**0.5]} for kp in (2.0, 6.25, 12.0)},
+    ),
+    ("fast.alpha", {f"alpha {a:g}": {"fast.alpha": a} for a in (1.0, 5.0, 12.0)}),
+    ("fast.q of the rates", {f"q of rates {q:g}": {"fast.q": [1.0, 1.0, q, q]} for q in (1.0, 100.0, 3000.0)}),
+    (
+        "manifold.type and feedforward",
+        {
+            "quasi_steady, none: the paper's": {"manifold.type": "quasi_steady"},
+            "corrected, none": {},
+            "corrected, preview": {"feedforward": "preview"},
+        },
+    ),
+)  # fmt: skip
+
+
+def tuning():
+    """What each gain does: arm R, 90 degrees in 2 s, with a third more payload than the controller knows of."""
+    shipped = scenario.parameters("composite") | {"feedforward": "none"}
+    arm = model.build(arm_file.load("R"))
+    shape = arm.mode_shapes(arm.arm.links[0].name, "y")(1.0)
+    figure, axes = plt.subplots(
+        len(GAINS), 2, figsize=(9.0, 9.5), sharex=True, layout="constrained"
+    )
+    for (title, cases), (left, right) in zip(GAINS, axes, strict=True):
+        for label, settings in cases.items():
+            run = scenario.Scenario(
+                "R", shipped | settings, "quintic:to=1.5708,duration=2", payload_scale=1.33
+            )
+            record, metrics = scenario.run(run)
+            error = np.degrees(record.reference - record.plant_position)[:, 0]
+            left.plot(record.time, error, lw=1.2, label=label)
+            right.plot(record.time, 1e3 * record.plant_amplitude @ shape, lw=1.2)
+            rest = metrics["residual_tip_rms_mm"]
+            print(f"{title}; {label}: peak {np.abs(error).max():.3f} deg, residual {rest:.3g} mm")
+        left.set_ylabel("joint error [°]")
+        right.set_ylabel("tip deflection [mm]")
+        left.set_title(title, fontsize=10, loc="left")
+        left.legend(fontsize=8)
+    for ax in axes.flat:
+        ax.grid(alpha=0.3)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+    figure.savefig(HERE / "tutorial" / "tuning.png", dpi=90)
+
+
 if __name__ == "__main__":
-    spin_up()
-    convergence()
+    for draw in (spin_up, convergence, tuning):
+        if not sys.argv[1:] or draw.__name__ in sys.argv[1:]:
+            draw()
