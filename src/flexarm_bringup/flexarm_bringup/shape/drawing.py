@@ -8,7 +8,7 @@ import numpy as np
 from flexarm_dynamics.sections import Sections
 
 #: Length of the arrow of a joint's whole torque limit, of the arm's [-].
-ARROW = 0.35
+ARROW = 0.6
 
 
 @dataclass(frozen=True)

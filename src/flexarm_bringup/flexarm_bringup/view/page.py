@@ -104,14 +104,13 @@ class Page:
             show_share_button=False,
             brand_color=(28, 126, 214),
         )
-        eye = (0.35, -1.05, 1.7) if flat else (0.9, -1.5, 0.8)
-        look = (0.35, 0.1, 0.0) if flat else (0.25, 0.0, 0.1)
+        eye = (0.3, -1.05, 1.05) if flat else (0.9, -1.5, 0.8)
+        look = (0.35, 0.12, 0.0) if flat else (0.25, 0.0, 0.1)
         camera = self.server.initial_camera
         camera.position, camera.look_at = (tuple(r * np.array(v)) for v in (eye, look))
         scene.set_up_direction("+z")
-        # Plain colours: a picture of an arm needs no reflections, and many machines have no GPU.
+        # Lines and dots in plain colours: no reflections to compute, and many machines have no GPU.
         scene.configure_environment_map(None)
-        scene.configure_default_lights(cast_shadow=False)
         scene.add_grid(
             "/grid",
             width=4.0 * r,
@@ -127,10 +126,8 @@ class Page:
         self._trail = scene.add_line_segments("/trail", line, TRAIL, thickness=0.005 * r)
         self._joints = self._dots("/joints", len(self.arm.joints), HUB, 0.036)
         self._tip = self._dots("/tip", 1, TIP, 0.03)
-        size = {"shaft_radius": 0.008 * r, "head_radius": 0.018 * r, "head_length": 0.035 * r}
-        arrows = np.zeros((len(self.arm.joints), 2, 3))
-        self._slow = scene.add_arrows("/slow", arrows, SLOW, **size)
-        self._fast = scene.add_arrows("/fast", arrows, FAST, **size)
+        self._slow = scene.add_line_segments("/slow", line, SLOW, thickness=0.014 * r)
+        self._fast = scene.add_line_segments("/fast", line, FAST, thickness=0.014 * r)
 
     def _dots(self, name, count, colour, size):
         return self.server.scene.add_point_cloud(
