@@ -442,7 +442,7 @@ def damping_matrix(M22, K, ratios):
     Raises
     ------
     ModelError
-        For more ratios than modes, or one that is not allowed.
+        Where the stiffness is not positive definite.
     """
     m = K.shape[0]
     if not len(ratios):
