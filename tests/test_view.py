@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import sys
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 from harness import Arm, Bench
@@ -112,6 +114,21 @@ def screen(shared_bench, arm, browser):
     screen = Screen(shared_bench, browser, found[1])
     screen.wait_for("state", "READY")
     return screen
+
+
+def test_view_starts_nodes_and_page_and_ends_them(bench):
+    words = ["view", "R", "--lockstep", "--no-open", "--port", "0", "--rate", "2"]
+    bench.processes.start("view", [sys.executable, "-m", "flexarm_bringup.cli", *words])
+    found = bench.wait_for(
+        "the page's address", lambda: re.search(r"R at (http://\S+),", bench.log("view"))
+    )
+    assert found[1].startswith("http://127.0.0.1:")
+    Arm(bench).wait_ready()
+    with urlopen(found[1]) as answer:
+        assert answer.status == 200 and b"<html" in answer.read().lower()
+    assert bench.stop("view", signal.SIGINT) == 0
+    nodes = {"simulator", "observer", "controller"}
+    bench.wait_for("the nodes to leave", lambda: not nodes & set(bench.node.get_node_names()))
 
 
 def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(shared_bench, arm, screen):

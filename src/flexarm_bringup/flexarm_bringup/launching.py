@@ -48,6 +48,7 @@ LOCKSTEP = Argument(
 )
 LOG_LEVEL = Argument("info", "least severity that is logged", LEVELS)
 SIMULATOR = Argument("true", "false: a driver of yours takes the simulator's place", SWITCH)
+SHAPE = Argument("false", "true: the node shape draws the arm, for RViz and Foxglove", SWITCH)
 AUTOSTART = Argument(
     "true",
     "true: torque follows with the first valid state; false: the controller waits for a lifecycle manager",
@@ -59,6 +60,7 @@ ONE_ARM = {
     "controller": CONTROLLER,
     "namespace": NAMESPACE,
     "with_simulator": SIMULATOR,
+    "with_shape": SHAPE,
     "lockstep": LOCKSTEP,
     "log_level": LOG_LEVEL,
 }
@@ -111,6 +113,7 @@ def one_arm(values):
     ParameterError
         For a controller file that is not there, or a value that is none of an argument's choices.
     """
+    values = {"with_shape": SHAPE.default, **values}  # not an argument of every launch file
     check(values, ONE_ARM)
     common = [str(parameter_files.find(values["controller"]))]
     if values["arm"]:
@@ -124,6 +127,8 @@ def one_arm(values):
         # Not paused at its start: nobody is to unpause it.
         pace = {"lockstep": is_true(values["lockstep"]), "pause_at": -1.0}
         starts.insert(0, Start("flexarm_sim", "simulator", parameters=[*common, pace], **own))
+    if is_true(values["with_shape"]):
+        starts.append(Start("flexarm_bringup", "shape", parameters=list(common), **own))
     return starts
 
 

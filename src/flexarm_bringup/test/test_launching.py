@@ -133,3 +133,15 @@ def test_beside_a_driver_the_controller_may_wait_and_the_driver_is_started_where
 def test_a_value_that_cannot_be_used_is_refused(given, reason):
     with pytest.raises(ParameterError, match=reason):
         launching.one_arm(values(launching.ONE_ARM, **given))
+
+
+def test_the_shape_is_drawn_where_it_is_asked_for():
+    given = {"controller": "two_link", "namespace": "left", "with_shape": "true"}
+    shape = launching.one_arm(values(launching.ONE_ARM, **given))[-1]
+    assert (shape.package, shape.executable, shape.namespace) == (
+        "flexarm_bringup",
+        "shape",
+        "left",
+    )
+    assert shape.parameters[0].endswith("two_link.yaml")
+    assert [s.executable for s in launching.one_arm(values(launching.ONE_ARM))].count("shape") == 0

@@ -1,0 +1,54 @@
+"""What `flexarm view` costs the loop it looks on at: ``python -m benchmarks.view``, under two minutes, in real time.
+
+Two loops on domains of their own, at one of which a view looks on (without a browser), run in turns of a second and a
+half; from measurement to torque, as `flexarm latency` counts.
+"""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from flexarm_bringup import latency
+
+ROUNDS = 12
+
+
+def main(rounds=ROUNDS, rate=500.0):
+    """Print percentiles of both, and their ratios turn by turn."""
+    case = next(c for c in latency.CASES if c.arm == "R" and c.rate == rate)
+    name = next(n for n in latency.CHAINS if n != "relay")
+    windows = {"alone": [], "viewed": []}
+    with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        loops = {
+            key: latency.Chain(stack, name, case, Path(folder) / key, "executor") for key in windows
+        }
+        viewed = loops["viewed"]
+        words = ["view", "--attach", "--no-open", "--port", "0"]
+        viewed.processes.start("view", [sys.executable, "-m", "flexarm_bringup.cli", *words])
+        viewed.wait_for("the page", lambda: "http://" in viewed.processes.log("view"))
+        for loop in loops.values():
+            loop.get_ready()
+        for i in range(rounds):
+            for key in list(loops)[:: 1 - 2 * (i % 2)]:
+                windows[key].append(loops[key].window(case.window))
+    found = {
+        key: [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in each]
+        for key, each in windows.items()
+    }
+    for key, each in found.items():
+        p50, p95, p99 = 1e3 * np.median(each, axis=0)
+        print(f"{key:8} p50 {p50:.3f} ms, p95 {p95:.3f} ms, p99 {p99:.3f} ms")
+    ratios = np.array(found["viewed"]) / np.array(found["alone"])
+    p50, p95, p99 = np.median(ratios, axis=0)
+    print(f"viewed / alone, median of {rounds} turns: p50 {p50:.3f}, p95 {p95:.3f}, p99 {p99:.3f}")
+    print(
+        f"load of the machine in the last minute: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    )
+
+
+if __name__ == "__main__":
+    main()
