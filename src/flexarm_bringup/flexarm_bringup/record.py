@@ -53,8 +53,7 @@ def record(options):
         arm_file.load(options.arm)  # refused here, and not after the recording
     with Listener(options.namespace) as listener:
         listener.wait_for_first(PATIENCE)
-        taken = _take(listener, out, options.arm, duration)
-    taken.tell(out)
+        _take(listener, out, options.arm, duration)
     return out
 
 
@@ -62,12 +61,10 @@ def _take(listener, out, arm, duration):
     """Record until the duration is over, Ctrl-C or SIGTERM; what was counted."""
     from .recorder import BagWriter
 
-    began, told = time.monotonic(), 0.0
+    began, told, ended = time.monotonic(), 0.0, None
     asked = None if arm else listener.ask_arm()
     with BagWriter(out, arm or "", listener.namespace) as bag:
-        taken = Taken(bag)
-        if arm:
-            taken.arm = arm
+        taken = Taken(bag, arm or "")
         print(f"recording to {out}{'' if duration else '; Ctrl-C ends it'}", file=sys.stderr)
         try:
             while duration is None or time.monotonic() < began + duration:
@@ -78,12 +75,14 @@ def _take(listener, out, arm, duration):
                     told = time.monotonic()
                     taken.show(told - began)
                 time.sleep(POLL_PERIOD)
-        except KeyboardInterrupt:
-            pass  # the way to end it
-        finally:
-            taken.take(listener.poll(), time.time_ns())
-            if sys.stderr.isatty():
-                print(file=sys.stderr)
+        except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the way to end it; SIGTERM
+            ended = end
+        taken.take(listener.poll(), time.time_ns())
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    taken.tell(out)
+    if isinstance(ended, SystemExit):
+        raise ended
     return taken
 
 
@@ -93,12 +92,14 @@ class Taken:
     Parameters
     ----------
     bag : BagWriter
+    arm : str
+        What the bag already says.
     """
 
-    def __init__(self, bag):
+    def __init__(self, bag, arm=""):
         from .recorder import TOPICS
 
-        self.bag, self.arm, self._unusable = bag, "", None
+        self.bag, self.arm, self._unusable = bag, arm, None
         self.counts = dict.fromkeys(TOPICS, 0)
         self._from = self._to = None
 

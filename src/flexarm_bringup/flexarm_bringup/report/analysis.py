@@ -75,6 +75,7 @@ def summary(run, moves=None):
         "rate_hz": 1.0 / run.period if run.period > 0.0 else None,
         "lost": run.timeline.lost,
         "lost_by_recorder": _lost_by_recorder(run),
+        "unanswered": run.unanswered,
         "repeated": run.timeline.repeated,
         "clock_jumps": len(run.timeline.jumps),
         "motions": len(moves),
@@ -142,7 +143,7 @@ def _vibration(run, moves):
         peaks = np.zeros(len(names))
         for part in _parts(run):
             bent = run.deflections(part) @ rows.T
-            peaks = np.maximum(peaks, np.abs(bent).max(axis=0))
+            peaks = np.fmax(peaks, np.fmax.reduce(np.abs(bent), axis=0))
         found["peak_deflection_m"] = dict(zip(names, peaks.tolist(), strict=True))
     squares, count, windows = 0.0, 0, 0
     for move in moves:
@@ -150,6 +151,8 @@ def _vibration(run, moves):
             continue
         window = slice(move.end, move.rest)
         moved = residual(run, window)
+        if not moved.size:
+            continue
         squares, count, windows = squares + (moved**2).sum(), count + moved.size, windows + 1
     if windows:
         found |= {"residual_m": float(np.sqrt(squares / count)), "residual_windows": windows}
@@ -157,11 +160,12 @@ def _vibration(run, moves):
 
 
 def residual(run, window):
-    """Distance of the tip from its mean place that bending alone makes, over a rest, shape (window,) [m].
+    """Distance of the tip from its mean place that bending alone makes, over a rest, shape (known samples,) [m].
 
     With the tip's Jacobian with respect to the amplitudes at the mean joint angles.
     """
     bent = run.deflections(window)
+    bent = bent[np.isfinite(bent).all(axis=1)]
     q = np.nanmean(run.positions(window), axis=0)
     jacobian = tip_jacobian(run.model, q)
     return np.linalg.norm((bent - bent.mean(axis=0)) @ jacobian.T, axis=1)
@@ -263,6 +267,7 @@ def spectrum(run, mask):
     if not run.amplitude_source or not run.period > 0.0:
         return None
     rate = 1.0 / run.period
+    mask = mask & run.bent_known
     pieces = [(a, b) for a, b in _gapless(run, mask) if (b - a) * run.period >= SHORTEST_SEGMENT]
     if not pieces:
         return None

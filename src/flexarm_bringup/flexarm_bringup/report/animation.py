@@ -131,7 +131,7 @@ def film(run, times):
     first, last = int(rows.min()), int(rows.max()) + 1
     part, rows = slice(first, last), rows - first
     q = np.nan_to_num(run.positions(part)[rows])
-    delta = run.deflections(part)[rows]
+    delta = _held(run.deflections(part))[rows]
     wanted = run.references(part)
     links = len(shape.links)
     straight = np.empty((len(rows), links, 2, 3))
@@ -145,6 +145,13 @@ def film(run, times):
         if wanted is not None and np.isfinite(wanted[rows[k]]).all():
             reference[k] = shape.points(wanted[rows[k]], none)[:, [0, -1]]
     return Film(straight, bent, reference, run.state[part][rows].tolist())
+
+
+def _held(values):
+    """A table whose NaN are what was last known, 0 before, shape (k, m)."""
+    known = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values))[:, None], 0), axis=0)
+    return np.nan_to_num(np.take_along_axis(values, last, axis=0))
 
 
 def data(runs):

@@ -255,6 +255,7 @@ def rows(runs, numbers):
     row("rate [Hz]", lambda r, m: _cell(digits(m["rate_hz"], 4)))
     row("samples", lambda r, m: _cell(str(m["samples"]), _repeats(m)))
     row("samples lost", _lost)
+    row("samples without a torque", _unanswered)
     row("motions", lambda r, m: _cell(str(m["motions"]) if r.has("controller/state") else "–"))
     row("faults", _faults)
     group("Tracking and vibration")
@@ -293,6 +294,13 @@ def _lost(run, m):
         f", {m['lost_by_recorder']} missed by the recorder alone" if m["lost_by_recorder"] else ""
     )
     return _cell(str(m["lost"]), f"{share}{missed})", bad=m["lost"] > m["lost_by_recorder"])
+
+
+def _unanswered(run, m):
+    if m["unanswered"] is None:
+        return _cell("–")
+    share = f"({digits(100.0 * m['unanswered'] / m['samples'])} %)" if m["unanswered"] else ""
+    return _cell(str(m["unanswered"]), share, bad=m["unanswered"] > 0.01 * m["samples"])
 
 
 def _faults(run, m):

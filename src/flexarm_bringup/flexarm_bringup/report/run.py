@@ -14,6 +14,10 @@ from . import timeline
 STATES = ("INACTIVE", "READY", "TRACKING", "HOLDING", "STOPPING", "FAULT")
 INACTIVE, READY, TRACKING, HOLDING, STOPPING, FAULT = range(6)
 ALL = slice(None)
+#: A sample without an answer is in the state of the last one that has one, for so long [s].
+HOLD = 0.5
+#: Over so many samples that lack an amplitude it is taken to have changed evenly.
+BRIDGED = 5
 ENABLED = 1  # `JointTorque.ENABLED`
 
 
@@ -143,20 +147,44 @@ class Run:
 
     @cached_property
     def state(self):
-        """The supervisor's state of each sample, -1 where it is not known, shape (k,) int8."""
+        """The supervisor's state of each sample, -1 where it is not known, shape (k,) int8.
+
+        A sample that got no answer is in the state of the one before, for `HOLD` at most.
+        """
         state = self.column("controller/state", "supervisor_state")
         if state is None:
             return np.full(self.time.size, -1, np.int8)
-        return np.where(np.isfinite(state), state, -1).astype(np.int8)
+        last = self._last_answer
+        return np.where(last >= 0, state[last], -1).astype(np.int8)
 
     @cached_property
     def reason(self):
         """Which of `contents.reasons` stands with each sample, -1 for none, shape (k,)."""
-        table, out = self.contents.tables.get("controller/state"), np.full(self.time.size, -1)
-        if table is not None:
-            rows = self._rows_of("controller/state")
-            out[rows >= 0] = table.reason[rows[rows >= 0]]
-        return out
+        table = self.contents.tables.get("controller/state")
+        if table is None:
+            return np.full(self.time.size, -1)
+        rows, last = self._rows_of("controller/state"), self._last_answer
+        return np.where(last >= 0, table.reason[rows[last]], -1)
+
+    @cached_property
+    def _last_answer(self):
+        """The last sample up to each one that has a `controller/state`, -1 where it is too long ago, shape (k,)."""
+        here = np.arange(self.time.size)
+        known = self._rows_of("controller/state") >= 0
+        last = np.maximum.accumulate(np.where(known, here, -1))
+        epoch, time = self.timeline.epoch, self.timeline.time
+        fresh = (last >= 0) & (epoch[last] == epoch) & (time - time[last] <= HOLD)
+        return np.where(fresh, last, -1)
+
+    @property
+    def unanswered(self):
+        """Samples without a torque between the first and the last that has one; None without the topic."""
+        if not self.has("joint_torque"):
+            return None
+        answered = np.flatnonzero(self._rows_of("joint_torque") >= 0)
+        if not answered.size:
+            return None
+        return int(answered[-1] - answered[0] + 1 - answered.size)
 
     def position(self, j, part=ALL):
         """Measured joint angle [rad]."""
@@ -213,14 +241,33 @@ class Run:
         return out
 
     def deflections(self, part=ALL):
-        """Amplitudes of all modes, 0 where one is not known, shape (part, m)."""
-        size = self.time[part].size
+        """Amplitudes of all modes, shape (part, m): 0 for a mode of which nothing tells, NaN where a sample lacks it.
+
+        Over at most `BRIDGED` samples that lack it, a line is drawn.
+        """
+        size, count = self.time[part].size, len(self.mode_names)
+        out = np.zeros((size, count))
+        for j in np.flatnonzero(self._told):
+            out[:, j] = bridged(self.amplitude(j, part), BRIDGED)
+        return out
+
+    @cached_property
+    def _told(self):
+        """Of which modes something tells, shape (m,) bool."""
         if not self.amplitude_source:
-            return np.zeros((size, len(self.mode_names)))
+            return np.zeros(len(self.mode_names), bool)
         if self.amplitude_source == "strain":
-            return np.nan_to_num(self._mapped(part))
-        columns = [self.amplitude(j, part) for j in range(len(self.mode_names))]
-        return np.nan_to_num(np.column_stack(columns))
+            return np.isin(self.mode_names, self._strain_map.mode_names)
+        columns = self.contents.tables[self.amplitude_source].columns["modal_amplitude"]
+        return np.array([np.isfinite(columns[:, j]).any() for j in range(columns.shape[1])])
+
+    @property
+    def bent_known(self):
+        """Samples whose deflections are known, shape (k,) bool."""
+        known = np.ones(self.time.size, bool)
+        for j in np.flatnonzero(self._told):
+            known &= np.isfinite(bridged(self.amplitude(j), BRIDGED))
+        return known
 
     def positions(self, part=ALL):
         """Joint angles, shape (part, n) [rad]."""
@@ -231,3 +278,20 @@ class Run:
         if not self.has("controller/state", "reference_position"):
             return None
         return np.column_stack([self.reference(j, part) for j in range(len(self.joint_names))])
+
+
+def bridged(values, most):
+    """A series with lines drawn over holes of at most so many samples, shape (k,)."""
+    holes = np.isnan(values)
+    if not holes.any() or holes.all():
+        return values
+    here, known = np.arange(values.size), np.flatnonzero(~holes)
+    starts, ends = timeline.stretches(holes)
+    short = (ends - starts <= most) & (starts > 0) & (ends < values.size)
+    inside = np.zeros(values.size + 1, int)
+    np.add.at(inside, starts[short], 1)
+    np.add.at(inside, ends[short], -1)
+    fill = np.cumsum(inside)[:-1] > 0
+    out = values.copy()
+    out[fill] = np.interp(here[fill], known, values[known])
+    return out
