@@ -73,6 +73,12 @@ class Screen:
         what = f"{parts} in #{name} of the page"
         self.bench.wait_for(what, lambda: all(p in self.text(name) for p in parts))
 
+    def wait_for_value(self, label, value):
+        """Until the number beside a slider is this."""
+        field = self.field(label)
+        what = f"{value} beside {label}"
+        self.bench.wait_for(what, lambda: field.input_value() == value)
+
     def click(self, label):
         """Click a button, however busy the machine draws."""
         self.page.get_by_role("button", name=label, exact=True).dispatch_event("click")
@@ -135,7 +141,7 @@ def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(shared_bench, a
     bench, page = shared_bench, screen.page
 
     # Move: to where the sliders point, a radian from here.
-    assert screen.field("joint1").input_value() == "1"
+    screen.wait_for_value("joint1", "1")
     screen.click("Move there")
     bench.wait_for("the motion to be accepted", lambda: arm.state.accepted_trajectory_id == 1)
     arm.run(1.0)
@@ -143,19 +149,20 @@ def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(shared_bench, a
     at = arm.estimated.newest
     q, delta = list(at.joint_position), list(at.modal_amplitude)
     assert 0.2 < q[0] < 0.9
-    bench.wait_for("the angle to be shown", lambda: screen.joint(0)[1:2] == [f"{q[0]:.3f}"])
-    assert screen.joint(0)[0] == "joint1"
-    assert screen.joint(0)[3:] == [
+    reference = arm.state.reference_position
+    drawer = Drawer(model.build(arm_file.load("R")))
+    shown = [
+        "joint1",
+        f"{q[0]:.3f}",
+        f"{1e3 * (reference[0] - q[0]):.2f}",
         f"{arm.state.slow_torque[0]:.2f}",
         f"{arm.state.fast_torque[0]:.2f}",
     ]
-    drawer = Drawer(model.build(arm_file.load("R")))
-    error = 1e3 * drawer.tip_error(q, delta, arm.state.reference_position)
-    assert screen.text("tip") == f"{error:.2f}" and screen.text("trajectory") == "1"
-    canvases = page.evaluate(
-        "[...document.querySelectorAll('canvas')].filter(c => c.width > 99).length"
-    )
-    assert canvases == 4  # the scene and three plots
+    bench.wait_for(f"{shown} in the table", lambda: screen.joint(0) == shown)
+    screen.wait_for("tip", f"{1e3 * drawer.tip_error(q, delta, reference):.2f}")
+    screen.wait_for("trajectory", "1")
+    canvases = "[...document.querySelectorAll('canvas')].filter(c => c.width > 99).length"
+    bench.wait_for("the scene and three plots", lambda: page.evaluate(canvases) == 4)
 
     # Stop, half-way: the arm is brought to rest and held where it is.
     screen.click("Stop")
@@ -170,20 +177,18 @@ def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(shared_bench, a
         screen.field("fast.alpha").fill(value)
         screen.field("fast.alpha").dispatch_event("blur")
 
-    assert (
-        bench.get("controller", "fast.alpha") == 5.0
-        and screen.field("fast.alpha").input_value() == "5"
-    )
+    assert bench.get("controller", "fast.alpha") == 5.0
+    screen.wait_for_value("fast.alpha", "5")
     turn("6")
     screen.wait_for("message", "set: fast.alpha = 6")
     assert bench.get("controller", "fast.alpha") == 6.0
     turn("20")
     screen.wait_for("message", "sampled at 100 Hz", "lower the gains")
-    bench.wait_for("alpha as it was", lambda: screen.field("fast.alpha").input_value() == "6")
+    screen.wait_for_value("fast.alpha", "6")
     assert bench.get("controller", "fast.alpha") == 6.0
     # What somebody else sets is shown.
     assert bench.set("controller", slow__kp=[9.0])[0].successful
-    bench.wait_for("the new gain", lambda: screen.field("slow.kp[0]").input_value() == "9")
+    screen.wait_for_value("slow.kp[0]", "9")
 
     # A fault, in red with its reason; recover leaves it.
     screen.click("Recover")

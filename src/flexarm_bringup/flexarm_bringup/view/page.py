@@ -20,6 +20,8 @@ BEAM, GHOST, TRAIL, TIP = (28, 126, 214), (173, 181, 189), (224, 49, 49), (224, 
 SLOW, FAST, HUB = (247, 103, 7), (47, 158, 68), (52, 58, 64)
 #: Span of the plots [s], and how often they are drawn [Hz].
 WINDOW, PLOT_RATE = 10.0, 6.0
+#: So many of the last messages are shown.
+MESSAGES = 3
 #: Largest factor of the deflections.
 EXAGGERATION = 20.0
 
@@ -83,6 +85,7 @@ class Page:
         )
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
         self._gains, self._plotted = {}, 0.0
+        self._said = deque(maxlen=MESSAGES)
         modes = len(arm.mode_names)
         self._histories = {
             "tip": History(1),
@@ -260,11 +263,15 @@ class Page:
             slider.value = float(np.clip(round(value, 2), slider.min, slider.max))
 
     def say(self, text, bad):
-        """Show a message to the person."""
-        colour = "#c92a2a" if bad else "#495057"
+        """Show a message to the person, above the last ones."""
+        self._said.appendleft((text, bad))
+        lines = "".join(
+            f'<div style="color:{"#c92a2a" if bad else "#495057"};opacity:{1.0 - 0.3 * i}">{html.escape(text)}</div>'
+            for i, (text, bad) in enumerate(self._said)
+        )
         self._message.content = (
-            f'<div id="message" style="margin:0 0.8em 0.6em;font-size:0.8em;color:{colour};'
-            f'overflow-wrap:anywhere">{html.escape(text)}</div>'
+            '<div id="message" style="margin:0 0.8em 0.6em;font-size:0.8em;overflow-wrap:anywhere">'
+            f"{lines}</div>"
         )
 
     def show(self, heard, picture, trail, tip_error):
