@@ -28,15 +28,6 @@ def test_every_link_of_the_pages_and_the_readme_leads_somewhere():
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_page_is_in_the_table_of_contents():
-    index = (ROOT / "docs" / "index.md").read_text("utf-8")
-    listed = {target for _, target in links.links(index)}
-    for page in (ROOT / "docs").glob("*.md"):
-        if page.name != "index.md":
-            assert page.name in listed, f"docs/index.md: no link to {page.name}"
-            assert f"\n{page.stem}\n" in index, f"docs/index.md: {page.stem} is in no toctree"
-
-
 @pytest.fixture
 def tree(tmp_path, monkeypatch):
     """A repository of two pages."""

@@ -162,7 +162,7 @@ def _vibration(run, moves):
 def residual(run, window):
     """Distance of the tip from its mean place that bending alone makes, over a rest, shape (known samples,) [m].
 
-    With the tip's Jacobian with respect to the amplitudes at the mean joint angles.
+    The rest lasts over `window`. With the tip's Jacobian with respect to the amplitudes at the mean joint angles.
     """
     bent = run.deflections(window)
     bent = bent[np.isfinite(bent).all(axis=1)]
