@@ -264,11 +264,13 @@ def test_names_from_a_bag_are_text_and_no_markup(tmp_path):
 
 
 def test_a_large_figure_becomes_a_picture_and_a_large_page_is_refused(runs, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(figures, "LARGEST_SVG", 30_000)
-        text = page.write([runs["slow"]])
-    checked(text)
-    assert "data:image/png" in text and "<svg" in text
+    run = runs["slow"]
+    paper = figures._Paper([run], [analysis.motions(run)], "", False)
+    monkeypatch.setattr(figures, "LARGEST_SVG", 1000)
+    made = paper.tracking()
+    checked(made.image)
+    assert made.image.startswith('<img alt="Tracking" src="data:image/png;base64,')
+    assert len(made.times) == 2 and all(0.0 < left < right < 1.0 for left, right, *_ in made.times)
     asked = []
     monkeypatch.setattr(page.figures, "draw", lambda *args: asked.append(args[-1]) or [])
     monkeypatch.setattr(page, "LARGEST", 10_000)
@@ -345,8 +347,8 @@ def test_without_strain_modes_and_arm_there_are_still_angles(tmp_path):
     checked(text)
     assert "give --arm" in text and 'id="animation"' not in text and 'id="tracking"' in text
     # With an arm there is an animation, of a straight one.
-    text = command.make([path], tmp_path / "arm.html", "R").read_text(encoding="utf-8")
-    assert 'id="animation"' in text
+    film = animation.data([read(path, arm="R")])
+    assert film["most"] == 0.0 and film["factor"] == 1.0
 
 
 def test_numbers_that_are_none_leave_holes(tmp_path):
@@ -565,9 +567,11 @@ def test_a_fault_is_told_with_its_reason(tmp_path, recorded):
     got = analysis.summary(run)
     assert got["faults"] == 1 and "tracking error <of joint1>" in got["first_fault"]
     assert got["compute_time_s"] == pytest.approx([1.5e-4, 2e-4, 2e-4], rel=0.34)
-    text = command.make([faulty], tmp_path / "f.html").read_text(encoding="utf-8")
-    checked(text)
-    assert "tracking error &lt;of joint1&gt;" in text and 'id="timing"' in text
+    assert "One fault, the first at" in page.short([run], [got])[0]
+    told = [(state, why) for _, _, state, why in page._events([run])]
+    assert ("FAULT", "tracking error <of joint1>") in told
+    timing = figures._Paper([run], [analysis.motions(run)], "", False).timing()
+    assert "<svg" in timing.image and len(timing.times) == 1
 
 
 def message_stamp(raw):
