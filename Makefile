@@ -15,7 +15,7 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test docs bench compare latency fuzz soak lint clean distclean
+.PHONY: help build demo test docs bench compare latency fuzz soak lint release-check clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -29,6 +29,7 @@ help:
 	@echo 'make fuzz       build, then malformed input for every reader and node; FUZZ_ARGS="--inputs 10000"'
 	@echo 'make soak       build, then random motions, parameters and faults; SOAK_ARGS="--minutes 5"'
 	@echo 'make lint       check style (ruff)'
+	@echo 'make release-check   versions, style, docs, and the packages without ROS on every Python at hand'
 	@echo 'make clean      remove what was built, results and caches; .venv stays'
 	@echo 'make distclean  clean, and remove .venv'
 	@echo ''
@@ -83,6 +84,9 @@ soak: build
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check
+
+release-check: docs
+	@. tools/env.sh && python tools/release_check.py
 
 clean:
 	@rm -rf build install log results

@@ -4,7 +4,7 @@ The pages of ``docs/`` are copied, and beside them are put
 
 - ``api/``: a page for each public module, from its docstrings;
 - ``messages.md``: from the ``.msg`` files;
-- ``readme.md``: the README;
+- ``readme.md`` and ``contributing.md``: the README and CONTRIBUTING;
 - ``parameters.md``: anew from the declarations.
 
 Links to source files become links to the pages of their modules. Before, all links and anchors are checked
@@ -26,6 +26,8 @@ sys.path[:0] = [str(HERE), *(str(path) for path in (ROOT / "src").glob("*/"))]
 import links  # noqa: E402
 
 PACKAGES = ("flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_ros", "flexarm_bringup")
+#: Pages outside of docs/.
+AT_THE_ROOT = ("README.md", "CONTRIBUTING.md")
 
 
 def modules(package):
@@ -111,8 +113,8 @@ def adapt(text, page):
         up = "../" * len(page.parent.relative_to(HERE).parts)
         if file in known:
             return f"]({up}api/{known[file]}.rst)"
-        if file == ROOT / "README.md":
-            return f"]({up}readme.md{hash_}{anchor})"
+        if file.parent == ROOT and file.name in AT_THE_ROOT:
+            return f"]({up}{file.name.lower()}{hash_}{anchor})"
         if HERE in file.parents:
             return match.group()
         return f"]({up}{file.relative_to(ROOT)})"
@@ -127,10 +129,11 @@ def copy_pages(out):
     for page in HERE.rglob("*.md"):
         copy = out / page.relative_to(HERE)
         copy.write_text(adapt(page.read_text(encoding="utf-8"), page), encoding="utf-8")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    readme = re.sub(r"\]\(docs/", "](", readme)
-    readme = re.sub(r'(src|href)="docs/', r'\1="', readme)
-    (out / "readme.md").write_text(readme, encoding="utf-8")
+    for name in AT_THE_ROOT:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        text = re.sub(r"\]\(docs/", "](", text)
+        text = re.sub(r'(src|href)="docs/', r'\1="', text)
+        (out / name.lower()).write_text(text, encoding="utf-8")
     for page in (ROOT / "examples").glob("*/README.md"):
         copy = out / page.relative_to(ROOT)
         copy.parent.mkdir(parents=True)

@@ -22,7 +22,12 @@ TARGET = re.compile(r"^\(([\w.:-]+)\)=\s*$|<a (?:id|name)=\"([^\"]+)\"", re.MULT
 
 def pages(root=ROOT):
     """Markdown files whose links are checked."""
-    found = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "examples").rglob("*.md")]
+    found = [
+        root / "README.md",
+        root / "CONTRIBUTING.md",
+        *(root / "docs").rglob("*.md"),
+        *(root / "examples").rglob("*.md"),
+    ]
     return sorted(path for path in found if path.is_file())
 
 

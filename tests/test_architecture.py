@@ -1,11 +1,13 @@
 """Dependencies point one way: bringup to sim and control, these to dynamics; ROS in the nodes alone."""
 
 import ast
+import importlib.util
 from pathlib import Path
 
 import pytest
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
+DOCS = SOURCE.parent / "docs"
 ROS = {"rclpy", "flexarm_msgs", "flexarm_ros", "rcl_interfaces", "std_msgs", "std_srvs"}
 ROS |= {"sensor_msgs", "trajectory_msgs", "diagnostic_msgs", "builtin_interfaces", "launch"}
 OURS = {"flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_bringup"}
@@ -45,3 +47,16 @@ def test_ros_is_imported_in_nodes_alone(package):
         inside = "nodes" in path.parts and package != "flexarm_dynamics"
         found = imported(path) & ROS
         assert inside or not found, f"{path.relative_to(SOURCE)} imports {', '.join(sorted(found))}"
+
+
+def test_the_page_on_the_architecture_is_what_the_sources_are():
+    """Else: python docs/architecture.py."""
+    spec = importlib.util.spec_from_file_location("architecture", DOCS / "architecture.py")
+    architecture = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(architecture)
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    assert architecture.table() in page
+    drawing = (DOCS / "architecture.svg").read_text(encoding="utf-8")
+    for package in MAY:
+        assert package in drawing
+        assert all(label in drawing for label in architecture.labels(package))

@@ -1,6 +1,7 @@
 """What a package says of itself: keys for what it imports and nothing else, licences, changelogs."""
 
 import ast
+import importlib.util
 import re
 import sys
 from pathlib import Path
@@ -151,3 +152,26 @@ def test_every_topic_of_the_nodes_is_in_the_documentation_and_overridable():
             if isinstance(topic, ast.Constant):
                 assert f"| `{topic.value}` |" in text, topic.value
                 assert any(k.arg == "qos_overriding_options" for k in call.keywords), topic.value
+
+
+def _tool(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_one_version_is_written_everywhere():
+    check = _tool("release_check")
+    assert len(check.versions()) >= 13
+    assert not check.disagreements()
+
+
+def test_every_python_file_begins_with_its_licence():
+    tool = _tool("licences")
+    assert len(tool.files()) > 300
+    wrong = [p for p in tool.files() if tool.lacks(p.read_text(encoding="utf-8"))]
+    assert not wrong, "run tools/licences.py"
+    assert tool.lacks('"""Text."""\n') and not tool.lacks(tool.headed('"""Text."""\n'))
+    shell = tool.headed('#!/usr/bin/env python3\n"""Text."""\n')
+    assert shell.startswith("#!") and not tool.lacks(shell)

@@ -83,7 +83,11 @@ def check_arguments(options):
     FlexarmError
     """
     if options.controller is None:
-        wrong = [k for k in (*FIELDS, "set", "bag") if k not in SHARED and getattr(options, k) is not None]
+        wrong = [
+            k
+            for k in (*FIELDS, "set", "bag")
+            if k not in SHARED and getattr(options, k) is not None
+        ]
         why = "only with --controller"
     else:
         wrong = [k for k in OPEN_LOOP if getattr(options, k)]

@@ -96,7 +96,9 @@ class StateReader:
         sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
         if stamp.nanosec >= SECOND:
-            raise MessageError(f"header.stamp.nanosec is {stamp.nanosec}: it must be below {SECOND}")
+            raise MessageError(
+                f"header.stamp.nanosec is {stamp.nanosec}: it must be below {SECOND}"
+            )
         joints = self._joints
         order = joints.order(msg.joint_names)
         if not joints.read("joint_position", msg.joint_position, order, sample.position):
