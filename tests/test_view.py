@@ -105,7 +105,7 @@ def arm(shared_bench):
     )
     command = [sys.executable, "-m", "flexarm_bringup.cli", "view"]
     shared_bench.processes.start(
-        "view", [*command, *["--attach", "--no-open", "--port", "0", "--rate", "8"]]
+        "view", [*command, *["--attach", "--no-open", "--port", "0", "--rate", "4"]]
     )
     return Arm(shared_bench, pauses_at=10)
 
