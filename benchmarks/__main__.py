@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The benchmark command; see ``python -m benchmarks --help``."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference cases, and arms made of their links."""
 
 import json

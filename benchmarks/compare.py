@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference cases in all codes, and the generated code beside hand-written loops."""
 
 import importlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """This project with the interface of the other codes."""
 
 import numpy as np

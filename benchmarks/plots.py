@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of the measurements, PNG and SVG."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cost of one evaluation against links and modes; throughput of batches against cores."""
 
 import hashlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Times of several tasks that take turns, so that what slows the computer slows all of them."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `flexarm view` costs the loop it looks on at: ``python -m benchmarks.view``, under two minutes, in real time.
 
 Two loops on domains of their own, at one of which a view looks on (without a browser), run in turns of a second and a

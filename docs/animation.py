@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draws the README's animation: ``. tools/env.sh; python docs/animation.py``.
 
 Arm R moves 90 degrees in 1 s, once under the slow control alone and once under

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draws architecture.svg and lists the modules of architecture.md, both from the sources' imports and docstrings."""
 
 import ast

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Builds the site of these pages: ``make docs``, or ``python docs/build_site.py --out results/docs``.
 
 The pages of ``docs/`` are copied, and beside them are put

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of Sphinx; `docs/build_site.py` prepares the pages and starts it."""
 
 from pathlib import Path

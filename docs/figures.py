@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draws the figures of docs/dynamics.md and docs/tutorial/tuning.md: ``. tools/env.sh; python docs/figures.py``.
 
 ``python docs/figures.py tuning`` draws one alone.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether the links inside the repository's Markdown lead anywhere: ``python docs/links.py``.
 
 Of every page in ``docs/``, the README and the examples, each link that is no web address must be a file or a folder

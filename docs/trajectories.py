@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of docs/trajectories.md: what shapers and motions leave of vibration.
 
 Made by `python docs/trajectories.py`.

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Malformed input for every reader of messages and files; see ``python -m fuzz --help``."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fuzzing command; see ``python -m fuzz --help``."""
 
 import argparse

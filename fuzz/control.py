@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control path: observers, the controller and designs, with any samples and any parameters."""
 
 import numpy as np

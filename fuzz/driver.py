@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver template's serial line: damaged lines, pieces of lines, clocks that jump."""
 
 import sys

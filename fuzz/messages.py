@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readers of messages: states, torques, and the gate of a driver."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Running nodes: malformed messages and parameters over DDS, in lockstep; afterwards they must hold an arm."""
 
 import sys

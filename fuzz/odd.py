@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odd values and mutations, drawn from one seeded generator: the same number gives the same input."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is fuzzed: readers, each with its inputs and with what must hold of every one."""
 
 import reprlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readers of motions: messages, files, written motions, and the reference that follows them."""
 
 import copy

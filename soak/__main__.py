@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The soak command; see ``python -m soak --help``."""
 
 import argparse

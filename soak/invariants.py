@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What must hold of every sample on the topics, whatever happens to the nodes."""
 
 from collections import Counter

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The soak itself: rounds of trouble, each followed by a healthy motion that must come to its end."""
 
 import random

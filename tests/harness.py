@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bench for the nodes: processes on a DDS domain of their own, and what a user's programs do beside them.
 
 Nothing here sleeps: every wait serves an executor until a condition holds, for a bounded time, and then

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What one host hears of a loop, told on standard output, a JSON line a message; moves and recovers on request.
 
 A program and not a fixture: Fast DDS looks up a process's addresses once, so each host needs a process of its own.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Dependencies point one way: bringup to sim and control, these to dynamics; ROS in the nodes alone."""
 
 import ast

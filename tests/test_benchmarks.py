@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The equations that the benchmark compares are the same ones, and its measures measure what they say."""
 
 import sys

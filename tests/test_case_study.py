@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`flexarm demo` as a user runs it: three processes over DDS, figures, bags, summary, table."""
 
 import json

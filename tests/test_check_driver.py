@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm check_driver`` on running drivers: the simulator in real time passes, a drive without power does not."""
 
 from test_driver_template import RATE, TIMEOUT, check_driver, start_template

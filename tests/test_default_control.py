@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The default control of the three nodes on the paper's arm, in lockstep at 1 kHz, by its figures."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every public name is documented, and what a docstring says of its arguments is true.
 
 Names of the packages' public modules: neither they nor what they are in begins with an underscore. The rules, as

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver template on its fake device: it passes the check, and observer and controller run on it unchanged.
 
 In real time: nothing here depends on how fast that is, or on how late a process gets its turn.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the simulator, over DDS: who may set them, and that they are on arm_state."""
 
 import numpy as np

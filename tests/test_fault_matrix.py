@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fault matrix: what is wrong, what the arm comes to, how soon, and how it goes on; the table of docs/safety.md.
 
 The rows of sensors and network run in lockstep, the faults injected by the simulator: reaction times are counted in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is wrong with a state, a torque or a process, and what the nodes make of it."""
 
 import math

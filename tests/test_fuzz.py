@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No malformed input does more than be refused: a few of every reader here, a million with `make fuzz`."""
 
 import sys

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gauges through the nodes: calibrated at rest and not in motion, lost one by one under a running loop."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm excite`` on the simulator in lockstep, and ``flexarm identify`` on the bag that it wrote."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch files with the real `ros2 launch`, where there is one: the wheels have none."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Links inside the documentation lead somewhere; the checker finds those that do not."""
 
 import importlib.util

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lockstep: the same inputs give the same samples, to the last bit, whatever else the machine does."""
 
 import contextlib

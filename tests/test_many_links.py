@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms of several links as a user runs them: the simulator node, the composite controller, over DDS."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes over DDS: signals, refusals, life cycle, parameters, services."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observer and controller in one process; processes that end with the one that started them."""
 
 import os

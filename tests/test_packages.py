@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a package says of itself: keys for what it imports and nothing else, licences, changelogs."""
 
 import ast

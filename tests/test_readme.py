@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every command of the README and the guide: what it starts exists, what it publishes moves the arm."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The adapter between ros2_control's topics and flexarm's: names and orders, and efforts that end in time."""
 
 import math

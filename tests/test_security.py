@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """config/security/flexarm.policy.xml allows each node what it creates, and nothing else."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The node `shape` draws what the topics say: markers, and joint states of the URDF."""
 
 import numpy as np

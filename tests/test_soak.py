@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A short soak and a few malformed messages to running nodes; `make soak` and `make fuzz` do it at length."""
 
 import sys

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of docs/theory.md, evaluated: each symbol has its shape, each formula gives what the code computes."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories on the topic, published as users do: reliable, volatile, with stamp 0 or an explicit one."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tutorial's lessons, typed as they stand: files written, commands run in order, in a directory of their own.
 
 In a lesson, a block whose first line is ``# file: NAME`` is that file; in a ``console`` block, ``$`` is a command and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulator on one host, observer and controller on another, over a network that is cut.
 
 Needs the right to make network namespaces, see `two_hosts`. What is judged is counted in samples and read from

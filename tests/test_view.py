@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of `flexarm view` in a real browser: what is shown is what the nodes say, what is clicked they do."""
 
 import os
@@ -94,30 +95,30 @@ class Screen:
         return self.page.evaluate(f"[...({row}?.children ?? [])].map(e => e.textContent)")
 
 
-@pytest.fixture(scope="module")
-def arm(shared_bench):
+@pytest.fixture
+def arm(bench):
     """Page and nodes, in lockstep at 100 Hz, at which designs may be refused; paused at the tenth sample."""
-    shared_bench.start_loop(
+    bench.start_loop(
         {"lockstep": True, "pause_at": 0.1, "resend_period": 0.02},
         controller={"state_timeout": 60.0},
         arm="R",
         rate=100.0,
     )
     command = [sys.executable, "-m", "flexarm_bringup.cli", "view"]
-    shared_bench.processes.start(
+    bench.processes.start(
         "view", [*command, *["--attach", "--no-open", "--port", "0", "--rate", "4"]]
     )
-    return Arm(shared_bench, pauses_at=10)
+    return Arm(bench, pauses_at=10)
 
 
-@pytest.fixture(scope="module")
-def screen(shared_bench, arm, browser):
+@pytest.fixture
+def screen(bench, arm, browser):
     """The page in the browser, at the first picture; there are few, as it is drawn without a GPU."""
-    found = shared_bench.wait_for(
-        "the page's address", lambda: re.search(r"R at (http://\S+),", shared_bench.log("view"))
+    found = bench.wait_for(
+        "the page's address", lambda: re.search(r"R at (http://\S+),", bench.log("view"))
     )
     arm.wait_standing()
-    screen = Screen(shared_bench, browser, found[1])
+    screen = Screen(bench, browser, found[1])
     screen.wait_for("state", "READY")
     return screen
 
@@ -137,8 +138,8 @@ def test_view_starts_nodes_and_page_and_ends_them(bench):
     bench.wait_for("the nodes to leave", lambda: not nodes & set(bench.node.get_node_names()))
 
 
-def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(shared_bench, arm, screen):
-    bench, page = shared_bench, screen.page
+def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(bench, arm, screen):
+    page = screen.page
 
     # Move: to where the sliders point, a radian from here.
     screen.wait_for_value("joint1", "1")

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two hosts on one machine, each a network namespace with a cable to a switch, which is a third one.
 
 Nothing of it has a name in the file system or on the machine's own network: the namespaces live while this

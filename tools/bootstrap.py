@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Set flexarm up: a virtual environment in .venv, the colcon workspace in install, compiled kernels.
 
 Run it as often as you like: what is done is skipped, what was interrupted goes on. Two modes:

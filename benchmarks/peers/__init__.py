@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Other ways to simulate the reference cases, to compare flexarm's accuracy and speed with.
 
 Every module has one or more classes with the interface of `Peer`. They import nothing of ROS; each

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The equations of `numpy_equations` through python-control's nonlinear systems."""
 
 import control

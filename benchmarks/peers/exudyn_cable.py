@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Exudyn model of one or two planar flexible links from ANCF cable elements.
 
 Every node has a position and a slope vector :math:`r'` (`NodePoint2DSlope1`); the cables' axial

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The equations of `numpy_equations` as closed-form loops in numba: the least time they take.
 
 Everything that speeds up a loop written for these two arms only is in here:

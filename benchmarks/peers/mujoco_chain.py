@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""MuJoCo model of one or two planar flexible links as chains of rigid segments.
 
 A link is a chain of rigid segments with a spring hinge between neighbours. With hinges at the nodes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""First-order assumed-modes equations of one and two planar links, as one writes them in numpy.
 
 A point of a link is at :math:`(x, y(x))` in the frame of its base, :math:`y =

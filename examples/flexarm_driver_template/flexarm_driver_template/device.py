@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm's electronics at the end of a serial line: lines in and out, and when they were measured."""
 
 import os

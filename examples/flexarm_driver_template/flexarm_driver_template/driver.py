@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver: frames of the device to `arm_state`, `joint_torque` to the device, the safe action when in doubt.
 
 To make it yours: put your line's protocol into `protocol.py`, and the scales of your electronics into a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A device that is not there: a simulated arm in real time behind a pseudo-terminal, counts and lines and all."""
 
 import argparse

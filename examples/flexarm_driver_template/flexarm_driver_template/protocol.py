@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The line protocol of the fake device; yours has its own, and this file is what you replace first.
 
 From the device, one line a sample, all whole numbers, then the checksum (exclusive or of the bytes, in hex)::

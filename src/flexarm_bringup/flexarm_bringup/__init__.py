@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Case study, reports and command line of flexarm."""

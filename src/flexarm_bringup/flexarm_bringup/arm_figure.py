@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A picture of an arm and of its natural modes."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's case study: its runs, what is reported of them, and the table beside print.
 
 Nothing here imports ROS but `start_nodes` and `run_nodes`, which run the three executables, and `_relay`;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
 
 import argparse

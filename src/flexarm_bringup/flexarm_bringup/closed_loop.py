@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop without ROS: the very objects that the nodes call, sample by sample; and the continuous loop."""
 
 from collections import deque

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures 2-11 of the paper, slow control against composite; one figure, one story.
 
 Axes are in the paper's units (degrees, feet, lbf ft), so that they can be laid beside print.

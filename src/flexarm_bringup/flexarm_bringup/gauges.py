@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""``flexarm gauges``: how well an arm's strain gauges tell its modes, and where they would do it best. No ROS.
 
 With rows R and the rms error sigma of a reading, the amplitudes of the observed modes have the covariance

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm frequencies`` and ``flexarm show``: what an arm file makes of an arm. No ROS."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""``flexarm latency``: from measurement to torque, in real time, beside a bare relay of the same messages.
 
 A loop is the shipped nodes in the shipped control, on the moving arm: simulator, observer and controller as three

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The line's nodes with a stopwatch: what `latency` starts. ``python -m flexarm_bringup.latency_nodes ROLE …``.
 
 The nodes are the shipped ones. The simulator stamps each state as it publishes it and each torque as it comes in,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the launch files start: arguments with their descriptions, and from their values the nodes, without launch.
 
 `description` makes a launch description of both; only there is `launch` imported, which a machine without a ROS

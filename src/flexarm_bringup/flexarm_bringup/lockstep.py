@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs of the three nodes as three processes, in lockstep, recorded."""
 
 import time

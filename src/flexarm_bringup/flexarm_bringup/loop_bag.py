@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bag of the loop without ROS: the messages that the nodes would send, by the nodes' own writers.
 
 Nothing is sent: no middleware is started. Stamps are the simulator's, and so are the times in the bag.

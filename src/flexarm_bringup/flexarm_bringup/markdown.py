@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Text that a run writes into a document, between two lines that mark its place."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is reported of a run: tracking, vibration, torque; from recorded samples, without ROS."""
 
 from dataclasses import dataclass, fields

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A network between the arm and its control: samples are lost and late, and the loop goes on as the nodes do.
 
 A sample of `arm_state` is lost with a probability, each on its own; else it arrives after ``delay`` and a random

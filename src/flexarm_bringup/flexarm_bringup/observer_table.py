@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm observers``: how well each observer tells the rates of an arm, by noise, rate and delay. No ROS.
 
 The arm is simulated once per rate, its joints led by a collocated PD law on the true state through steps of the

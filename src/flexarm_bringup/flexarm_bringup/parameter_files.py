@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS parameter files, read without ROS, so that the loop without ROS runs from the same file as the nodes."""
 
 from pathlib import Path

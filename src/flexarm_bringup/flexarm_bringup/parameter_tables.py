@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of all parameters in Markdown, from the declarations that the nodes validate with."""
 
 from flexarm_bringup.markdown import write_between

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes, on a DDS domain of their own."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Says what is going on: a line that fills on a terminal, a line per step elsewhere."""
 
 import sys

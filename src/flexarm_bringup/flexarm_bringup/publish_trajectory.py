@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publishes a motion, or writes it to a file: ``ros2 run flexarm_bringup publish_trajectory``."""
 
 import argparse

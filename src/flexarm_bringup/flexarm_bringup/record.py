@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm record``: a bag of a running arm, of a driver or of the simulator alike.
 
 It listens to the line's topics and writes what comes, message by message, so that memory stays small however long it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records the line as serialised messages; reads them back; writes a bag that common viewers open."""
 
 import functools

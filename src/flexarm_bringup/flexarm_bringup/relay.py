@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bare relay of the line's messages through as many processes: what the middleware alone costs.
 
 Each of three plain nodes answers the message it gets with a ready-made one of the same type and size, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""``flexarm robustness``: how many lost samples, and how much random delay, a loop bears. No ROS.
 
 A motion is carried out with samples lost, each on its own with a probability, and separately with every sample late

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm simulate --controller``: plant, observer and controller in one process, and how well they did. No ROS."""
 
 import json

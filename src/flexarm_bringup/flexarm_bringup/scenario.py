@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One run of an arm under control, described by plain data: what `flexarm simulate --controller` runs.
 
 A scenario says which arm, which parameters of observer and controller, which motion, and in what the arm differs

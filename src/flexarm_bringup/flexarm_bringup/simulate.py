@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm simulate``: an arm under given torques, or moved as prescribed, to a table. No ROS.
 
 With ``--controller`` the arm is in a closed loop: `run_controller`.

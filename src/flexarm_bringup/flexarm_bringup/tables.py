@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of numbers over time: reading torques and motions from CSV, writing results."""
 
 import csv

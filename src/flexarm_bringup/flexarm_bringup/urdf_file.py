@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm urdf``: the URDF of an arm file, links that bend as chains of short rigid pieces. No ROS."""
 
 from pathlib import Path

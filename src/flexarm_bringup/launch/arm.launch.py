@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One arm: simulator, observer and controller; `with_simulator:=false` where a driver runs."""
 
 from flexarm_bringup import launching

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The three nodes on one arm, and the paper's motion."""
 
 from flexarm_bringup import launching

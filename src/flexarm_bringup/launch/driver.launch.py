@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observer and controller beside the driver of a real arm."""
 
 from flexarm_bringup import launching

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two arms side by side, each in a namespace of its own."""
 
 from flexarm_bringup import launching

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A synthetic record for the tests of metrics and figures."""
 
 import numpy as np

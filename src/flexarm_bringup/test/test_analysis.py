@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm analyze``: time scales, the bound on mu, margins beside runs, what comes back, the report."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Monte Carlo of ``flexarm analyze``: the same samples however they are computed, results kept, resumed, refused."""
 
 import builtins

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm simulate``, ``frequencies`` and ``show``, as typed, against the reference data."""
 
 import json

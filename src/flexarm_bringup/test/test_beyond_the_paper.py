@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the default control makes of the paper's arm, and of softer ones: the loop without ROS."""
 
 from dataclasses import replace

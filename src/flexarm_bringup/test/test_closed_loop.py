@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The case study without ROS: the reference table, continuous and sampled; determinism; what goes wrong."""
 
 import json

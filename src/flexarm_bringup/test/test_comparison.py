@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm compare``: the rivals' laws, the tuner, the shipped controller files, and the tables of stored rows."""
 
 import json

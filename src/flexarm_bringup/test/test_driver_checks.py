@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The checks of a driver on simulated samples: a good one passes, each broken one fails with the right sentence."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures: each is there as PNG and SVG, says what it shows and in which unit, and shows just that."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm gauges``: noise of the amplitudes, the best places, modes that can't be told apart."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters from recorded motions: intervals cover the truth, what is not determined is named, files are read back."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `flexarm latency` makes of the windows that it measured."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the launch files start, from their arguments; with a stand-in for `launch`, which is not on PyPI."""
 
 import runpy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Metrics of a record: by hand, in the reference table's units."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observers side by side, and the paper's motion under the control of what a Kalman filter makes of counts."""
 
 from argparse import ArgumentParser

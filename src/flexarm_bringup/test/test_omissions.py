@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the appendix leaves out, and what that does: the figures of docs/paper.md, computed."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every parameter tells `ros2 param describe` and rqt what it is, in what range, whether it can be set."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS parameter files read without ROS: which section is whose, what is refused."""
 
 import pytest

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: help, wrong usage, options of the commands, progress."""
 
 import argparse

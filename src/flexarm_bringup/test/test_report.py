@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`flexarm report`: its numbers against the record itself, its page, and bags of every sad kind."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm without modes: the composite control is its slow law, and there is no deflection to wait for."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lost and late samples: what the network does, the loop over it, and where it breaks; a laboratory's sensing."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The torque ends in the middle of a move: what the safe action makes of the arm."""
 
 from dataclasses import replace

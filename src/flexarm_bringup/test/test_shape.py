@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of an arm: what the markers show; and every topic and field that the layouts name exists."""
 
 import importlib

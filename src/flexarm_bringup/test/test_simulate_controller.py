@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios and ``flexarm simulate --controller``: the plant they build, late torque, metrics, what is refused."""
 
 import json

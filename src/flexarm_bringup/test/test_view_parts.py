@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parts of `flexarm view` that need neither nodes nor a browser: gains, histories, options, what is written."""
 
 import argparse

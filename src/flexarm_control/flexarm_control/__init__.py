@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Laws, observers and trajectories for arms with flexible links; ROS only in `nodes`."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Controller of an arm: reference, composite control, limits; what happens when a state is bad is `supervisor`'s."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observer of an arm: strains to amplitudes, order of samples, and the chosen observer."""
 
 import numpy as np

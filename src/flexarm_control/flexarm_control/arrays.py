@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small arrays on the control path, where numpy's convenience costs more than the arithmetic."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Composite control, (12) of Siciliano & Book (1986): u = u_slow(x) + u_fast(x, z_f).
 
 The deflections that go with the slow motion, z_bar, are what the fast control holds on to: z_f = z - z_bar. The

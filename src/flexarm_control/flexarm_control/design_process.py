@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Designs in a process of their own, so that none holds the interpreter's lock while a sample waits for its torque.
 
 A thread of the controller's process shares its lock: on a design's every other bytecode the control path may have to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What a motion excites: the linear response of the fast subsystem (11) along it.
 
 The slow torque of the motion is that of the reduced model (10), :math:`\bar u = B^{-1}(\ddot q - a)`; with it the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shakes an arm sample by sample: waits for rest, applies an `ExcitationTorque`, stops at a limit. No ROS."""
 
 from enum import Enum

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Torques that shake an arm so that its motion tells its parameters: pulse, ring-down, sweep; and what stops them.
 
 Of amplitude A, joint by joint, each with a time of rest after it, in which the arm rings freely:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The full order closed loop, sampled: the arm with its bending under a composite control, linearised at rest.
 
 The arm (2), linear about rest in a configuration, held by its torque against gravity, moves exactly from sample to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Strain gauges that fail, and their bias at rest.
 
 A reading :math:`\varepsilon_i` of gauge i is

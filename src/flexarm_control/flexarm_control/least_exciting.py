@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The time law that excites the links least, for a given duration and torque limit.
 
 The joints go in a straight line of joint space, :math:`q = q_0 + \Delta\,\sigma(t)`, and :math:`\sigma` is a spline of

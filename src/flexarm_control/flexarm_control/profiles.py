@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions in closed form, and their points for a `trajectory_msgs/JointTrajectory`.
 
 Each goes from rest to rest along theta(t) = start + angle sigma(s), s = t / T, sigma from 0 to 1.

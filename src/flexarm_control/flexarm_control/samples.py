@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One sample of the arm, as plain arrays: what observers and controllers work on."""
 
 from collections import deque

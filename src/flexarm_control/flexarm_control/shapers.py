@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Input shapers: a motion that is delayed copies of itself, so that what one copy excites the next cancels.
 
 Of a mode :math:`\omega,\zeta` at rest before, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Safety supervisor: which state the controller is in, and what it may not let happen.
 
 States and what leads from one to the next:

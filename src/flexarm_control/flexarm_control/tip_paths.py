@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Paths of the tip in space, a straight line or a circular arc, as motions of the joints.
 
 The path :math:`x(s)`, s from 0 to 1, is turned into joint angles Q(s) by the inverse kinematics of the arm at rest

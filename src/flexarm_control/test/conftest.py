@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arms for the tests of the control package."""
 
 from dataclasses import replace

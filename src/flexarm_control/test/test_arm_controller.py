@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller of an arm: its states, what it answers to a bad sample, its limits."""
 
 from dataclasses import replace

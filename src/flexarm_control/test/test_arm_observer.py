@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The observer of an arm: strains, order of samples, what is refused and what that leaves behind."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Composite control (12), and laws found by name with checked parameters."""
 
 from types import SimpleNamespace

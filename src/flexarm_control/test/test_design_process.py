@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Designs that come from another process are those made here."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shaking an arm: the torque's shape, its limits, and what stops it."""
 
 from dataclasses import replace

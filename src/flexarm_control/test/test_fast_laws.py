@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fast laws: the Riccati equation (20), the paper's gains, what can't be designed."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The sampled full-order closed loop: against the closed form of the continuous one, and against the loop that runs."""
 
 import numpy as np

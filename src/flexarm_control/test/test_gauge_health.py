@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gauges that fail, what is left of the strain map then, and the bias of an arm at rest."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kalman filters: consistent with the noise they assume, exact without noise, and what they find out of an arm."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The least-exciting motion: its optimum, its limits, and what the full model, integrated, says of it."""
 
 from dataclasses import replace

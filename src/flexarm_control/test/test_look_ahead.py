@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Work done between two samples for the next one: it changes nothing but when it is done."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slow manifolds: the paper's, the reference's, and the corrected one beside a slow manifold found numerically."""
 
 from types import SimpleNamespace

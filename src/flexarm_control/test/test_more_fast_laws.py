@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scheduled gains, placed poles, and feedback of amplitudes alone: what each of these fast laws promises."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Computed torque, resolved acceleration, sliding mode, adaptive model following: what defines each."""
 
 from dataclasses import replace

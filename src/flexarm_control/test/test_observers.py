@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observers of the modal rates: what they assume, how exact they are, how they start."""
 
 from types import SimpleNamespace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""(16): :math:`x = \bar x + O(\mu)`, :math:`z = \bar z + z_f + O(\mu)`, and what a better manifold makes of it.
 
 The arm, stiffened step by step, under continuous control and on a smooth reference, beside what the slow subsystem

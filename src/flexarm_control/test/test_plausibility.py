@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slips of units and of choice that a person is told of before the arm moves."""
 
 from dataclasses import replace

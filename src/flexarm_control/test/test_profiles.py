@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Profiles: closed forms against hand-computed values, their integrals and each other."""
 
 import numpy as np

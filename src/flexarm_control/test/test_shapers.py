@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shapers: closed forms, the vibration that is left at and off the design frequency, and on the arms."""
 
 import numpy as np

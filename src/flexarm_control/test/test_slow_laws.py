@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slow laws: (17) by hand, (13)-(14) as perfect model following, none."""
 
 from types import SimpleNamespace

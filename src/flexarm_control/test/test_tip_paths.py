@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tip paths: the bent arm's tip is on them, joints and their derivatives belong together."""
 
 import numpy as np

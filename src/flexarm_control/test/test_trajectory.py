@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories: what is refused, how the points are joined, when the reference changes."""
 
 from array import array

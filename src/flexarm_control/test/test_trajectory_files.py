@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectory files: what is written is read back bit by bit, and what can't be used is refused by its place."""
 
 import numpy as np

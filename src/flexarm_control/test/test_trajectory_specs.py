@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions written in a line are those of their families; what can't be read is refused by name."""
 
 import numpy as np

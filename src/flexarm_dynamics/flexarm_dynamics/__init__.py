@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Dynamics of arms with flexible links; no ROS anywhere in this package."""

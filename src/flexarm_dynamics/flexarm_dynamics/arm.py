@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What an arm is: plain data in SI, as `arm_file.load` reads it.
 
 Frames: each joint's frame is the tip frame of the previous link (the base frame for the first joint) moved by

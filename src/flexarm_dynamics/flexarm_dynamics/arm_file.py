@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arm files: YAML, validated; every error starts with the field's path, as ``links[0].length``.
 
 Nothing is half read: a file gives an `Arm` or an `ArmFileError`.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From an arm to the constants of `kernels.chain`: mode shapes, loads, modal integrals, work space."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Mode shapes of a uniform Euler-Bernoulli beam clamped at its base.
 
 Every shape here has the form (Siciliano & Book 1986, (A1), written so that nothing cancels)

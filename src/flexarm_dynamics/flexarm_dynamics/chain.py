@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Arms of any number of links, rigid or flexible: the general model, evaluated by `kernels.chain`.
 
 Every link is a uniform beam along its frame's x axis, which bends (Euler-Bernoulli, no rotary inertia of the

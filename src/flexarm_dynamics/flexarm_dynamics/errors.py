@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The errors that flexarm raises; every one of them is a `FlexarmError`.
 
 A message names the joint, mode, parameter or field, the value, the limit, and what to do.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Fixed-step methods for an arm's compiled integrators, and how short their steps must be.
 
 Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 0.5 it loses

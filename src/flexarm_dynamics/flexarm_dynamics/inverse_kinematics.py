@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Inverse kinematics: joint angles that put the tip at a point, of the straight or of the statically bent arm.
 
 The tip of an arm at rest is :math:`p(q, \delta_s(q))`, with :math:`\delta_s` the deflections under gravity

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What every model of an arm offers, and the terms of the equations of motion (2).
 
 .. math::

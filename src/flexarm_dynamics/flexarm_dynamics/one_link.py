@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The fully derived one-link arm: everything that the Lagrangian of the planar beam gives.
 
 The hub turns by q, the beam point at x moves to :math:`R(q)\,(x,\ y(x,t))` with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The one-link model that Siciliano & Book print in their appendix, typos mended, omissions kept.
 
 What is mended (print does not compute otherwise): the sign of :math:`\nu_i` in (A1); :math:`\phi_{ie}^2` in k11

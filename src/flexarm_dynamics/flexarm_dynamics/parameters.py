@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declared parameters: one declaration gives type, unit, range, default and description.
 
 From it come the validation, the ROS parameter descriptors and the tables in the documentation.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Components found by name through Python entry points, so that a user's package adds one."""
 
 import difflib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Where the sections of an arm's links are, bent and twisted: for pictures, and for rigid pieces in their place.
 
 A section at x of a link has the frame that the link's tip would have if the link ended there; it is the chain model's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Values as messages for people show them: cut short, whatever they are."""
 
 import reprlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Slow and fast subsystems of an arm (Siciliano & Book 1986, section 3).
 
 Everything is computed from the `Terms` of (2) taken without deflections: the paper's assumptions a) and b).

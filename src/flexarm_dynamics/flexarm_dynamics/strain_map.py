@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Gauges to modal amplitudes and back.
 
 A gauge at :math:`\eta` on a face at distance c from the neutral axis reads, for bending,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conversion to SI, done once on reading; everything inside is SI.
 
 A dimension is written as powers of (force, length, time); imperial means ft, lbf, s, so that mass is

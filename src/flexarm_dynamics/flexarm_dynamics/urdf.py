@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""An arm as a URDF: each flexible link a chain of short rigid pieces that small joints bend and twist.
 
 A link of length L becomes N pieces of length h = L/N. Piece k points as the link's tangent does at its middle,

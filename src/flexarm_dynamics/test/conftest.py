@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by the tests of this package: reference data and shipped arms."""
 
 import json

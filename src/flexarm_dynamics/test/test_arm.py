@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plain data of an arm: names, order of the modal coordinates, arms with more modes."""
 
 from dataclasses import replace

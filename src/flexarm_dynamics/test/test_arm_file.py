@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Arm files: what is read, and what every kind of malformed file is told."""
 
 import copy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mode shapes: roots, boundary conditions, orthogonality, integrals, limiting cases."""
 
 from itertools import pairwise

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The general chain: a second derivation of its equations, power, momentum, kinematics, frequencies, what it refuses.
 
 `Reference` places every point of an arm that has mass by formulae of its own and takes velocities and

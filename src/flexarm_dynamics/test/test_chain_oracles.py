@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The general chain against what knows nothing of it.
 
 Two flexible links in a plane against sympy (`two_link_symbolic`), rigid spatial arms against MuJoCo, one link

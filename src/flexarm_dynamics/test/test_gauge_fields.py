@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bridge fields of a gauge in the arm file: read, checked, refused by path."""
 
 import pytest

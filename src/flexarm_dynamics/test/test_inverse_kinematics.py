@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inverse kinematics: against triangles, against the forward kinematics of the bent arm, and at its limits."""
 
 from dataclasses import replace

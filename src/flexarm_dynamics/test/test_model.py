@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Terms of the equations of motion, structural damping, frequencies of any model."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one-link arm: a second derivation, energy, kinematics, the compiled kernel, independent trajectories."""
 
 import os

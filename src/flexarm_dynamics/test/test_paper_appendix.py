@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The printed model: every number of the case study, what print leaves out, and that it is a model of its own."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declared parameters: what is taken, what is refused and with which words."""
 
 import array

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Components found by name through entry points."""
 
 from importlib.metadata import EntryPoint

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An arm with another payload, stiffness or damping than its file says."""
 
 import numpy as np

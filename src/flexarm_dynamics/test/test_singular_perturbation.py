@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slow and fast subsystems: equations (6) to (11), stabilisability, full order poles."""
 
 from dataclasses import replace

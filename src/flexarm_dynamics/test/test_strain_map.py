@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gauges to amplitudes: signs, weights, gain and bias, spill-over, gauges that cannot do it."""
 
 from dataclasses import replace

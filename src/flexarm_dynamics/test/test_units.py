@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conversion from ft, lbf, s to SI."""
 
 import pytest

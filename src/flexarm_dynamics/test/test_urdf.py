@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sections of bent links, and the URDF of rigid pieces: its own kinematics must put it where the model's arm is."""
 
 import xml.etree.ElementTree as ET

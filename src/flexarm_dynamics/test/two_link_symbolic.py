@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Independent oracle: the planar two-link arm with two modes per link, by sympy from its Lagrangian.
 
 Nothing here comes from the model that it checks. Every point of the arm is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages to arrays and back, without copies that are not needed.
 
 Numbers are cast here: a Python int or numpy scalar assigned to a float64 field is published as garbage.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frame of every node: lifecycle with autostart, diagnostics, clean exit on signals."""
 
 import gc

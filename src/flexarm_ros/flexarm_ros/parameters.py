@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declared parameters as ROS parameters: descriptors, validation, and what changed."""
 
 import difflib

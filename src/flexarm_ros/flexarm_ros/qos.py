@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quality of service on the line: reliable, volatile, the newest sample only; overridable by parameters.
 
 Two ends of a topic whose policies don't go together exchange nothing, and neither would say so: `Mismatches` does.

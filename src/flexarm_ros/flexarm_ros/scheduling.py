@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where and how urgently a node's process runs: CPU affinity and real-time priority; Linux.
 
 Both are off by default. They apply to every thread that the process has when its node is made, the middleware's

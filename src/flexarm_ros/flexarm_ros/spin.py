@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Spins nodes whose control path is one subscription, without rebuilding a wait set of everything per message.
 
 rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node

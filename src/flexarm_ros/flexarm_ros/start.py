@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Starts and ends a node's process: a signal ends it cleanly from the first moment, while it still imports."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a node measures of itself for `/diagnostics`: cheap per sample, worked out once a second.
 
 `Percentiles` and `Gaps` are fed on the control path: no allocation there beyond Python's own small numbers, no

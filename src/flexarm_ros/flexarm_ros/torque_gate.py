@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which torque a driver may apply, and when it must not: the rules of `joint_torque`, without a clock of its own.
 
 A torque acts while it answers a state of this session that was published no longer than the timeout ago. Else

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages to arrays and back: names, lengths, arrays written in place, and anything at all."""
 
 import math

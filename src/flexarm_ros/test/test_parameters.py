@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Declared parameters on a real node: descriptors, refusals, all or nothing, misspelt names."""
 
 import math

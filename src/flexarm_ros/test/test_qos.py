@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Overrides of quality of service touch one topic, and what can't be used is refused by its name."""
 
 import os

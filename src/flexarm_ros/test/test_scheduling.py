@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """CPU affinity and real-time priority: what is taken, what is refused and how that is said."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Percentiles by nearest rank, of the newest values; gaps in uint32 numbers."""
 
 import math

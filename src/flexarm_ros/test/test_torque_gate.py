@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a driver may apply: fresh, finite, of this session, of one controller, within limits."""
 
 import math

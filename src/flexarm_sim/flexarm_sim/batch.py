@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many simulations at once on all cores: other initial states, other torques, other arms."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Brakes that stick: an arm without drive torque under Coulomb's law, without smoothing.
 
 Brake i, of torque :math:`T_i`, gives :math:`-T_i\,\mathrm{sign}\,\dot q_i` while its joint turns. A joint at rest it

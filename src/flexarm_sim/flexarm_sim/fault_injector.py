@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults put into what the simulator publishes, so that the answers to them can be tested; the plant knows nothing.
 
 A fault is one line, "SIGNAL KIND [key=value ...]", as docs/fault_injection.md lists them. Times are simulated

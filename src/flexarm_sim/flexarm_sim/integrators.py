@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Integration of a plant: fixed steps in real time and lockstep, error-controlled offline."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm that is simulated: its state, its motion under torque, its safe action."""
 
 import math

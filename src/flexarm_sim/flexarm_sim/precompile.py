@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiles the numba kernels into their cache, so that no node waits for it: ``python -m flexarm_sim.precompile``."""
 
 from concurrent.futures import ProcessPoolExecutor

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What the simulator measures: encoder and strain gauges.
 
 A gauge reads, for the plant's amplitudes :math:`\delta`,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated arm behind its sensors, sample by sample; what the simulator node calls."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Brakes: sticking, slipping, stopping, energy."""
 
 from dataclasses import replace

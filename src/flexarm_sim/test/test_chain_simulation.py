@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulations of the general chain: against independent codes, orders, energy, prescribed motion, many at once."""
 
 import json

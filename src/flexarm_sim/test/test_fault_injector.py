@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults: their lines, and what each makes of the samples."""
 
 import numpy as np

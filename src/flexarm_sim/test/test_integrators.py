@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Integrators: the tableau's order, substeps, the error-controlled solution, what can't be integrated."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plant: motion under torque, energy, safe actions, errors."""
 
 from dataclasses import replace

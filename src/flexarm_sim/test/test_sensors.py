@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encoder and gauges: quantisation, noise, what a gauge reads."""
 
 from dataclasses import replace

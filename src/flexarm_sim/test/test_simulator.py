@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated arm sample by sample: time, session, spill-over, another plant, reset."""
 
 import numpy as np

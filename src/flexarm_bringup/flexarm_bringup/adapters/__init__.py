@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes that stand in for a driver where an arm already has other ROS topics."""
 
 from flexarm_ros.start import start

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Adapter node: an arm behind ros2_control, or anything that speaks its topics, becomes a driver of flexarm.
 
 `joint_states` and an array of strains in, `arm_state` out; `joint_torque` in, an array of efforts out, in the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm analyze``: what can be said of a design before the arm moves. One subject per module, no ROS.
 
 `scales`: time scales and reachability; `bound`: how large mu may be; `margins`: what the loop withstands;

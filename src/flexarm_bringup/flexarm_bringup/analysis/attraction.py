@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From how far off the nonlinear loop brings the arm back to rest, with its torque limits, sensors and observer.
 
 The loop starts with a joint beside where it is to be held, or with the arm bent; the offset is scaled up until the

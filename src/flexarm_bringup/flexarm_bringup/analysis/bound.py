@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""How large mu may be: the composite Lyapunov function of Saberi and Khalil, on the loop as designed.
 
 The closed loop, continuous and linear about rest at the motion's end, in slow error x = (q, qd) and fast deviation

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm analyze``: time scales, the bound on mu, margins, domain of attraction, Monte Carlo of a design."""
 
 import json

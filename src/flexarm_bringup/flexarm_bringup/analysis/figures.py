@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of an analysis: mu along the motion, poles over the slow gain, the bound on mu, quantiles."""
 
 from pathlib import Path

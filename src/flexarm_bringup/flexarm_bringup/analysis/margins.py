@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the loop withstands of what it was not told: delay, gain of the drives, payload, stiffness, a lower rate; noise.
 
 Each margin is where the sampled full-order loop, linear at the motion's end, loses stability: `full_order.closed_loop`

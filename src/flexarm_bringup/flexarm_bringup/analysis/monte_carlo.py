@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many runs of an arm that is not quite what its controller was told: payload, stiffness, damping, delay, noise.
 
 Sample i is drawn from ``SeedSequence(seed, spawn_key=(i,))`` alone, and its run is the same to the last bit wherever

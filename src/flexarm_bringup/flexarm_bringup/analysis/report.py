@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An analysis in words and columns, for a terminal."""
 
 from ..scenario import type_of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time scales: mu, spectra of the slow and the fast subsystem, what the torques can reach, along the motion and beyond.
 
 mu is the paper's estimate, the slow subsystem's highest frequency under its control over the smallest frequency of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is analysed: an arm, its design in one configuration, the motion it is for."""
 
 from dataclasses import dataclass, replace

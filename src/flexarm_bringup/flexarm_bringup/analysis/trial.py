@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs that tell whether the nonlinear loop, sensors, observer and limits included, is stable."""
 
 from dataclasses import replace

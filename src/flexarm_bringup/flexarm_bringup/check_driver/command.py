@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm check_driver``: listens to a running driver, pushes its arm where that is allowed, says what is wrong."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What can be said of a driver by listening: names, numbers, time, counts, strain of an arm at rest.
 
 Every check takes `Samples` and gives one `Finding`; none waits, moves or knows ROS. Medians and least values

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What a small push tells: signs, scales and order of joints, gauges and modes, beside the model's answer.
 
 Joint j is pushed by one period of a sine,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recorded `ArmState` messages as arrays, and what a check finds."""
 
 from dataclasses import dataclass

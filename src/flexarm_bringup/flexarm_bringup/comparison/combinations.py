@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The composite control's own parts beside each other: slow law, fast law, slow manifold and feed-forward.
 
 `full` is every slow law with every fast law and every manifold, and with every fast law and every feed-forward; `pairs`

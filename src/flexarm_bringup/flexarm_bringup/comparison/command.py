@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm compare``: tunes everyone alike, runs everyone, and writes the table."""
 
 import argparse

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Who is compared: the shipped composite control and its rivals, with the numbers of each that are tuned.
 
 Every rival's first guess has the bandwidth of the shipped controller's slow poles, on ranges that are wide. A joint's

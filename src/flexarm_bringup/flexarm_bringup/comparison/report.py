@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of a comparison, for the terminal and for docs/comparison.md."""
 
 from flexarm_bringup.markdown import write_between

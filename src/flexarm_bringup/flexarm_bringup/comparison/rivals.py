@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Controllers that are no composite control, with its interface: what `ArmController` calls.
 
 `JointPid`, as the joint_trajectory_controller of ros2_controllers has it, each joint by itself,

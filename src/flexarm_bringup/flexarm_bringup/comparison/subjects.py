@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arms that are compared on, their motions, and the controller that flexarm ships for each."""
 
 from dataclasses import dataclass, replace

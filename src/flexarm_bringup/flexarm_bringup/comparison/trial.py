@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One run of a contender, and the few numbers that are compared."""
 
 from dataclasses import replace

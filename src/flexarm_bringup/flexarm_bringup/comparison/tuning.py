@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tuning by simulation: the same search, metric and number of simulations for everyone.
 
 A third of the budget goes to the first guess and a Latin hypercube, the rest to Nelder and Mead's simplex from the

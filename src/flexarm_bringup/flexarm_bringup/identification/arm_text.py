@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes an arm file with other values: the text of the given file, its comments kept where that is possible."""
 
 from itertools import pairwise

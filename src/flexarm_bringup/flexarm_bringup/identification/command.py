@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm identify``: a recorded motion and an arm file in; parameters with intervals, an arm file and a plot out."""
 
 import json

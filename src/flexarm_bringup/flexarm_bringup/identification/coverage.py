@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How often intervals cover the truth, and how wide they are, on simulated arms drawn at random.
 
 ``python -m flexarm_bringup.identification.coverage --arms 100`` draws arms around `nominal`, shakes and measures each

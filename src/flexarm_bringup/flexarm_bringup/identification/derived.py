@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What a person knows of an arm and its file does not say: frequencies, damping and coupling of its modes.
 
 Of the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with the locked

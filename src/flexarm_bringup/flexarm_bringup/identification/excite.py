@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm excite``: shakes a running arm with the node `excite`, and writes a bag of what it did meanwhile."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Output-error fit of an arm's parameters, with intervals that hold when the residuals are coloured.
 
 Parameters :math:`\theta`, gauge biases and initial state x_0 are chosen so that the prediction of `predictor` is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records the states of a running arm, and the torques that answer them."""
 
 import time

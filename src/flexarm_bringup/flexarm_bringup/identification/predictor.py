@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""What an arm would have measured: its own model under the recorded torque, from an initial state.
 
 .. math::

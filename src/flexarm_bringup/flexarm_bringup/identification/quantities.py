@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which numbers of an arm file a motion tells of: each by its path in the file, with its scale and limits."""
 
 from dataclasses import dataclass, replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What was measured while an arm moved: read from a bag, from a CSV file, or from messages. No ROS needed to read.
 
 Row k of a recording holds the joint angles and strains at time k, and the torque that acted over the interval

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm report``: what recorded runs show, on one page of HTML that needs nothing else.
 
 ``serialised`` turns many messages into columns of numbers at once, ``bag`` reads a bag of any length through

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is told of a run: tracking, vibration after motions, torque, losses, spectra. Plain numbers, no drawing."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The moving arm as numbers for the page: straight links, how far they bend away, and the reference.
 
 A point of a link's axis is p_i + R_i (x, sum phi_y delta_y, sum phi_z delta_z), with the link's base frame (R_i, p_i)

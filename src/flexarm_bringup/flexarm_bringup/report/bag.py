@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reads the line's topics out of a bag of any length, into columns of numbers in files.
 
 Memory holds a block of messages at a time. A bag may come from anywhere: topics may be missing or stand in a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm report``: what bags show, on one page of HTML."""
 
 import time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The report's figures, as SVG to be put into a page; a figure that would grow too large becomes a PNG.
 
 One axis of time for all of them, one colour for each run. Series are thinned to the least and greatest of each bin,

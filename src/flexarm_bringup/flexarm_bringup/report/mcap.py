@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What an MCAP file holds up to where it breaks off: a recording that was never closed has no index to read by.
 
 The format is a magic number, then records of one byte of kind, eight of length and the content; messages stand in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes the report's page: sentences and tables from the numbers, with the figures and the animation."""
 
 import json

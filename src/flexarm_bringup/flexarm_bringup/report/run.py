@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One recorded run: the samples of a bag's topics on one axis of time, a column at a time."""
 
 from functools import cached_property

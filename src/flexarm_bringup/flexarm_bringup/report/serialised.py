@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Columns of numbers out of serialised messages, many at a time.
 
 Messages of one topic have nearly always the same layout: the same names, arrays as long as the last time. The

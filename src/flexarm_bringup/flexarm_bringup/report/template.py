@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page's HTML, style and script: all that it needs is in it."""
 
 # ruff: noqa: E501  (HTML)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Puts samples in order and on one axis of time; joins topics; thins series for drawing. Plain arrays.
 
 A sample is known by session, sequence and stamp, which every answer to it copies. The sequence counts, so that it

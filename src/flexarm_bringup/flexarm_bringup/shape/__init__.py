@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A picture of a running arm: `drawing` has the maths, `node` publishes it for RViz, `flexarm view` shows it."""
 
 from flexarm_ros.start import start

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a picture of an arm is made of: lines along its links, the way of its tip, arrows for its torques. No ROS."""
 
 from collections import deque

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The newest message of a topic, when it is asked for: what comes in between wakes nobody and is not deserialised."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shape node: `arm_state_estimate` and `controller/state` in, `shape` and `shape/joint_states` out.
 
 Markers for RViz and Foxglove, and the joints of the URDF that ``flexarm urdf`` writes, at a rate for the eye.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``flexarm view``: an arm in the browser, live, of nodes that it starts or that run."""
 
 import contextlib

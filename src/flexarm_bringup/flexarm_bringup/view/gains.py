@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which of a controller's parameters are gains to turn by hand, and from where to where. No ROS."""
 
 import re

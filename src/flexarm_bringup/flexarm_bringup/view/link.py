@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the page hears of the nodes and tells them, in one thread, without a callback per sample."""
 
 import time

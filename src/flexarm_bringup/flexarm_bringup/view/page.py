@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page: a scene, plots, gains and buttons, by viser. It knows no ROS: what is done on it goes into a queue."""
 
 import html

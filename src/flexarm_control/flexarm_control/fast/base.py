@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a fast control law is."""
 
 from abc import ABC, abstractmethod

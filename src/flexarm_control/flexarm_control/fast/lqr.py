@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Optimal fast control with prescribed degree of stability, (18)-(20) of Siciliano & Book (1986).
 
 .. math::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No fast control: the slow control alone."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Fast control from the modal amplitudes alone: optimal gain on an observer of the boundary layer.
 
 Over a sample of length h under constant u_f the boundary layer (11), taken at one joint configuration, moves exactly by

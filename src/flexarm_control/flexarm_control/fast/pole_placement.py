@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Fast control by pole placement: frequency and damping of every mode of (11) are prescribed.
 
 The boundary layer (11), :math:`\dot z_f = A_2 z_f + B_2 u_f`, taken at one joint configuration, has m modes with poles

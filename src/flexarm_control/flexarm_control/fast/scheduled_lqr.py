@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Optimal fast control, its gain scheduled over the workspace: the law of `lqr` as (11) changes with q.
 
 Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Feed-forward from a model that runs along: the nominal arm, simulated under a regulator of its own.
 
 The slow manifold along the reference, :math:`s_{ref} = (q_{ref}, \bar\delta, \dot q_{ref}, \dot{\bar\delta})` with

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Feed-forward with preview: a motion that bends the arm and leaves it straight at its end.
 
 When a whole trajectory is known at its receipt, the joints need not follow it to the last millidegree: a small

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The integral manifold of the slow motion, to any order in mu.
 
 On the slow manifold the arm moves as the slow law wants it, :math:`\ddot q_s = a + B\bar u`, and the deflections

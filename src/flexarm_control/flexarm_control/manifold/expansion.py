@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Derivatives of the slow motion's deflections by central differences: what every manifold's orders are made of."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The paper's manifold, (9) of Siciliano & Book (1986): the quasi-steady state under the slow torque.
 
 .. math:: \bar\delta = (H_{21}K_1 + H_{22}K_2)^{-1}(-H_{21}f_1 - H_{22}f_2 + H_{21}\bar u), \qquad \dot{\bar\delta} = 0

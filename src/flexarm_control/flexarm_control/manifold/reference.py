@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The slow manifold of the reference trajectory, with its rates and the feed-forward torque that goes with it.
 
 .. math::

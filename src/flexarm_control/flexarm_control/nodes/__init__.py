@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes of this package, and their entry points."""
 
 from flexarm_ros.start import start

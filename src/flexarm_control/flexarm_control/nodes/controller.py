@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Controller node: `arm_state_estimate` and `joint_trajectory` in, `joint_torque` and `controller/state` out."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Excitation node: `arm_state` in, `joint_torque` out, as the controller does, to find the arm's parameters by."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
 from dataclasses import replace

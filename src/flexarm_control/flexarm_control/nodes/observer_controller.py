@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observer and controller in one process: the estimate goes to the controller by a call, not through the middleware.
 
 The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics; only

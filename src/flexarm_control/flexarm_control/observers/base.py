@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What an observer is."""
 
 from abc import ABC, abstractmethod

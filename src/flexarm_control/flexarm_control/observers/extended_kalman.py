@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Extended Kalman filter of joints, modes, and what is not known of the arm: payload and joint friction.
 
 The state of `kalman` is augmented by parameters that walk slowly at random:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""The paper's reconstructing filter: a derivative behind a first-order low-pass.
 
 .. math:: \hat{\dot\delta}(s) = \frac{\omega_c s}{s + \omega_c}\,\delta(s)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Kalman filter of joints and modes, from noise levels in physical units.
 
 The state x = (q, delta, qd, delta_d) moves as `motion` has it, under the torque that was applied and under unknown

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Reduced-order Luenberger observer of the modal rates, from the boundary layer's model (11).
 
 Over a sample of length h under constant torque u the fast subsystem moves exactly by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""How an arm moves from sample to sample: what observers predict with.
 
 With the state x = (q, delta, qd, delta_d), the equations of motion :math:`\dot x = f(x, u)` and the linearisation

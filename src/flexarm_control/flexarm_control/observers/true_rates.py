@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No reconstruction: passes on the modal rates that the source publishes.
 
 For a simulator with ``publish_rates: true``, in tests and for reproducing the paper, which assumes the full

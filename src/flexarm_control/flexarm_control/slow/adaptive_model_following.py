@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Model following that learns the payload (Slotine & Li 1987), on the slow subsystem (10).
 
 The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file

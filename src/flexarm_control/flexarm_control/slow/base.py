@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a slow control law is."""
 
 from abc import ABC, abstractmethod

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Computed torque with an integral, on the slow subsystem (10) of Siciliano & Book (1986).
 
 .. math::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Linear model following, (17) of Siciliano & Book (1986), for any number of joints.
 
 .. math::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Model following with compensation, the general form (13)-(14) of Siciliano & Book (1986).
 
 .. math::

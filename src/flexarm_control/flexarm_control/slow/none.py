@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No slow control: the fast control alone holds the deflections; the joint drifts."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm under another payload than its file's: what a law that learns the payload believes."""
 
 import numpy as np

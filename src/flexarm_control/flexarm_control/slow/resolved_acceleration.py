@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Resolved acceleration control (Luh, Walker & Paul 1980) of the tip, on the slow subsystem (10).
 
 .. math::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The arm that the slow laws see: the same chain with rigid links, and its tip."""
 
 from dataclasses import replace

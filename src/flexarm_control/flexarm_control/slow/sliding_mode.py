@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Sliding mode with a boundary layer (Slotine 1985; Slotine & Li 1991, ch. 7), on the slow subsystem (10).
 
 .. math::

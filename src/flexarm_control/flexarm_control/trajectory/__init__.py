@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories: what a `trajectory_msgs/JointTrajectory` asks for, and the reference it makes.
 
 Read as the joint_trajectory_controller of ros2_controllers (Jazzy) reads it. The fields that the

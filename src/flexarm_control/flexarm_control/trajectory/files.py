@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Trajectories in files: the text of a `trajectory_msgs/JointTrajectory`, or a CSV table.
 
 YAML (``.yaml``, ``.yml``), as `ros2 topic pub` takes it and `ros2 topic echo --once` prints it::

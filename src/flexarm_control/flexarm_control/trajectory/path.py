@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Piecewise polynomials through the points of a trajectory, evaluated on the control path."""
 
 import numpy as np

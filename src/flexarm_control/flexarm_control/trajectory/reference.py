@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference that the joints follow: holds, trajectories, stops."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a `trajectory_msgs/JointTrajectory` asks for, checked and in the arm's joint order."""
 
 import operator

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions written in a line: ``quintic:to=1.57,duration=2``, as `flexarm simulate --trajectory` takes them.
 
 A family's name, a colon, and its settings; where a setting has a value per joint (or per axis), they are

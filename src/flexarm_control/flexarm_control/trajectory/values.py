@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits, and values as messages show and check them; shared by this package."""
 
 import numpy as np

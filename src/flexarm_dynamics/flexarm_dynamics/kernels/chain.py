@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Equations of motion of a serial chain of flexible links, recursively, in O(number of links).
 
 The same functions run in three ways: as they stand (for reading and debugging), compiled by numba

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fixed-step integrators of ``state' = slope(state, net torque)``; joined to a right-hand side by `kernels.load`.
 
 The state is (q, delta, qd, delta_d). Torque goes from `torque` to `torque + change` over the whole interval;

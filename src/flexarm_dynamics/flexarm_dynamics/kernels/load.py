@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joins source files of kernels into one module, compiled by numba or left as plain Python.
 
 A compiled module is a file of its own in the cache directory, named by a hash of its source: numba's cache

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Right-hand side of one flexible link.
 
 The equations of motion (2) of one link with m modes, every term of which is in `one_link.Coefficients`:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scalars that record what is done to them: running a kernel on them gives straight-line code for one structure.
 
 A constant stays a Python float, so that whatever depends on constants alone is computed while tracing, and

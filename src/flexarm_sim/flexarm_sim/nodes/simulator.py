@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulator node: `joint_torque` in, `arm_state` and `joint_states` out; in lockstep or in real time."""
 
 import os
