@@ -9,8 +9,6 @@ import time
 import numpy as np
 
 from flexarm_bringup import parameter_files
-from flexarm_bringup.processes import Processes, own_domain
-from flexarm_bringup.shape.drawing import Drawer, Trail
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
 
@@ -123,6 +121,8 @@ def files(controller, arm):
 
 def start(options, stack):
     """Start the three nodes, on the user's domain or, without one, on a free one."""
+    from flexarm_bringup.processes import Processes, own_domain  # here: other commands need no ROS
+
     given = os.environ.get("ROS_DOMAIN_ID", "")
     domain = int(given) if given.isdigit() else stack.enter_context(own_domain())
     logs = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexarm-view-"))
@@ -169,6 +169,8 @@ class View:
                 self._turn()
 
     def _open(self, name):
+        from flexarm_bringup.shape.drawing import Drawer, Trail
+
         arm_model = model.build(arm_file.load(name))
         self.drawer = Drawer(arm_model)
         self.trail = Trail(TRAIL, 0.002 * self.drawer.reach)
