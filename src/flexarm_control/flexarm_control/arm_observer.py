@@ -339,9 +339,8 @@ HUGE_TORQUE = 1e9
 
 def check_finite(values, names, field):
     """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
-    if (
-        values.dot(values) < HUGE
-    ):  # what every usable sample is; one product costs a third of what follows
+    # So is every usable sample; one product costs a third of what follows.
+    if values.dot(values) < HUGE:
         return
     if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
         i = int(np.argmin(np.abs(values) < HUGE))

@@ -81,10 +81,8 @@ class CompositeControl:
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_share = 1.0
         self._last = None  # reference and interval of the last step
-        self._nominal = (
-            b"",
-            np.zeros(model.n_joints),
-        )  # of what motion, and the slow law's torque on it
+        # Of what motion, and the slow law's torque on it.
+        self._nominal = b"", np.zeros(model.n_joints)
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = feedforward
         if feedforward is not None:
