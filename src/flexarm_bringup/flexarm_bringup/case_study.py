@@ -388,11 +388,11 @@ def _print_tables(summary, references, figures, directory, report):
     if (directory / "R_m11_composite" / "bag").is_dir():
         print(f"Bags     {directory}/<run>/bag (MCAP): open in PlotJuggler or Foxglove")
     print(f"Numbers  {directory / 'summary.json'}")
-    print("Next     flexarm view two_link: an arm in the browser, to handle")
+    print("Next     ./flexarm view two_link: an arm in the browser, to handle")
     bag = directory.parent / "mine"
-    print(f"         flexarm simulate R --controller composite --trajectory paper --bag {bag}")
+    print(f"         ./flexarm simulate R --controller composite --trajectory paper --bag {bag}")
     if report is not None:
         print(
-            f"         flexarm report {bag} {directory / 'R_m11_composite'}: yours beside the paper's"
+            f"         ./flexarm report {bag} {directory / 'R_m11_composite'}: yours beside the paper's"
         )
-    print("         README.md, 'Run the nodes yourself'; docs/ for the rest")
+    print("         docs/guide.md, 'Run the nodes yourself'; docs/index.md for the rest")
