@@ -74,6 +74,32 @@ def test_looking_ahead_leaves_the_manifold_of_the_motion_out_of_the_step(arm_r):
     assert sum(helped[10:90]) == 1  # where the second motion took over
 
 
+def test_the_slow_torque_is_that_about_the_motion_as_it_is_now(arm_r):
+    """Of every sample anew: the torque of the motion less the slow law's on it, and the law's about it."""
+    control = composite.design(arm_r, SLOW, FAST, CORRECTED, {"feedforward": "model"})
+    motion, n, m = control.feedforward, arm_r.n_joints, arm_r.n_modes
+    L, U = control.manifold.error_response(motion.settings.configuration)
+    reference = ReferenceGenerator(arm_r.joint_names)
+    reference.start(np.zeros(n), 0)
+    point = [(100 * MS, [0.3], [0.0], [0.0], [])]
+    reference.offer(trajectory.validate(arm_r.joint_names, arm_r.joint_names, 0, point))
+    parts = []
+    for k in range(60):
+        reference.sample((k + 1) * MS)
+        q, qd = reference.position + 1e-3, reference.velocity - 2e-3
+        control.step(q, qd, np.zeros(m), np.zeros(m), reference, 1e-3 if k else 0.0)
+        law, error = control.slow, np.concatenate([q - motion.position, qd - motion.velocity])
+        nominal = law.nominal(arm_r.terms(motion.position, motion.velocity), motion.acceleration)
+        about = law.torque(q, qd, motion, arm_r.terms(q, qd))
+        parts.append(float(nominal[0]))
+        wanted = about + motion.torque - nominal + U @ error
+        np.testing.assert_allclose(control.slow_torque, wanted, rtol=1e-12)
+        off = motion.amplitude + (L @ error)[:m]
+        np.testing.assert_allclose(control.quasi_steady, off, rtol=1e-12)
+        control.look_ahead()
+    assert np.ptp(parts) > 1.0
+
+
 def test_a_control_without_feedforward_has_nothing_to_look_ahead_to(arm_r):
     control = composite.design(arm_r, SLOW, FAST, CORRECTED)
     control.look_ahead()

@@ -161,6 +161,20 @@ def test_joint_friction_helps_a_brake_to_stop_and_not_to_hold():
     assert 0.0 < stops[1] < 0.5 * stops[0]
 
 
+def test_a_joint_that_is_damped_hard_shakes_a_weak_brake_loose():
+    """Stretched out, nothing but the first joint's stopping moves the second."""
+    arm = replace(arm_file.load("rigid"), gravity=(0.0, 0.0, 0.0))
+    first, *rest = arm.joints
+    joints = (replace(first, safe_action="damp", damp_coefficient=50.0), *rest)
+    for torque, slips in ((1e-3, True), (1e3, False)):
+        weak = replace(joints[1], safe_action="brake", brake_torque=torque)
+        plant = Plant(model.build(replace(arm, joints=(joints[0], weak, *joints[2:]))), 1e-3)
+        plant.qd[0] = 1.0
+        _, qd, energy = run(plant, 5)
+        assert (qd[-1, 1] != 0.0) == slips
+        assert np.diff(energy).max() <= 0.0
+
+
 def test_shares_of_brakes_are_the_least_constraint():
     random = np.random.default_rng(5)
     for _ in range(200):
