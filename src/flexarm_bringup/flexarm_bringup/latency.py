@@ -212,7 +212,7 @@ class Chain:
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
 
     def mathematics(self):
-        """End the processes; median time of one call of observer and controller [s]."""
+        """End the processes; median time of one call of observer, controller and law [s]."""
         logs = CHAINS[self.name]
         self.processes.stop()
         found = {}
@@ -318,8 +318,8 @@ def table(rows):
     """Markdown table of `summary` rows."""
     lines = [
         "| arm, rate | | p50 [ms] | p95 | p99 | ratio of p50 | of p95 | late or missed | controller's step [ms] |"
-        " of relay's p50 |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        " of relay's p50 | the law in it [ms] | of relay's p50 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         t, r = row["latency_ms"], row["ratio"]
@@ -329,10 +329,10 @@ def table(rows):
         else:
             cells += [f"{r['p50']:.2f}", f"{r['p95']:.2f}"]
         cells.append(f"{100.0 * row['missed']:.1f} %")
-        step = row.get("controller_ms")
-        cells += (
-            ["", ""] if step is None else [f"{step:.3f}", f"{100 * row['controller_share']:.0f} %"]
-        )
+        for part in ("controller", "law"):
+            took = row.get(f"{part}_ms")
+            share = "" if took is None else f"{100 * row[f'{part}_share']:.0f} %"
+            cells += ["" if took is None else f"{took:.3f}", share]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

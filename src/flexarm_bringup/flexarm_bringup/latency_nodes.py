@@ -12,6 +12,7 @@ from time import perf_counter
 
 from flexarm_control.arm_controller import ArmController
 from flexarm_control.arm_observer import ArmObserver
+from flexarm_control.composite import CompositeControl
 from flexarm_sim.nodes import simulator
 
 
@@ -71,13 +72,27 @@ def timed(kind, key):
     return lambda: print(json.dumps({key: times}), flush=True)
 
 
+def timed_law():
+    """Time `CompositeControl.step`, the mathematics in a controller's step; printed at the end of the process."""
+    step, times = CompositeControl.step, []
+
+    def stepping(self, *state):
+        begin = perf_counter()
+        torque = step(self, *state)
+        times.append(perf_counter() - begin)
+        return torque
+
+    CompositeControl.step = stepping
+    return lambda: print(json.dumps({"law": times}), flush=True)
+
+
 def main():
     """Entry point of one process: ROLE, then what the node takes."""
     role = sys.argv.pop(1)
     if role == "simulator":
         simulator.SimulatorNode = TimedSimulator
         return simulator.main()
-    says = [timed(ArmController, "controller")] if "controller" in role else []
+    says = [timed_law(), timed(ArmController, "controller")] if "controller" in role else []
     says += [timed(ArmObserver, "observer")] if "observer" in role else []
     from flexarm_control.nodes import controller, observer, observer_controller
 

@@ -22,7 +22,7 @@ def test_ratios_are_taken_round_by_round():
     # The machine slows down threefold in the second round: the loop costs 1.5 of the relay in each.
     relay = {"windows": [window([1.0, 1.0, 2.0]), window([3.0, 3.0, 6.0]), window([1.0, 1.0, 2.0])]}
     loop = {"windows": [window([1.5, 1.5, 3.0]), window([4.5, 4.5, 9.0]), window([1.5, 1.5, 3.0])]}
-    loop["mathematics"] = {"controller": 1e-4}
+    loop["mathematics"] = {"controller": 1e-4, "law": 4e-5}
     bare, row = latency.summary(CASE, {"relay": relay, "three processes": loop})
     assert bare["latency_ms"]["p50"] == pytest.approx(1.0)
     assert row["latency_ms"]["p50"] == pytest.approx(1.5)
@@ -31,7 +31,7 @@ def test_ratios_are_taken_round_by_round():
     assert row["controller_share"] == pytest.approx(0.1)
     cells = latency.table([bare, row]).splitlines()[-1].split(" | ")
     assert cells[1:3] == ["three processes", "1.50"]
-    assert cells[-1].startswith("10 %")
+    assert cells[-4:] == ["0.100", "10 %", "0.040", "4 % |"]
 
 
 def test_missed_samples_count_with_those_answered():

@@ -123,7 +123,8 @@ class ArmController:
     def _take_limits(self, settings, limit):
         rate = np.array(settings["torque_rate_limit"])
         rate = np.where(rate > 0.0, rate, np.inf)
-        self._limit, self._rate_limit, self._settings = limit, rate, dict(settings)
+        self._limit, self._least, self._rate_limit = limit, -limit, rate
+        self._settings = dict(settings)
         self._rate_limited = bool(np.isfinite(rate).any())
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
@@ -454,12 +455,14 @@ class ArmController:
 
     def _limited(self, u, dt):
         """Torque within its size and rate, into `torque`."""
-        self._before[:] = self.torque
-        np.copyto(self.torque, u)
         if self._rate_limited:
+            self._before[:] = self.torque
             step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
             np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
+            np.copyto(self.torque, u)
             clip(self.torque, self._before - step, self._before + step)
+        else:
+            np.copyto(self.torque, u)
         # Last: the size holds whatever came before.
-        clip(self.torque, -self._limit, self._limit)
+        clip(self.torque, self._least, self._limit)
         self.saturated = bool((self.torque != u).any())

@@ -96,6 +96,7 @@ class OneLinkEquations(ArmModel):
         self._rotation = rotation(self.joint.origin_rpy)
         self._gravity = self._rotation.T @ np.asarray(arm.gravity)  # in the joint's frame
         self._gravity_plain = float(self._gravity[0]), float(self._gravity[1])
+        self._weighs = any(self._gravity_plain)
         self._terms_at_rest = self._constant_terms()
 
     def with_payload(self, scale):
@@ -129,7 +130,9 @@ class OneLinkEquations(ArmModel):
             + friction.coulomb * math.tanh(speed / friction.smoothing)
             - c.moment * across
         )
-        M, C1 = constant.M, constant.C1
+        M, C1, f2, K1 = constant.M, constant.C1, constant.f2, constant.K1
+        if self._weighs:
+            f2, K1 = -c.s * across, (c.s * along)[None, :]
         if delta is not None:
             M = M.copy()
             M[0, 0] += delta @ c.G @ delta
@@ -137,10 +140,10 @@ class OneLinkEquations(ArmModel):
         return Terms(
             M=M,
             f1=np.array([f1]),
-            f2=-c.s * across,
+            f2=f2,
             C1=C1,
             C2=c.D,
-            K1=(c.s * along)[None, :],
+            K1=K1,
             K2=c.K - speed**2 * c.G,
         )
 

@@ -174,14 +174,14 @@ def gains_along(model, path, period):
 class _Ahead:
     """The reference at a coming stamp, and what was worked out for it; the reference itself is left alone."""
 
-    def __init__(self, reference, dt):
-        self.path, self.dt = reference.path, dt
+    def __init__(self, reference, dt, limit):
+        self.path, self.dt, self.limit = reference.path, dt, limit
         self.start_ns, self.stamp_ns = self.path.start_ns, reference.stamp_ns + round(dt * SECOND)
         state = np.zeros((3, reference.position.size))
         self.path.evaluate(self.stamp_ns, state)
         self.position, self.velocity, self.acceleration = state
         self._near = np.zeros_like(state)
-        self.state = self.prepared = self.elapsed = self.wanted = None
+        self.state = self.torque = None
 
     def near(self, offset):
         self.path.near(self.stamp_ns, offset, self._near)
@@ -263,7 +263,7 @@ class ModelFeedforward(Feedforward):
     def take(self, plan, trajectory_id):
         if plan is not None:
             plan.trajectory_id = trajectory_id
-        self._prepared = plan
+        self._prepared, self._ahead = plan, None
 
     def reset(self):
         self._first, self._ahead = True, None
@@ -297,30 +297,30 @@ class ModelFeedforward(Feedforward):
 
     def update(self, reference, dt):
         ahead, self._ahead = self._ahead, None
-        if ahead is not None and not ahead.foresaw(reference, dt):
-            ahead = None
+        if ahead is not None and ahead.limit is self.limit and ahead.foresaw(reference, dt):
+            self.state[:], self.torque[:] = ahead.state, ahead.torque
+            self.acceleration[:] = ahead.acceleration
+            return
         if not self._first and dt > 0.0:  # the torque of the last sample has acted since
-            if ahead is None:
-                self._move(self.state, dt)
-            else:
-                self.state[:] = ahead.state
+            self._move(self.state, dt)
+        self._regulate(reference, self.state, self.torque)
+        self.acceleration[:] = reference.acceleration
+
+    def _regulate(self, reference, state, torque):
+        """The torque for a state of the simulated arm, which is put where it is wanted if it begins anew; in place."""
         prepared, elapsed = self._preparation(reference)
-        if ahead is not None and (prepared, elapsed) == (ahead.prepared, ahead.elapsed):
-            state, torque = ahead.wanted
-        else:
-            state, torque = self.wanted(reference, prepared, elapsed)
+        wanted, nominal = self.wanted(reference, prepared, elapsed)
         K = self.K
         if K is None and prepared is not None and prepared.gains is not None:
             K = prepared.gains.at(elapsed)
-        np.subtract(state, self.state, out=self._error)
+        np.subtract(wanted, state, out=self._error)
         if self._begins_anew(reference, K):
-            self.state[:] = state
+            state[:] = wanted
             self._error[:] = 0.0
-        np.copyto(self.torque, torque)
+        np.copyto(torque, nominal)
         if K is not None:
-            self.torque += K @ self._error
-        clip(self.torque, -self.limit, self.limit)
-        self.acceleration[:] = reference.acceleration
+            torque += K @ self._error
+        clip(torque, -self.limit, self.limit)
 
     def _move(self, state, dt):
         """Advance a state of the simulated arm in place, under the present torque."""
@@ -330,11 +330,10 @@ class ModelFeedforward(Feedforward):
     def look_ahead(self, reference, dt):
         if self._first or dt <= 0.0 or reference.path is None:
             return None
-        ahead = _Ahead(reference, dt)
-        ahead.state = self.state.copy()
+        ahead = _Ahead(reference, dt, self.limit)
+        ahead.state, ahead.torque = self.state.copy(), self.torque.copy()
         self._move(ahead.state, dt)
-        ahead.prepared, ahead.elapsed = self._preparation(ahead)
-        ahead.wanted = self.wanted(ahead, ahead.prepared, ahead.elapsed)
+        self._regulate(ahead, ahead.state, ahead.torque)
         self._ahead = ahead
         n, size = self.model.n_joints, ahead.state.size // 2
         return ahead.state[:n], ahead.state[size : size + n], ahead.acceleration

@@ -39,16 +39,18 @@ class LinearModelFollowing(SlowLaw):
         self.kp = np.array(self.parameters["kp"])
         self.kv = np.array(self.parameters["kv"])
         self.printed = self.parameters["gain"] == "h11"
-        self._cached = (None, None)
+        self._cached = (None, None, None)
 
     def B_inverse(self, terms):
         """The matrix in front of the bracket of (17), shape (n, n) [kg m^2]."""
-        # M of (2) is one object as long as it is constant; K1, gravity's, makes B depend on q besides.
-        if self._cached[0] is not terms.M or terms.K1.any():
+        # M of (2) and gravity's K1, which B depends on besides, are each one object as long as they are constant.
+        M, K1, inverse = self._cached
+        if M is not terms.M or K1 is not terms.K1:
             n = terms.n
             B = terms.H[:n, :n] if self.printed else slow_subsystem(terms)[1]
-            self._cached = (terms.M, np.linalg.inv(B))
-        return self._cached[1]
+            inverse = np.linalg.inv(B)
+            self._cached = terms.M, terms.K1, inverse
+        return inverse
 
     def nominal(self, terms, acceleration):
         return self.B_inverse(terms) @ acceleration

@@ -89,10 +89,14 @@ class Path:
         self._once = np.arange(1.0, order)[:, None]
         self._twice = self._once[:-1] * self._once[1:]
         self._x = np.zeros(())
+        self._last = np.zeros(
+            (3, n)
+        )  # what was evaluated last: looked up ahead first, then sampled
         self._forget_segment()
 
     def _forget_segment(self):
         self._segment, self._low_ns, self._high_ns = -1, 0, 0
+        self._last_ns = -1
 
     def begin(self, start_ns, reference):
         """Start at a stamp [ns] from a (3, n) reference state; may be called again."""
@@ -113,9 +117,14 @@ class Path:
         if elapsed_ns >= self.duration_ns:
             np.copyto(out, self._end)
             return False
+        if elapsed_ns == self._last_ns:
+            np.copyto(out, self._last)
+            return True
         if not self._low_ns <= elapsed_ns < self._high_ns:
             self._enter_segment(elapsed_ns)
         self._horner((elapsed_ns - self._low_ns) / SECOND, out)
+        np.copyto(self._last, out)
+        self._last_ns = elapsed_ns
         return True
 
     def near(self, stamp_ns, offset, out):
