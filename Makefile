@@ -71,7 +71,7 @@ compare: build
 	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
 
 # The table of docs/latency.md, of a whole run alone.
-LATENCY_OUT := --write docs/latency.md
+LATENCY_OUT := --redesign --write docs/latency.md
 latency: build
 	@. tools/env.sh && python -m flexarm_bringup.cli latency $(if $(LATENCY_ARGS),$(LATENCY_ARGS),$(LATENCY_OUT))
 

@@ -200,12 +200,16 @@ class Chain:
 
     def window(self, seconds):
         """Let it run for a while; what the simulator found."""
-        before = len(self._said("simulator"))
+        before = len(self.figures())
         self.pause(False)
         time.sleep(seconds)
         self.pause(True)
-        said = self.wait_for("the simulator's figures", lambda: self._said("simulator")[before:])
+        said = self.wait_for("the simulator's figures", lambda: self.figures()[before:])
         return said[-1]
+
+    def figures(self):
+        """What the simulator found, one for each window so far."""
+        return self._said("simulator")
 
     def _said(self, name):
         lines = self.processes.log(name).splitlines()
@@ -364,6 +368,11 @@ def add_arguments(parser):
         default="executor",
         help="relay's nodes served by rclpy's executor (default), or as the loop's nodes are",
     )
+    parser.add_argument(
+        "--redesign",
+        action="store_true",
+        help="then, at 500 Hz, the loop while its fast law is designed anew; three minutes more",
+    )
     parser.add_argument("--json", metavar="FILE", help="all figures, window by window")
     parser.add_argument("--write", metavar="FILE", help="put the table between a file's markers")
 
@@ -381,26 +390,51 @@ def chosen(options):
     return cases
 
 
-def latency(options):
-    """The sub-command."""
-    rows, everything = [], []
-    for case in chosen(options):
-        rounds = options.rounds or (3 if options.quick else 5)
-        chains = tuple(CHAINS)[:2] if options.quick else tuple(CHAINS)
-        # Planning a motion of many joints takes longer than a quick run may.
-        moving = not (options.quick and case.file)
-        found = measure(case, rounds, chains, options.relay_spin, moving)
-        mine = summary(case, found)
-        print(table(mine) if not rows else "\n".join(table(mine).splitlines()[2:]), flush=True)
-        for row in mine:
-            if row["chain"] != "relay" and row["enabled"] < 0.99:
+def _table_of(everything, cases, options, measured):
+    """Measure case by case, and print as it goes; the table of all, whose figures are added to `everything`."""
+    text = ""
+    for case in cases:
+        found, rows, made = measured(case, options)
+        more = "\n".join(made.splitlines()[2:]) if text else made
+        print(more, flush=True)
+        text = f"{text}\n{more}" if text else more
+        for row in rows:
+            if row.get("chain", "relay") != "relay" and row["enabled"] < 0.99:
                 share = f"{100.0 * row['enabled']:.0f} %"
                 print(
                     f"{row['case']}, {row['chain']}: torque was enabled in {share} of the samples"
                 )
-        rows += mine
-        everything.append({"case": case.name, "moving": moving, "found": found, "rows": mine})
+        everything.append({"case": case.name, "found": found, "rows": rows})
+    return text
+
+
+def _beside_the_relay(case, options):
+    rounds = options.rounds or (3 if options.quick else 5)
+    chains = tuple(CHAINS)[:2] if options.quick else tuple(CHAINS)
+    # Planning a motion of many joints takes longer than a quick run may.
+    moving = not (options.quick and case.file)
+    found = measure(case, rounds, chains, options.relay_spin, moving)
+    rows = summary(case, found)
+    return found, rows, table(rows)
+
+
+def _while_designing(case, options):
+    from . import latency_redesign
+
+    found = latency_redesign.measure(case, options.rounds or 10)
+    rows = latency_redesign.summary(case, found)
+    return found, rows, latency_redesign.table(rows)
+
+
+def latency(options):
+    """The sub-command."""
+    tables, everything = [], []
+    cases = chosen(options)
+    tables.append(_table_of(everything, cases, options, _beside_the_relay))
+    if options.redesign:
+        again = [case for case in cases if case.rate == 500.0]
+        tables.append(_table_of(everything, again, options, _while_designing))
     if options.json:
         Path(options.json).write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
     if options.write:
-        write(options.write, table(rows))
+        write(options.write, "\n\n".join(tables))

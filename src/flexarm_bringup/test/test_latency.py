@@ -6,7 +6,7 @@ import argparse
 import numpy as np
 import pytest
 
-from flexarm_bringup import latency
+from flexarm_bringup import latency, latency_redesign
 from flexarm_dynamics.errors import FlexarmError
 
 CASE = latency.CASES[1]
@@ -32,6 +32,20 @@ def test_ratios_are_taken_round_by_round():
     cells = latency.table([bare, row]).splitlines()[-1].split(" | ")
     assert cells[1:3] == ["three processes", "1.50"]
     assert cells[-4:] == ["0.100", "10 %", "0.040", "4 % |"]
+
+
+def test_redesigning_is_compared_within_each_round():
+    found = {
+        latency_redesign.NOTHING: [window([1.0]), window([3.0]), window([1.0])],
+        latency_redesign.ALPHA: [window([1.1]), window([3.3]), window([5.0])],
+    }
+    rows = latency_redesign.summary(CASE, found)
+    assert rows[0]["ratio"] == pytest.approx({"p50": 1.0, "p95": 1.0, "p99": 1.0})
+    assert rows[1]["latency_ms"]["p99"] == pytest.approx(3.3)
+    assert rows[1]["ratio"]["p99"] == pytest.approx(1.1)
+    text = latency_redesign.table(rows).splitlines()
+    assert text[-1] == "| R, 500 Hz | `fast.alpha` set | 3.30 | 3.30 | 3.30 | 1.10 | 1.10 | 1.10 |"
+    assert all(line.count("|") == text[0].count("|") for line in text)
 
 
 def test_missed_samples_count_with_those_answered():

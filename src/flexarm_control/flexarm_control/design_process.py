@@ -88,9 +88,19 @@ def _begin(arm, parent, niceness):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:
             os._exit(0)
-    # Not SCHED_IDLE: on a machine that is always busy no design would ever be done.
-    os.nice(niceness)
+    _step_back(niceness)
     _own["model"] = models.build(arm)
+
+
+def _step_back(niceness):
+    """An ordinary process of lower priority, whatever priority the parent has, on CPUs that the parent leaves."""
+    if hasattr(os, "sched_setscheduler"):  # Linux
+        # Not SCHED_IDLE: on a machine that is always busy no design would ever be done.
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        all_of_them = set(range(os.cpu_count() or 1))
+        left = all_of_them - os.sched_getaffinity(0)
+        os.sched_setaffinity(0, left or all_of_them)
+    os.nice(niceness)
 
 
 def _work(function, data):
