@@ -266,7 +266,7 @@ def nonlinear_table(summaries, references):
     return lines
 
 
-def demo(directory, show, nodes=True):
+def demo(directory, show, nodes=True, as_json=False):
     """All runs, figures, bags, ``summary.json``, and the tables.
 
     Parameters
@@ -277,6 +277,8 @@ def demo(directory, show, nodes=True):
         Where to say what is going on.
     nodes : bool
         Three processes over DDS; False: the loop without ROS.
+    as_json : bool
+        Print what ``summary.json`` holds, and no tables.
 
     Returns
     -------
@@ -324,7 +326,10 @@ def demo(directory, show, nodes=True):
         show.step("report of the composite and the slow control")
         report = _report(directory)
     show.done()
-    _print_tables(summary, references, figures, directory, report)
+    if as_json:
+        print(json.dumps(summary, indent=1, allow_nan=False))
+    else:
+        _print_tables(summary, references, figures, directory, report)
     return summary
 
 

@@ -2,18 +2,36 @@
 """The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
 
 import argparse
+import os
 import re
 import signal
 import sys
 
 from flexarm_dynamics.errors import FlexarmError
 
+#: Below the options of every command.
+EXIT_CODES = (
+    "exit code: 0 done, 1 an error or a failed check, said on standard error, 2 wrong usage, 130 Ctrl-C,"
+    " 143 terminated"
+)
+
+
+class Help(argparse.HelpFormatter):
+    """Leaves examples as they are, a line each, to be copied; fills the rest."""
+
+    def _fill_text(self, text, width, indent):
+        lines = []
+        for line in text.splitlines():
+            keep = line.startswith(("example", "  "))
+            lines.append(indent + line if keep else super()._fill_text(line, width, indent))
+        return "\n".join(lines)
+
 
 def _demo(options):
     from .case_study import demo
     from .progress import Progress
 
-    demo(options.out, Progress(), nodes=not options.without_ros)
+    demo(options.out, Progress(), nodes=not options.without_ros, as_json=options.json)
 
 
 def _publish(options):
@@ -23,8 +41,6 @@ def _publish(options):
 
 
 def _run(options):
-    import os
-
     from .processes import executable
 
     path = executable(options.package, options.executable)
@@ -128,10 +144,14 @@ def _report(options):
 
 
 def _parameters(options):
-    from .parameter_tables import tables, write
+    import json
+
+    from .parameter_tables import plain, tables, write
 
     if options.write:
         write(options.write)
+    elif options.json:
+        print(json.dumps(plain(), indent=1))
     else:
         print(tables())
 
@@ -155,6 +175,7 @@ def parser():
         action="store_true",
         help="the same objects in one process, no DDS, no bags",
     )
+    demo.add_argument("--json", action="store_true", help="print summary.json, not the tables")
     demo.set_defaults(function=_demo)
 
     _add_arm_commands(commands)
@@ -194,7 +215,7 @@ def parser():
         help="an arm in the browser, live: its shape, errors, torques; gains, motions and stops by hand",
         description="Starts simulator, observer and controller in real time, and a page on this machine that shows"
         " and handles them; with --attach, the page alone, of nodes that run.",
-        epilog="examples: flexarm view two_link; flexarm view R --attach --namespace left",
+        epilog="examples:\n  flexarm view two_link\n  flexarm view R --attach --namespace left",
     )
     add_view_arguments(view)
     view.set_defaults(function=_view)
@@ -215,7 +236,7 @@ def parser():
     latency = commands.add_parser(
         "latency",
         help="measurement to torque of the running loop, beside a bare relay of the same messages",
-        description="Runs loop and relay in real time, in turns, at several rates; three to four minutes.",
+        description="Runs loop and relay in real time, in turns, at several rates; some five minutes.",
         epilog="example: flexarm latency --quick --json results/latency.json",
     )
     add_latency_arguments(latency)
@@ -228,7 +249,11 @@ def parser():
         epilog="example: flexarm parameters --write docs/parameters.md",
     )
     parameters.add_argument("--write", metavar="FILE", help="rewrite the tables of this file")
+    parameters.add_argument("--json", action="store_true", help="print the declarations as JSON")
     parameters.set_defaults(function=_parameters)
+    for command in commands.choices.values():
+        command.formatter_class = Help
+        command.epilog += f"\n{EXIT_CODES}"
     return top
 
 
@@ -241,8 +266,8 @@ def _add_arm_commands(commands):
         help="simulate an arm under given torques, moved as prescribed, or under a controller",
         description="Simulates an arm from rest: under torques over time, with its joints moved as prescribed, or"
         " in a loop with an observer and a controller, of which it tells how well they did.",
-        epilog="examples: flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv;"
-        " flexarm simulate R --controller paper_composite --trajectory paper --payload-scale 2",
+        epilog="examples:\n  flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv"
+        "\n  flexarm simulate R --controller paper_composite --trajectory paper --payload-scale 2",
     )
     simulate.add_arguments(command)
     command.set_defaults(function=_simulate)
@@ -394,6 +419,9 @@ def main(argv=None):
     except FlexarmError as error:
         print(f"flexarm {options.command}: {error}", file=sys.stderr)
         sys.exit(1)
+    except BrokenPipeError:  # whoever reads it has enough, `head` say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except OSError as error:
         print(f"flexarm {options.command}: {error}", file=sys.stderr)
         sys.exit(1)

@@ -228,7 +228,14 @@ class Chain:
         return found
 
 
-def measure(case, rounds, chains=tuple(CHAINS), relay_spin="executor", moving=True):
+def measure(
+    case,
+    rounds,
+    chains=tuple(CHAINS),
+    relay_spin="executor",
+    moving=True,
+    fraction=lambda done: None,
+):
     """Windows of a case, in turns.
 
     Parameters
@@ -241,6 +248,8 @@ def measure(case, rounds, chains=tuple(CHAINS), relay_spin="executor", moving=Tr
         How the relay's nodes are served: ``executor``, by rclpy; ``line``, as the loop's nodes are.
     moving : bool
         Whether the arm moves.
+    fraction : callable
+        Is told how much is done, 0 to 1.
 
     Returns
     -------
@@ -262,6 +271,7 @@ def measure(case, rounds, chains=tuple(CHAINS), relay_spin="executor", moving=Tr
             # In another order each time: none of them always comes first.
             for chain in made[i % len(made) :] + made[: i % len(made)]:
                 out[chain.name]["windows"].append(chain.window(case.window))
+            fraction((i + 1) / rounds)
         for chain in made:
             out[chain.name]["mathematics"] = chain.mathematics()
     return out
@@ -392,9 +402,15 @@ def chosen(options):
 
 def _table_of(everything, cases, options, measured):
     """Measure case by case, and print as it goes; the table of all, whose figures are added to `everything`."""
-    text = ""
-    for case in cases:
-        found, rows, made = measured(case, options)
+    from .progress import Progress
+
+    text, progress = "", Progress()
+    for i, case in enumerate(cases):
+        progress.step(
+            f"{measured.__name__.strip('_').replace('_', ' ')}: {case.name}", i + 1, len(cases)
+        )
+        found, rows, made = measured(case, options, progress)
+        progress.done()
         more = "\n".join(made.splitlines()[2:]) if text else made
         print(more, flush=True)
         text = f"{text}\n{more}" if text else more
@@ -408,20 +424,20 @@ def _table_of(everything, cases, options, measured):
     return text
 
 
-def _beside_the_relay(case, options):
+def _beside_the_relay(case, options, progress):
     rounds = options.rounds or (3 if options.quick else 5)
     chains = tuple(CHAINS)[:2] if options.quick else tuple(CHAINS)
     # Planning a motion of many joints takes longer than a quick run may.
     moving = not (options.quick and case.file)
-    found = measure(case, rounds, chains, options.relay_spin, moving)
+    found = measure(case, rounds, chains, options.relay_spin, moving, progress.fraction)
     rows = summary(case, found)
     return found, rows, table(rows)
 
 
-def _while_designing(case, options):
+def _while_designing(case, options, progress):
     from . import latency_redesign
 
-    found = latency_redesign.measure(case, options.rounds or 10)
+    found = latency_redesign.measure(case, options.rounds or 10, progress.fraction)
     rows = latency_redesign.summary(case, found)
     return found, rows, latency_redesign.table(rows)
 

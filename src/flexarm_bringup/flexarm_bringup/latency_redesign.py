@@ -94,7 +94,7 @@ class Setter:
             self.answers.append(answer.result().result)
 
 
-def measure(case, rounds):
+def measure(case, rounds, fraction=lambda done: None):
     """Windows of a case, in turns.
 
     Parameters
@@ -102,6 +102,8 @@ def measure(case, rounds):
     case : Case
         Of an arm of `REDESIGNS`.
     rounds : int
+    fraction : callable
+        Is told how much is done, 0 to 1.
 
     Returns
     -------
@@ -127,6 +129,7 @@ def measure(case, rounds):
         for i in range(rounds):
             for kind in kinds if i % 2 == 0 else kinds[::-1]:
                 found[kind].append(setter.window(kind))
+            fraction((i + 1) / rounds)
         chain.processes.stop()
     for answer in setter.answers:
         if not answer.successful:
@@ -135,7 +138,7 @@ def measure(case, rounds):
 
 
 def summary(case, found):
-    """Rows of the table: percentiles [ms], and the ratio of each round's to that without.
+    """Rows of the table of one case: percentiles [ms], and the ratio of each round's to that without.
 
     `found` has the windows by what was done in them.
 

@@ -20,6 +20,8 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_sim.plant import Plant
 from flexarm_sim.sensors import Sensors
 
+from .progress import Progress
+
 #: Observers that hear the truth have no error to show.
 LEFT_OUT = ("true_rates",)
 #: Steps of the reference: size [rad] and time between them [s].
@@ -59,6 +61,7 @@ def observers(options):
         options.observers.split(",") if options.observers else None,
         options.duration,
         options.seed,
+        Progress(),
     )
     if options.json:
         print(json.dumps(rows, indent=1))
@@ -69,7 +72,7 @@ def observers(options):
         print("| " + " | ".join(_word(row[c]) for c in COLUMNS) + " |")
 
 
-def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0):
+def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress=None):
     """Errors of the observers' rates.
 
     Parameters
@@ -87,6 +90,7 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0):
     duration : float
         [s]
     seed : int
+    progress : Progress, optional
 
     Returns
     -------
@@ -106,10 +110,12 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0):
             raise FlexarmError(
                 f"{rate:g} Hz for {duration:g} s: from 10 to {MOST_SAMPLES} samples are possible"
             )
+        if progress is not None:
+            progress.step(f"{known.name} at {rate:g} Hz")
         truth, torques = motion(model.build(known), rate, duration, seed)
         for label, (strain, counts) in noises.items():
             sensed = model.build(_with_noise(known, strain, counts))
-            for name in names:
+            for i, name in enumerate(names):
                 for delay, predicted in _cases(delays):
                     values = {"delay": delay if predicted else 0.0}
                     heard = listen(
@@ -118,6 +124,11 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0):
                     errors = _errors(heard, truth, delay * rate, sensed)
                     head = (name, rate, label, 1e3 * delay, predicted)
                     rows.append(dict(zip(COLUMNS, (*head, *errors), strict=True)))
+                if progress is not None:
+                    done = list(noises).index(label) * len(names) + i + 1
+                    progress.fraction(done / (len(noises) * len(names)))
+    if progress is not None:
+        progress.done()
     return rows
 
 

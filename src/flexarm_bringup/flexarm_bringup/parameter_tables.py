@@ -38,6 +38,28 @@ def tables():
     return "\n".join(lines).rstrip()
 
 
+def plain():
+    """The declarations as plain data: node to a list of parameters."""
+    return {
+        node: [
+            {
+                "name": prefix + p.name,
+                "type": p.kind,
+                "default": p.default,
+                "unit": p.unit,
+                "low": p.low,
+                "high": p.high,
+                "choices": list(p.choices),
+                "read_only": p.read_only,
+                "description": p.description,
+            }
+            for prefix, declared in by_prefix.items()
+            for p in declared
+        ]
+        for node, by_prefix in groups().items()
+    }
+
+
 def _row(prefix, p):
     default = f"`{p.default!r}`".replace("'", '"').replace("True", "true").replace("False", "false")
     if p.choices:

@@ -2,6 +2,7 @@
 """Publishes a motion, or writes it to a file: ``ros2 run flexarm_bringup publish_trajectory``."""
 
 import argparse
+import json
 import math
 import sys
 import time
@@ -75,6 +76,7 @@ def add_arguments(parser):
         metavar="FILE",
         help="write it to a .csv or .yaml file for later, publish nothing; starts as --dry-run does",
     )
+    parser.add_argument("--json", action="store_true", help="say it as JSON")
     parser.add_argument("--topic", default="joint_trajectory", help="topic to publish on")
     parser.add_argument(
         "--timeout", type=float, default=10.0, help="longest wait for a controller [s] (default 10)"
@@ -139,39 +141,71 @@ def prepare(options):
     arm = model.build(arm_file.load(options.arm))
     profile = profile_of(options, np.zeros(arm.n_joints), arm)
     trajectory = specs.sampled(profile, arm, points_of(options))
+    said = {"profile": options.profile, "duration_s": profile.duration}
     if options.dry_run:
-        print(description(options.profile, profile, arm))
+        said |= effects(profile, arm)
+        if not options.json:
+            print(description(said))
     if options.out:
         files.write(options.out, trajectory)
-        print(f"{options.out}: {len(trajectory.times_ns)} points, {profile.duration:g} s")
+        said |= {"out": options.out, "points": len(trajectory.times_ns)}
+        if not options.json:
+            print(f"{options.out}: {said['points']} points, {profile.duration:g} s")
+    if options.json:
+        print(json.dumps(said, allow_nan=False))
 
 
-def description(name, profile, arm):
-    """Peaks of a motion and of its slow torque, and the vibrations that it leaves without fast control."""
+def effects(profile, arm):
+    """Peaks of a motion and of its slow torque, and the vibrations that it leaves without fast control; plain data."""
     from flexarm_control import excitation
 
     excited = excitation.along(arm, profile)
     speed = np.abs(profile.velocity(excited.times)).max(axis=0)
-    lines = [f"{name}: {profile.duration:.6g} s"]
-    for i, joint in enumerate(arm.arm.joints):
-        limits = joint.limits
+    joints = [
+        {
+            "name": joint.name,
+            "from_rad": float(profile.start[i]),
+            "to_rad": float(profile.start[i] + profile.angle[i]),
+            "peak_speed_rad_s": float(speed[i]),
+            "speed_limit_rad_s": _limit(joint.limits.velocity),
+            "peak_slow_torque_Nm": float(excited.peak_torque[i]),
+            "torque_limit_Nm": _limit(joint.limits.torque),
+        }
+        for i, joint in enumerate(arm.arm.joints)
+    ]
+    if not arm.n_modes:
+        return {"joints": joints}
+    energies = {"mean": float(excited.transient), "left_at_the_end": float(excited.residual)}
+    return {"joints": joints, "vibration_energy_J": energies}
+
+
+def description(said):
+    """What `prepare` found, for people."""
+    lines = [f"{said['profile']}: {said['duration_s']:.6g} s"]
+    for joint in said["joints"]:
+        torque, limit = joint["peak_slow_torque_Nm"], joint["torque_limit_Nm"]
         lines.append(
-            f"  {joint.name}: {profile.start[i]:.4g} to {profile.start[i] + profile.angle[i]:.4g} rad, at most"
-            f" {speed[i]:.4g} rad/s{_of(limits.velocity)}, slow torque {excited.peak_torque[i]:.4g} N m"
-            f"{_of(limits.torque)}"
+            f"  {joint['name']}: {joint['from_rad']:.4g} to {joint['to_rad']:.4g} rad, at most"
+            f" {joint['peak_speed_rad_s']:.4g} rad/s{_of(joint['speed_limit_rad_s'])}, slow torque"
+            f" {torque:.4g} N m{_of(limit)}"
         )
-        if excited.peak_torque[i] > limits.torque:
+        if limit is not None and torque > limit:
             lines[-1] += ": it will be clipped; give it more time"
-    if arm.n_modes:
+    if "vibration_energy_J" in said:
+        energy = said["vibration_energy_J"]
         lines.append(
-            f"  vibration about the quasi-steady state, without fast control: {excited.transient:.3g} J on"
-            f" average, {excited.residual:.3g} J left at the end"
+            f"  vibration about the quasi-steady state, without fast control: {energy['mean']:.3g} J on"
+            f" average, {energy['left_at_the_end']:.3g} J left at the end"
         )
     return "\n".join(lines)
 
 
+def _limit(value):
+    return float(value) if math.isfinite(value) else None
+
+
 def _of(limit):
-    return f" of {limit:g}" if math.isfinite(limit) else ""
+    return "" if limit is None else f" of {limit:g}"
 
 
 class _Conversation:
@@ -261,9 +295,17 @@ def publish(options, ros_args=None):
         )
         if line.state.accepted_trajectory_id == before.accepted_trajectory_id:
             raise FlexarmError(f"refused: {line.state.rejected_reason}")
+        said = {
+            "profile": options.profile,
+            "trajectory_id": line.state.accepted_trajectory_id,
+            "points": len(message.points),
+            "duration_s": profile.duration,
+        }
         print(
-            f"{options.profile}: accepted as trajectory {line.state.accepted_trajectory_id},"
-            f" {len(message.points)} points, {profile.duration:g} s"
+            json.dumps(said)
+            if options.json
+            else f"{options.profile}: accepted as trajectory {said['trajectory_id']}, {said['points']} points,"
+            f" {profile.duration:g} s"
         )
     finally:
         line.close()

@@ -6,6 +6,7 @@ takes. The arm's name is asked of the nodes, and the text of its file goes into 
 """
 
 import datetime
+import json
 import sys
 import time
 from pathlib import Path
@@ -33,6 +34,7 @@ def add_arguments(parser):
     parser.add_argument(
         "--arm", help="arm file that goes into the bag; asked of the nodes if not given"
     )
+    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
 
 
 def record(options):
@@ -54,11 +56,11 @@ def record(options):
         arm_file.load(options.arm)  # refused here, and not after the recording
     with Listener(options.namespace) as listener:
         listener.wait_for_first(PATIENCE)
-        _take(listener, out, options.arm, duration)
+        _take(listener, out, options.arm, duration, options.json)
     return out
 
 
-def _take(listener, out, arm, duration):
+def _take(listener, out, arm, duration, as_json=False):
     """Record until the duration is over, Ctrl-C or SIGTERM; what was counted."""
     from .recorder import BagWriter
 
@@ -81,7 +83,7 @@ def _take(listener, out, arm, duration):
         taken.take(listener.poll(), time.time_ns())
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    taken.tell(out)
+    taken.tell(out, as_json)
     if isinstance(ended, SystemExit):
         raise ended
     return taken
@@ -141,8 +143,12 @@ class Taken:
             )
             sys.stderr.flush()
 
-    def tell(self, out):
+    def tell(self, out, as_json=False):
         """The last lines: what is in the bag, and what to do with it."""
+        if as_json:
+            said = {"out": str(out), "arm": self.arm or None, "seconds": self.seconds}
+            print(json.dumps(said | {"messages": self.counts}))
+            return
         there = [f"{count} {topic}" for topic, count in self.counts.items() if count]
         missing = [topic for topic, count in self.counts.items() if not count]
         print(f"{out}: {self.seconds:.1f} s; {', '.join(there)}")

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm urdf``: the URDF of an arm file, links that bend as chains of short rigid pieces. No ROS."""
 
+import json
 from pathlib import Path
 
 from flexarm_dynamics import model
@@ -16,6 +17,7 @@ def add_arguments(parser):
         "--pieces", type=int, default=8, help="rigid pieces of each flexible link (default 8)"
     )
     parser.add_argument("--out", metavar="FILE", help="write it there instead of printing it")
+    parser.add_argument("--json", action="store_true", help="print joints and text as JSON")
     add_model_arguments(parser)
 
 
@@ -23,8 +25,11 @@ def urdf(options):
     """Run the sub-command."""
     chain = PieceChain(model.build(load_arm(options)), options.pieces)
     text = chain.urdf()
-    if not options.out:
+    if options.out:
+        Path(options.out).write_text(text, encoding="utf-8")
+    if options.json:
+        print(json.dumps({"out": options.out, "joints": list(chain.joint_names), "urdf": text}))
+    elif not options.out:
         print(text, end="")
-        return
-    Path(options.out).write_text(text, encoding="utf-8")
-    print(f"{options.out}: {len(chain.joint_names)} joints, frames from base_link on")
+    else:
+        print(f"{options.out}: {len(chain.joint_names)} joints, frames from base_link on")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: help, wrong usage, options of the commands, progress."""
+"""The command line: wrong usage, options of `publish`, progress."""
 
 import argparse
 import io
@@ -14,8 +14,6 @@ from flexarm_control import profiles, shapers
 from flexarm_control.trajectory import files
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
-
-COMMANDS = ("demo", "publish", "run", "parameters")
 
 
 def exit_code(words):
@@ -34,22 +32,7 @@ def profile(*words, reference=(0.0,)):
     return publish_trajectory.profile_of(options(*words), list(reference))
 
 
-# --------------------------------------------------------------------------- help and usage
-
-
-def test_help_lists_every_command(capsys):
-    assert exit_code(["--help"]) == 0
-    out = capsys.readouterr().out
-    for command in COMMANDS:
-        assert command in out
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_an_example(command, capsys):
-    assert exit_code([command, "--help"]) == 0
-    out = capsys.readouterr().out
-    assert f"flexarm {command}" in out
-    assert "example:" in out
+# --------------------------------------------------------------------------- usage
 
 
 @pytest.mark.parametrize(

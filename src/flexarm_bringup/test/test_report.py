@@ -228,6 +228,17 @@ def test_the_page_is_whole_small_and_needs_no_network(compared):
         assert name in checker.ids
 
 
+def test_the_numbers_of_the_page_as_json(recorded, runs, tmp_path, capsys):
+    paths = [str(path) for path, _, _ in recorded.values()]
+    with pytest.raises(SystemExit) as end:
+        cli.main(["report", *paths, "--out", str(tmp_path / "both.html"), "--json"])
+    assert end.value.code == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (tmp_path / "both.html").is_file() and said["report"] == str(tmp_path / "both.html")
+    for name, numbers in said["runs"].items():
+        assert numbers["residual_m"] == pytest.approx(analysis.summary(runs[name])["residual_m"])
+
+
 def test_two_runs_stand_side_by_side(compared, runs):
     assert "2 runs side by side" in compared
     composite, slow = (analysis.summary(runs[name]) for name in ("composite", "slow"))

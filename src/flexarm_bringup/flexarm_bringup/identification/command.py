@@ -10,6 +10,7 @@ import numpy as np
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
+from ..progress import Progress
 from . import recording as recordings
 from .arm_text import rewritten
 from .derived import derived
@@ -58,13 +59,17 @@ def identify(options):
             raise FlexarmError(f"--out {out}: that is the arm file itself; give another name")
         out.parent.mkdir(parents=True, exist_ok=True)
     arm = arm_file.load(options.arm)
+    progress = Progress()
+    progress.step("measure" if options.live is not None else f"read {options.recording}")
     if options.live is not None:
         from .live import record
 
         measured = record(arm, options.live, options.namespace)
     else:
         measured = recordings.read(options.recording, arm, options.namespace)
+    progress.step(f"fit {arm.name} to {len(measured.position)} samples")
     found = fit(arm, measured, options.hold, options.undetermined)
+    progress.done()
     result = summary(found, measured, options.recording or "a running arm")
     if out:
         text = arm_file.find(options.arm).read_text(encoding="utf-8")

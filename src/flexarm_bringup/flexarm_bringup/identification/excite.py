@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm excite``: shakes a running arm with the node `excite`, and writes a bag of what it did meanwhile."""
 
+import json
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from flexarm_control import excitation_run
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
+from ..progress import Progress
 from .live import PATIENCE, Graph
 
 #: Wall time without a new state after which the arm is taken for lost [s].
@@ -37,6 +39,7 @@ def add_arguments(parser):
             help=f"{p.description}{unit}{default}".replace("%", "%%"),
         )
     parser.add_argument("--namespace", default="", help="of the arm's topics")
+    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
 
 
 def excite(options):
@@ -62,12 +65,20 @@ def excite(options):
         graph.wait_for(lambda: states, PATIENCE, silence)
         if graph.tap.publishers("joint_torque"):
             raise FlexarmError("a controller sends joint_torque: stop it")
+        progress = Progress()
+        progress.step(f"shake {options.arm}")
         said = _run(options, graph)
+        progress.done()
         kept = between(graph.tap.messages(), graph.tap.raw)
     if not kept["joint_torque"]:
         raise FlexarmError(f"no torque was sent:\n{said}")
     write_bag(out, kept, options.arm)
-    print(f"{len(kept['arm_state'])} states in {out}")
+    count = len(kept["arm_state"])
+    print(
+        json.dumps({"out": str(out), "states": count})
+        if options.json
+        else f"{count} states in {out}"
+    )
     if "excitation complete" not in said:
         raise FlexarmError(f"{_ending(said) or said}; what came before is in {out}")
     return out

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm report``: what bags show, on one page of HTML."""
 
+import json
 import time
 import webbrowser
 from pathlib import Path
@@ -32,13 +33,24 @@ def add_arguments(parser):
         metavar="NS",
         help="of the one arm that is wanted; all in the bag if not given",
     )
+    parser.add_argument(
+        "--json", action="store_true", help="print the summary's numbers of each run as JSON"
+    )
     parser.add_argument("--open", action="store_true", help="open the page in a browser")
 
 
 def report(options):
     """Run ``report``; the page's path."""
-    made = make(options.bags, options.out, options.arm, options.namespace, Progress())
-    print(f"report {made} ({made.stat().st_size / 1e6:.2f} MB): open it in a browser")
+    progress, out = Progress(), _page_file(options.out)
+    runs = read(options.bags, options.arm, options.namespace, progress)
+    made = _write(runs, out, progress)
+    if options.json:
+        from .analysis import summary
+
+        numbers = {run.label: {"bag": str(run.contents.path)} | summary(run) for run in runs}
+        print(json.dumps({"report": str(made), "runs": numbers}, allow_nan=False))
+    else:
+        print(f"report {made} ({made.stat().st_size / 1e6:.2f} MB): open it in a browser")
     if options.open:
         webbrowser.open(made.resolve().as_uri())
     return made
@@ -65,10 +77,18 @@ def make(bags, out, arm=None, namespace=None, progress=None):
     FlexarmError
         For a bag that tells nothing, and for a page that can't be written.
     """
+    out = _page_file(out)
+    return _write(read(bags, arm, namespace, progress), out, progress)
+
+
+def _page_file(out):
     out = Path(out)
     if out.suffix not in (".html", ".htm"):
         raise FlexarmError(f"--out {out}: a page ends in .html")
-    runs = read(bags, arm, namespace, progress)
+    return out
+
+
+def _write(runs, out, progress):
     if progress is not None:
         progress.step("figures and page")
     # matplotlib and jinja2 are loaded when there is something to draw.

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What holds for every command alike: help with examples that parse, exit codes, JSON, plain text in pipes."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from flexarm_bringup import cli
+from flexarm_bringup.record import Taken
+
+COMMANDS = sorted(next(a for a in cli.parser()._actions if getattr(a, "choices", None)).choices)
+#: They go on until they are stopped: what they have to say is in the log, or on a page.
+WITHOUT_JSON = {"run", "view"}
+
+
+def text_of(words, capsys, code=0):
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    assert end.value.code == code
+    return capsys.readouterr().out
+
+
+@pytest.fixture(params=COMMANDS)
+def command(request):
+    return request.param
+
+
+def test_help_ends_with_examples_and_exit_codes(command, capsys):
+    text = text_of([command, "--help"], capsys)
+    tail = text[text.rindex("example") :]
+    assert "exit code: 0 done, 1 an error" in " ".join(tail.split())
+    examples = [line.split("flexarm ", 1)[1] for line in tail.splitlines() if "flexarm " in line]
+    assert examples
+    for example in examples:  # one line each, as it is typed
+        options = cli.parser().parse_args(cli.bind_angles(shlex.split(example)))
+        assert options.command == command
+
+
+def test_commands_that_end_can_say_it_as_json(command, capsys):
+    assert ("--json" in text_of([command, "--help"], capsys)) == (command not in WITHOUT_JSON)
+
+
+def test_every_command_is_listed_with_a_line_of_its_own(capsys):
+    text = text_of(["--help"], capsys)
+    for name in COMMANDS:
+        assert any(line.split()[:1] == [name] for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    "words, key",
+    [
+        (["urdf", "R", "--pieces", "2"], "joints"),
+        (["publish", "quintic", "--to", "0.5", "--dry-run"], "vibration_energy_J"),
+        (["publish", "paper", "--out", "{tmp}/paper.csv"], "points"),
+        (["parameters"], "controller"),
+        (["show", "R"], "modes"),
+        (["frequencies", "R"], "arm"),
+    ],
+)
+def test_json_is_all_that_standard_output_gets(words, key, tmp_path, capsys):
+    words = [word.format(tmp=tmp_path) for word in words]
+    said = json.loads(text_of([*words, "--json"], capsys))
+    assert key in said
+
+
+def test_a_dry_run_says_the_same_in_both_ways(capsys):
+    words = ["publish", "quintic", "--to", "1.5", "--dry-run"]
+    people, machines = text_of(words, capsys), json.loads(text_of([*words, "--json"], capsys))
+    (joint,) = machines["joints"]
+    assert f"slow torque {joint['peak_slow_torque_Nm']:.4g} N m" in people
+    assert f"{machines['vibration_energy_J']['left_at_the_end']:.3g} J left" in people
+
+
+def test_a_recording_is_told_as_json(capsys):
+    class Bag:
+        def write(self, *message):
+            pass
+
+    taken = Taken(Bag(), "R")
+    taken.take({"arm_state": [b"a", b"b"]}, 1_000_000_000)
+    taken.take({"joint_torque": [b"c"]}, 3_500_000_000)
+    taken.tell("there", as_json=True)
+    said = json.loads(capsys.readouterr().out)
+    assert (said["out"], said["arm"], said["seconds"]) == ("there", "R", 2.5)
+    assert (said["messages"]["arm_state"], said["messages"]["joint_torque"]) == (2, 1)
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    code = "from flexarm_bringup import cli; cli.main(['parameters'])"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=dict(os.environ),
+    )
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 141
+    process.stderr.close()
