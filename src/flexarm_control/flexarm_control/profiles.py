@@ -15,6 +15,8 @@ from flexarm_dynamics.errors import TrajectoryError
 
 #: Beyond this the middle of the motion gets steep, and nothing is gained at its ends.
 MOST_SMOOTHNESS = 20
+#: A longer motion is a slip of the pen [s].
+LONGEST = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +248,10 @@ def _checked(start, other, duration, other_name):
         raise TrajectoryError(
             f"start and {other_name} have shape {start.shape}: give (n,), one number per joint"
         )
-    if not 0.0 < duration < np.inf:
-        raise TrajectoryError(f"duration is {duration} s: it must be finite and above 0")
+    if not 0.0 < duration <= LONGEST:
+        raise TrajectoryError(
+            f"duration is {duration} s: it must be above 0, and {LONGEST:g} at most"
+        )
     for name, values in (("start", start), (other_name, other)):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.arm_observer import design_observer
 from flexarm_control.composite import FAST, SLOW, design, design_law
+from flexarm_control.trajectory import validate
 from flexarm_dynamics.errors import (
     DesignError,
     FlexarmError,
@@ -234,3 +235,17 @@ def test_what_is_refused_leaves_the_running_loop_as_it_was_to_the_last_bit(arm_r
     undisturbed = torques(arm_r, lambda k: None)
     assert_array_equal(torques(arm_r, refuse), undisturbed)
     assert np.ptp(undisturbed) > 1e-6
+
+
+@pytest.mark.parametrize("far", [1e5, 1e9])
+def test_a_motion_beyond_all_bounds_has_no_preview_and_says_why(arm_r, far):
+    control = design(
+        arm_r,
+        {"type": "linear_model_following", "kp": [6.25], "kv": [5.0]},
+        {"type": "none"},
+        settings={"feedforward": "preview", "rate": 1000.0, "stability_margin": 0.0},
+    )
+    names = arm_r.joint_names
+    motion = validate(names, names, 0, [(10**9, [far], [0.0], [0.0], [])])
+    with pytest.raises(DesignError, match="preview: the arm does not stand this motion"):
+        control.feedforward.prepare(motion, np.zeros((3, 1)))

@@ -131,7 +131,11 @@ def test_sampled_profiles_are_followed(profile, n_points, tolerance):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: paper_profile(0.0), "duration is 0.0 s: it must be finite and above 0"),
+        (lambda: paper_profile(0.0), "duration is 0.0 s: it must be above 0, and 1e.09 at most"),
+        (
+            lambda: paper_profile(1.7e308),
+            "duration is 1.7e.308 s: it must be above 0, and 1e.09 at most",
+        ),
         (lambda: paper_profile(float("nan")), "duration is nan s"),
         (lambda: quintic(0.0, 1.0, float("inf")), "duration is inf s"),
         (lambda: quintic(0.0, [1.0, float("nan")], 1.0), r"end\[1\] is nan rad"),

@@ -96,6 +96,8 @@ GOOD = point(1, [0.0, 0.0])
         (["a", "c"], 0, [GOOD], "'c', which is no joint of this arm: give a, b"),
         (["a", "b", "a"], 0, [GOOD], "'a' 2 times"),
         (None, 0, [GOOD], "joint_names is None"),
+        ({"a": 0, "b": 1}, 0, [GOOD], "joint_names is {.*}: give a list of names"),
+        ({"a", "b"}, 0, [GOOD], "joint_names is {.*}: give a list of names"),
         ([["a"], "b"], 0, [GOOD], "which is no joint"),
         ([np.zeros(2), "b"], 0, [GOOD], "which is no joint"),
         (ARM, 0, [], "empty trajectory: give at least one point"),

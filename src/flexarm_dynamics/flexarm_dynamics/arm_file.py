@@ -28,7 +28,7 @@ from .arm import (
     Payload,
 )
 from .errors import ArmFileError
-from .shown import show
+from .shown import number, show
 from .units import SI_UNIT, to_si
 
 #: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
@@ -91,7 +91,8 @@ class _Section:
         self.read = set()
 
     def at(self, key):
-        return f"{self.path}.{key}" if self.path else key
+        name = number(key) if isinstance(key, str) else show(key)
+        return f"{self.path}.{name}" if self.path else name
 
     def has(self, key):
         self.read.add(key)

@@ -500,6 +500,11 @@ def test_an_unknown_field_is_refused_with_what_there_is():
     assert message == "payload.colour: no such field (known here: inertia, mass, offset)"
 
 
+def test_an_unknown_field_with_an_endless_name_is_cut_short():
+    message = refused(changed(("payload", "x" * 5000), "red"))
+    assert message.startswith("payload.xxx") and len(message) < 200
+
+
 @pytest.mark.parametrize(
     "text, start",
     [

@@ -108,7 +108,9 @@ class Preview(ModelFeedforward):
         model = build(self.model.arm)
         path = path_of(trajectory, start)
         gains = None if self.K is not None else gains_along(model, path, self._period)
-        return Preparation(start, gains, _Planner(model, path, start, self.limit).solve())
+        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is checked
+            plan = _Planner(model, path, start, self.limit).solve()
+        return Preparation(start, gains, plan)
 
     def wanted(self, reference, prepared, elapsed):
         if prepared is None or not 0.0 <= elapsed < prepared.plan.duration:
@@ -116,6 +118,13 @@ class Preview(ModelFeedforward):
         # The torque is held over the coming period: that of its middle.
         plan = prepared.plan
         return plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self._period)
+
+
+def _finite(*arrays):
+    """The arrays, if all of their numbers are finite."""
+    if not all(np.isfinite(a).all() for a in arrays):
+        raise DesignError("preview: the arm does not stand this motion: give it more time")
+    return arrays
 
 
 class _Planner:
@@ -165,11 +174,9 @@ class _Planner:
             self._along(c)
             c = c + self._programme(c)
         self._along(c)
-        q, free, torque = self.motion, *self._bend()
+        q, free, torque = self.motion, *_finite(*self._bend())
         state = np.concatenate([q[::2, 0], free[:, 0], q[::2, 1], free[:, 1]], axis=1)
         rates = np.concatenate([q[::2, 1], free[:, 1], q[::2, 2], free[:, 2]], axis=1)
-        if not np.isfinite(state).all():
-            raise DesignError("preview: the arm does not stand this motion: give it more time")
         return Plan(
             duration=self.duration,
             motion=CubicHermiteSpline(self.times[::2], state, rates),
@@ -222,7 +229,9 @@ class _Planner:
         at = np.unique(np.linspace(0, self.times.size - 1, KNOTS).astype(int))
         x = CubicHermiteSpline(self.times[::2], bending[:, 0], bending[:, 1])
         v = CubicHermiteSpline(self.times[::2], bending[:, 1], bending[:, 2])
-        found = np.array([self._derivatives(k, x(self.times[k]), v(self.times[k])) for k in at])
+        (found,) = _finite(
+            np.array([self._derivatives(k, x(self.times[k]), v(self.times[k])) for k in at])
+        )
         flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
         everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
         # Columns: q, qd, qdd, x, v, and the bending's own acceleration, in the torque alone.
@@ -306,7 +315,7 @@ class _Planner:
 
     def _programme(self, c):
         """Change of the shift's coefficients, (n, count)."""
-        free, u = self._bend()
+        free, u = _finite(*self._bend())
         self._linearise(free)
         forced = self._respond()
         end = free[-1]

@@ -3,6 +3,7 @@
 
 import operator
 from array import array
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,6 +141,8 @@ def validate(
 def _column_order(joint_names, arm_joint_names):
     """Return for each of the arm's joints its column in the message, as a list of int."""
     try:
+        if isinstance(joint_names, Mapping | Set):  # which column is whose?
+            raise TypeError
         names = list(joint_names)
     except TypeError:
         raise TrajectoryError(f"joint_names is {show(joint_names)}: give a list of names") from None
