@@ -28,6 +28,8 @@ TWO_LINK_LAW = (
 SUBJECTS = (("R", R_LAW, "model"), ("two_link", TWO_LINK_LAW, "none"), ("R", R_LAW, "preview"))
 
 FIELDS = ("position", "velocity", "torque", "strain", "amplitude", "rate")
+#: The latest stamp that a message can have [ns]: its seconds are an int32.
+LAST_STAMP = (2**31 - 1) * 10**9
 
 
 def healthy(arm, law, samples):
@@ -92,7 +94,7 @@ def spoil(rng, sample, session):
             sample.velocity_known = False
         elif kind == 8:
             sample.stamp_ns = rng.choice(
-                (0, 1, -5, 2**62, sample.stamp_ns - 1, sample.stamp_ns + 10**12)
+                (0, 1, -5, LAST_STAMP, sample.stamp_ns - 1, sample.stamp_ns + 10**12)
             )
         elif kind == 9:
             sample.sequence = rng.choice((sample.sequence, sample.sequence + 1, odd.unsigned(rng)))
