@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `flexarm view` costs the loop it looks on at: ``python -m benchmarks.view``, under two minutes, in real time.
+"""What `flexarm view` costs the loop it looks on at: ``python -m benchmarks.view``, three minutes, in real time.
 
-Two loops on domains of their own, at one of which a view looks on (without a browser), run in turns of a second and a
-half; from measurement to torque, as `flexarm latency` counts.
+Two loops on domains of their own, at one of which a view looks on, run in turns of a second and a half while the arm
+moves; from measurement to torque, as `flexarm latency` counts. The page has a client that takes all that a browser on
+another machine would, and draws nothing.
 """
 
 import contextlib
 import os
+import re
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,11 +18,23 @@ import numpy as np
 from flexarm_bringup import latency
 
 ROUNDS = 12
+TWO_LINK = latency.Case("two_link", "two_link", 1000.0, (0.0, 0.0), (1.0, 1.0), 1.5, pace=0.25)
+#: Takes messages from the page's server as fast as they come, and says how many at the end.
+CLIENT = """
+import signal, sys, viser
+from websockets.sync.client import connect
+
+taken = 0
+signal.signal(signal.SIGINT, lambda *_: sys.exit(print(taken, "messages taken")))
+name = f"viser-v{viser.__version__}"
+with connect(sys.argv[1].replace("http", "ws"), subprotocols=[name], max_size=None) as page:
+    for message in page:
+        taken += 1
+"""
 
 
-def main(rounds=ROUNDS, rate=500.0):
+def main(case, rounds=ROUNDS):
     """Print percentiles of both, and their ratios turn by turn."""
-    case = next(c for c in latency.CASES if c.arm == "R" and c.rate == rate)
     name = next(n for n in latency.CHAINS if n != "relay")
     windows = {"alone": [], "viewed": []}
     with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
@@ -31,11 +45,17 @@ def main(rounds=ROUNDS, rate=500.0):
         words = ["view", "--attach", "--no-open", "--port", "0"]
         viewed.processes.start("view", [sys.executable, "-m", "flexarm_bringup.cli", *words])
         viewed.wait_for("the page", lambda: "http://" in viewed.processes.log("view"))
+        url = re.search(r"http://[0-9.:]+", viewed.processes.log("view"))[0]
+        viewed.processes.start("client", [sys.executable, "-c", CLIENT, url])
         for loop in loops.values():
             loop.get_ready()
+            loop.offer((rounds + 0.5) * case.window * case.pace)
         for i in range(rounds):
             for key in list(loops)[:: 1 - 2 * (i % 2)]:
                 windows[key].append(loops[key].window(case.window))
+        viewed.processes.stop()
+        said = viewed.processes.log("client").strip()
+    print(f"{case.name}; the client: {said}")
     found = {
         key: [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in each]
         for key, each in windows.items()
@@ -52,4 +72,5 @@ def main(rounds=ROUNDS, rate=500.0):
 
 
 if __name__ == "__main__":
-    main()
+    for each in (next(c for c in latency.CASES if c.name == "R, 500 Hz"), TWO_LINK):
+        main(each)

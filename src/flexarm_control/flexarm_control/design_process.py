@@ -23,6 +23,7 @@ from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.model import ArmModel
 
 from . import composite
+from .priority import step_back
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 _MODEL = "model"
@@ -82,25 +83,14 @@ def loads(data, model):
 _own = {}
 
 
-def _begin(arm, parent, niceness):
+def _begin(arm, parent, niceness, cpus):
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:
             os._exit(0)
-    _step_back(niceness)
+    step_back(niceness, cpus)
     _own["model"] = models.build(arm)
-
-
-def _step_back(niceness):
-    """An ordinary process of lower priority, whatever priority the parent has, on CPUs that the parent leaves."""
-    if hasattr(os, "sched_setscheduler"):  # Linux
-        # Not SCHED_IDLE: on a machine that is always busy no design would ever be done.
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        all_of_them = set(range(os.cpu_count() or 1))
-        left = all_of_them - os.sched_getaffinity(0)
-        os.sched_setaffinity(0, left or all_of_them)
-    os.nice(niceness)
 
 
 def _work(function, data):
@@ -132,10 +122,12 @@ class DesignProcess:
         Of the control path: the laws that come back hold it.
     niceness : int
         Of the process, beside this one's.
+    cpus : collection of int
+        That it runs on; empty: as this one.
     """
 
-    def __init__(self, model, niceness=10):
-        self.model, self.niceness, self._pool = model, niceness, None
+    def __init__(self, model, niceness=10, cpus=()):
+        self.model, self.niceness, self.cpus, self._pool = model, niceness, cpus, None
         self._starting = Lock()
 
     def begin(self):
@@ -185,7 +177,7 @@ class DesignProcess:
                     1,
                     mp_context=multiprocessing.get_context("spawn"),
                     initializer=_begin,
-                    initargs=(self.model.arm, os.getpid(), self.niceness),
+                    initargs=(self.model.arm, os.getpid(), self.niceness, self.cpus),
                 )
             return self._pool
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexarm_control import composite, design_process
+from flexarm_control import composite, design_process, priority
 from flexarm_control.design_process import AwayError, DesignProcess
 from flexarm_dynamics import arm_file
 from flexarm_dynamics.errors import ParameterError
@@ -46,6 +46,38 @@ def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
     assert travelled.model is arm_r
     np.testing.assert_array_equal(torques(travelled, 1, arm_r.n_modes), expected)
     assert np.ptp(expected) > 0.0
+
+
+def test_the_process_has_no_part_in_real_time_priority(arm_r):
+    worker = DesignProcess(arm_r, niceness=3)
+    try:
+        assert worker.call(scheduled) == (os.SCHED_BATCH, os.nice(0) + 3)
+    finally:
+        worker.close()
+
+
+def scheduled(model):
+    return os.sched_getscheduler(0), os.nice(0)
+
+
+def test_it_leaves_the_cpus_of_the_control_path(monkeypatch):
+    asked = []
+    for name, refused in (
+        ("sched_setaffinity", OSError),
+        ("sched_setscheduler", None),
+        ("nice", None),
+    ):
+
+        def record(*values, name=name, refused=refused):
+            asked.append((name, values[-1]))
+            if refused:
+                raise refused
+
+        monkeypatch.setattr(os, name, record)
+    priority.step_back(5)
+    assert [name for name, _ in asked] == ["sched_setscheduler", "nice"]
+    priority.step_back(5, {3})  # what the system refuses is left at that
+    assert ("sched_setaffinity", {3}) in asked and asked[-1] == ("nice", 5)
 
 
 def test_a_model_of_another_arm_stays_at_home(arm_r, arm_p3):

@@ -60,6 +60,14 @@ def apply(cpus, priority, warn):
         _hurry(priority, warn)
 
 
+_spare = set()
+
+
+def spare():
+    """CPUs that this process might run on and is not bound to; empty unless `apply` has bound it to some."""
+    return frozenset(_spare)
+
+
 def _pin(cpus):
     if not hasattr(os, "sched_setaffinity"):
         raise ParameterError("cpu_affinity: this system can't bind a process to CPUs: leave it out")
@@ -70,7 +78,10 @@ def _pin(cpus):
                 f"cpu_affinity: {cpu} is not a CPU of this machine, whose CPUs are 0 to {count - 1}"
             )
     try:
+        before = os.sched_getaffinity(0) | _spare
         _each(lambda thread: os.sched_setaffinity(thread, cpus))
+        _spare.clear()
+        _spare.update(before - set(cpus))
         refused = set(cpus) - os.sched_getaffinity(0)
     except OSError:
         refused = set(cpus)

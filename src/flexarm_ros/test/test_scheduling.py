@@ -23,13 +23,16 @@ def restored():
     """The affinity of every thread of this process comes back."""
     before = {thread: os.sched_getaffinity(thread) for thread in scheduling.threads()}
     yield
+    scheduling._spare.clear()
     for thread, cpus in before.items():
         if thread in scheduling.threads():
             os.sched_setaffinity(thread, cpus)
 
 
 def test_affinity_binds_every_thread(restored):
-    cpu = max(os.sched_getaffinity(0))
+    before = os.sched_getaffinity(0)
+    cpu = max(before)
+    assert not scheduling.spare()
     over, begun, found = threading.Event(), threading.Event(), []
 
     def wait():
@@ -45,6 +48,9 @@ def test_affinity_binds_every_thread(restored):
     other.join()
     assert os.sched_getaffinity(0) == {cpu}
     assert found == [{cpu}]
+    assert scheduling.spare() == before - {cpu}
+    scheduling.apply([cpu], 0, never)  # a second node of the process
+    assert scheduling.spare() == before - {cpu}
 
 
 def test_a_cpu_that_is_not_there_is_refused_by_its_number():

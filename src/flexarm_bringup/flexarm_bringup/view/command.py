@@ -9,6 +9,7 @@ import time
 import numpy as np
 
 from flexarm_bringup import parameter_files
+from flexarm_control.priority import step_back
 from flexarm_dynamics import arm_file, model
 from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
 
@@ -16,6 +17,8 @@ from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
 RATE, MOST = 30.0, 100.0
 #: Points of the tip's way.
 TRAIL = 300
+#: The page's process, beside the nodes'.
+NICENESS = 10
 #: How far the first target is from where the arm is [rad].
 STEP = 1.0
 #: Without a state for so long the page says so [s].
@@ -71,6 +74,7 @@ def view(options):
         domain, processes = None, None
         if not options.attach:
             domain, processes = start(options, stack)
+        step_back(NICENESS)  # after the nodes, which would inherit it
         from .link import Link
 
         link = Link(options.namespace, domain)

@@ -23,7 +23,7 @@ from flexarm_dynamics import arm_file, model, registry
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
-from flexarm_ros import qos
+from flexarm_ros import qos, scheduling
 from flexarm_ros.messages import (
     CompositeStateWriter,
     StateReader,
@@ -119,7 +119,9 @@ class ControllerNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(composite.sizes(self.model))
-        self._design_process = DesignProcess(self.model) if parameters["design_process"] else None
+        self._design_process = None
+        if parameters["design_process"]:
+            self._design_process = DesignProcess(self.model, cpus=scheduling.spare())
         self._good = self._law_parameters()
         law = self._design(self.model, self._good)
         settings = parameters.group("", {p.name for p in arm_controller.PARAMETERS})
