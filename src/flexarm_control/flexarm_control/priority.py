@@ -18,10 +18,11 @@ def step_back(niceness, cpus=()):
     cpus : collection of int
         To run on, where the system allows it; empty: those inherited.
     """
-    if hasattr(os, "sched_setscheduler"):  # Linux
+    if hasattr(os, "SCHED_BATCH"):  # Linux
         # Not SCHED_IDLE: on a machine that is always busy nothing would ever be done.
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        with contextlib.suppress(OSError):  # some containers allow none of it
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         if cpus:
-            with contextlib.suppress(OSError):  # a container may have lost them since
+            with contextlib.suppress(OSError):
                 os.sched_setaffinity(0, cpus)
     os.nice(niceness)
