@@ -30,12 +30,16 @@ PUBLISHERS = {
 }
 
 
+#: Messages that a publisher keeps for a recorder which falls behind.
+KEPT = 1000
+
+
 def keep_for_recording(node):
     """Parameters of a node whose messages are recorded: the line itself keeps the newest sample alone.
 
     A recorder that the machine leaves waiting is sent again what it missed only while the publisher has it.
     """
-    return {f"qos_overrides./{topic}.publisher.depth": 1000 for topic in PUBLISHERS[node]}
+    return {f"qos_overrides./{topic}.publisher.depth": KEPT for topic in PUBLISHERS[node]}
 
 
 #: Deep enough for a reader that falls behind for seconds.

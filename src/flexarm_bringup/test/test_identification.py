@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flexarm_bringup import cli
-from flexarm_bringup.identification import coverage, recording
+from flexarm_bringup.identification import coverage, excite, recording
 from flexarm_bringup.identification.arm_text import rewritten
 from flexarm_bringup.identification.derived import derived, values_of
 from flexarm_bringup.identification.fit import Problem, bandwidth, identify
@@ -232,6 +232,14 @@ def test_csv_and_commands(tmp_path, capsys):
     with pytest.raises(FlexarmError, match="that is the arm file itself"):
         options.out = str(file)
         options.function(options)
+
+
+@pytest.mark.parametrize(("namespace", "topic"), [("", ""), ("/left/", "/left"), ("a/b", "/a/b")])
+def test_the_node_that_excites_keeps_its_torques_for_the_recorder(tmp_path, namespace, topic):
+    words = ["excite", "one_link", "--out", str(tmp_path / "bag"), "--namespace", namespace]
+    values = excite.node_parameters(cli.parser().parse_args(words))
+    assert values[f"qos_overrides.{topic}/joint_torque.publisher.depth"] >= 1000
+    assert values["readers"] == 2
 
 
 def test_excite_asks_before_it_moves_the_arm(tmp_path):

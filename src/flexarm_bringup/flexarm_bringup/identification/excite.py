@@ -84,14 +84,23 @@ def excite(options):
     return out
 
 
+def node_parameters(options):
+    """Parameters of the node, from the options; name to value."""
+    from ..recorder import KEPT
+
+    # The driver, and this recorder, which is to get every torque even if the machine leaves it waiting.
+    values = {"arm": str(arm_file.find(options.arm)), "readers": 2}
+    topic = "/".join(("", options.namespace.strip("/"), "joint_torque")).replace("//", "/")
+    values |= {f"qos_overrides.{topic}.publisher.depth": KEPT}
+    values |= {p.name: getattr(options, p.name) for p in excitation_run.PARAMETERS}
+    return {k: v for k, v in values.items() if v != ""}
+
+
 def _run(options, graph):
     """Run the node until it says that it has ended; what it said."""
     from ..processes import arguments, executable
 
-    # The driver, and this recorder.
-    values = {"arm": str(arm_file.find(options.arm)), "readers": 2}
-    values |= {p.name: getattr(options, p.name) for p in excitation_run.PARAMETERS}
-    values = {k: v for k, v in values.items() if v != ""}
+    values = node_parameters(options)
     remaps = [f"__ns:=/{options.namespace.strip('/')}"] if options.namespace.strip("/") else []
     command = [executable("flexarm_control", "excite"), *arguments(values, None, remaps)]
     with tempfile.TemporaryFile() as log:
