@@ -4,12 +4,14 @@
 import json
 
 import pytest
+from rclpy.node import Node
 
 from flexarm_bringup import cli
-from flexarm_bringup.processes import executable
+from flexarm_bringup.processes import arguments, executable
 from flexarm_bringup.recorder import keep_for_recording
 from flexarm_dynamics import arm_file
 from flexarm_msgs.msg import JointTorque
+from flexarm_ros import qos
 
 RATE = 100.0
 #: What the file that is given says wrongly.
@@ -86,3 +88,22 @@ def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys)
     assert code == 1 and "beyond its limit 1e-05; take a smaller amplitude" in said
     assert not (tmp_path / "other").exists()
     assert torques.messages[-1].mode == JointTorque.DISABLED
+
+
+def test_nothing_moves_before_the_recorder_hears_it(bench):
+    arm = {"arm": "one_link", "rate": RATE}
+    bench.start("simulator", {**arm, "lockstep": True, "pause_at": -1.0})
+    torques = bench.tap(JointTorque, "joint_torque")
+    own = {"amplitude": 0.5, "duration": 0.2, "recorder": "late_recorder", "readers": 2}
+    bench.processes.start(
+        "excite", [executable("flexarm_control", "excite"), *arguments({"arm": "one_link", **own})]
+    )
+    silence = "no joint_torque answers state 0"
+    bench.wait_for("the simulator to wait", lambda: silence in bench.log("simulator"))
+    assert not torques.messages
+    late = Node("late_recorder", context=bench.node.context)
+    try:
+        late.create_subscription(JointTorque, "joint_torque", lambda message: None, qos.LINE)
+        bench.wait_for("a torque", lambda: torques.messages)
+    finally:
+        late.destroy_node()

@@ -239,7 +239,7 @@ def test_the_node_that_excites_keeps_its_torques_for_the_recorder(tmp_path, name
     words = ["excite", "one_link", "--out", str(tmp_path / "bag"), "--namespace", namespace]
     values = excite.node_parameters(cli.parser().parse_args(words))
     assert values[f"qos_overrides.{topic}/joint_torque.publisher.depth"] >= 1000
-    assert values["readers"] == 2
+    assert (values["readers"], values["recorder"]) == (2, excite.RECORDER)
 
 
 def test_excite_asks_before_it_moves_the_arm(tmp_path):

@@ -17,6 +17,8 @@ from .live import PATIENCE, Graph
 
 #: Wall time without a new state after which the arm is taken for lost [s].
 SILENCE = 10.0
+#: This process's node.
+RECORDER = "excite_recorder"
 
 
 def add_arguments(parser):
@@ -59,7 +61,7 @@ def excite(options):
         raise FlexarmError(f"--out {out}: exists already")
     out.parent.mkdir(parents=True, exist_ok=True)
     arm_file.load(options.arm)  # refused here, and not in another process's log
-    with Graph("excite_recorder", options.namespace) as graph:
+    with Graph(RECORDER, options.namespace) as graph:
         states = graph.tap.raw["arm_state"]
         silence = f"no arm_state for {PATIENCE:g} s: start the driver (or simulator)"
         graph.wait_for(lambda: states, PATIENCE, silence)
@@ -89,7 +91,7 @@ def node_parameters(options):
     from ..recorder import KEPT
 
     # The driver, and this recorder, which is to get every torque even if the machine leaves it waiting.
-    values = {"arm": str(arm_file.find(options.arm)), "readers": 2}
+    values = {"arm": str(arm_file.find(options.arm)), "readers": 2, "recorder": RECORDER}
     topic = "/".join(("", options.namespace.strip("/"), "joint_torque")).replace("//", "/")
     values |= {f"qos_overrides.{topic}.publisher.depth": KEPT}
     values |= {p.name: getattr(options, p.name) for p in excitation_run.PARAMETERS}

@@ -37,6 +37,13 @@ PARAMETERS = (
         high=100,
         read_only=True,
     ),
+    Parameter(
+        "recorder",
+        "string",
+        "",
+        "Name of a node that is to read joint_torque before a state is answered; empty: none is waited for.",
+        read_only=True,
+    ),
 )
 
 #: How long the last torque, DISABLED, is waited for to arrive.
@@ -79,10 +86,9 @@ class ExciteNode(ArmNode):
             return
         self._ticks, self._seen = 0, True
         if not self._heard:
-            readers = self._torque_pub.get_subscription_count()
-            if readers < self.parameters["readers"]:
+            self._heard = self._is_heard()
+            if not self._heard:
                 return
-            self._heard = True
         try:
             self._reader.read(msg, self._sample)
             enabled = self.core.step(self._sample)
@@ -91,6 +97,14 @@ class ExciteNode(ArmNode):
             enabled = False
         self._torque_pub.publish(self._torque.answer(self._sample, enabled, self.core.torque))
         self._tell()
+
+    def _is_heard(self):
+        """Whether all that are to hear the torque are connected; others may listen, too, and come sooner."""
+        if self._torque_pub.get_subscription_count() < self.parameters["readers"]:
+            return False
+        name = self.parameters["recorder"]
+        readers = self.get_subscriptions_info_by_topic(self._torque_pub.topic_name)
+        return not name or any(reader.node_name == name for reader in readers)
 
     def _tell(self):
         """Say once how it ended."""
