@@ -275,7 +275,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     chosen = check_all(PARAMETERS, settings)
     wanted = chosen["feedforward"]
     kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
-    q = np.array(fast_law.parameters.get("configuration", np.zeros(model.n_joints)))
+    q = fast_law.configuration
     control = CompositeControl(model, slow_law, fast_law, surface)
     free = slow_law.drifts  # joints that nothing holds have no pole left of zero
     if not free:

@@ -227,6 +227,16 @@ def test_a_joint_may_be_held_out_of_the_grid(arms):
     assert_allclose(law.gain([3.0, 1.0, 0.4, 1.0]), lqr.K_f, atol=1e-6 * np.abs(lqr.K_f).max())
 
 
+def test_the_whole_loop_is_checked_in_the_middle_of_the_range(arms, monkeypatch):
+    checked = []
+    monkeypatch.setattr(full_order, "check", lambda control, q, *more: checked.append(q.tolist()))
+    slow, settings = {"type": "model_following"}, {"feedforward": "none", "rate": 500.0}
+    fast = {"type": "scheduled_lqr", "grid": 3, "low": [0.2, 0.5], "high": [0.6, 0.7]}
+    design(arms["two_link"], slow, fast, settings=settings)
+    design(arms["two_link"], slow, {"type": "lqr", "configuration": [0.3, 0.4]}, settings=settings)
+    assert_allclose(checked, [[0.4, 0.6], [0.3, 0.4]], rtol=1e-15)
+
+
 def test_a_range_turned_around_is_refused(arms):
     with pytest.raises(
         DesignError, match=r"fast\.low\[1\]: 1 rad of joint2 is above fast\.high\[1\], -1"

@@ -3,6 +3,8 @@
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 
 class FastLaw(ABC):
     """Fast control u_fast of (12) and (15), designed on the boundary layer (11).
@@ -24,6 +26,11 @@ class FastLaw(ABC):
     def __init__(self, model, parameters):
         self.model = model
         self.parameters = dict(parameters)
+
+    @property
+    def configuration(self):
+        """Joint configuration that the law is made for, shape (n,) [rad]: the full-order loop is checked there."""
+        return np.array(self.parameters.get("configuration", np.zeros(self.model.n_joints)))
 
     def warnings(self):
         """What a person should know of this law on this arm; each a sentence."""

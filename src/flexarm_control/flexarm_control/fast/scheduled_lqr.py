@@ -141,7 +141,7 @@ class ScheduledLqr(FastLaw):
         s = self.scheduled
         self._table = GainTable(s, self.low[s], self.high[s], grid, self._turns[s], self.gains)
         self._check(grid)
-        self._K_f = self._table(0.5 * (self.low + self.high))
+        self._K_f = self._table(self.configuration)
 
     def _set_range(self):
         """Range of each joint, from the parameters or from the arm file's limits."""
@@ -216,6 +216,11 @@ class ScheduledLqr(FastLaw):
                     f" configuration {np.round(q, 4).tolist()}; raise fast.grid, narrow fast.low to fast.high,"
                     " or lower fast.alpha"
                 )
+
+    @property
+    def configuration(self):
+        """In the middle of the range."""
+        return 0.5 * (self.low + self.high)
 
     def torque(self, z_f, q):
         return self._table(q) @ z_f
