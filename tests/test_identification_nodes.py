@@ -50,9 +50,8 @@ def arms(tmp_path):
 def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys):
     truth, given = arms
     own = {"arm": str(truth), "rate": RATE, "lockstep": True, "pause_at": -1.0, "noise": True}
-    own |= keep_for_recording(
-        "simulator"
-    )  # no state is lost to a recorder that the machine leaves waiting
+    # No state is lost to a recorder that the machine leaves waiting.
+    own |= keep_for_recording("simulator")
     bench.start("simulator", own)
     torques = bench.tap(JointTorque, "joint_torque")
     bag = tmp_path / "bag"

@@ -70,9 +70,8 @@ def created():
             for name, node_class in CLASSES.items():
                 nodes[name] = node_class()
                 assert nodes[name].trigger_configure() == TransitionCallbackReturn.SUCCESS
-            yield {
-                name: graph(bystander, name) for name in CLASSES
-            }  # of one context: known at once
+            # Of one context: known at once.
+            yield {name: graph(bystander, name) for name in CLASSES}
         finally:
             for node in (*nodes.values(), bystander):
                 node.destroy_node()

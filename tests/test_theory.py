@@ -119,9 +119,8 @@ def test_a_formula_gives_what_the_code_computes(row, known):
     by_hand, computed = evaluate(numbers, known), evaluate(code, known)
     assert by_hand.shape == computed.shape
     scale = max(np.abs(computed).max(), 1e-12)
-    off = (
-        2e-5 if "d0(" in numbers else 1e-6
-    )  # d0 is differenced; mu is of a double pole, to half the digits
+    # d0 is differenced; mu is of a double pole, to half the digits.
+    off = 2e-5 if "d0(" in numbers else 1e-6
     np.testing.assert_allclose(computed, by_hand, rtol=0, atol=off * scale)
 
 

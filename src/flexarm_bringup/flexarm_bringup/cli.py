@@ -2,6 +2,7 @@
 """The command line: ``./flexarm``, or ``ros2 run flexarm_bringup flexarm``."""
 
 import argparse
+import json
 import os
 import re
 import signal
@@ -144,8 +145,6 @@ def _report(options):
 
 
 def _parameters(options):
-    import json
-
     from .parameter_tables import plain, tables, write
 
     if options.write:
@@ -236,7 +235,7 @@ def parser():
     latency = commands.add_parser(
         "latency",
         help="measurement to torque of the running loop, beside a bare relay of the same messages",
-        description="Runs loop and relay in real time, in turns, at several rates; some five minutes.",
+        description="Runs loop and relay in real time, in turns, at several rates; three to four minutes.",
         epilog="example: flexarm latency --quick --json results/latency.json",
     )
     add_latency_arguments(latency)

@@ -381,7 +381,7 @@ def add_arguments(parser):
     parser.add_argument(
         "--redesign",
         action="store_true",
-        help="then, at 500 Hz, the loop while its fast law is designed anew; three minutes more",
+        help="then, at 500 Hz, the loop while its fast law is designed anew; five minutes more",
     )
     parser.add_argument("--json", metavar="FILE", help="all figures, window by window")
     parser.add_argument("--write", metavar="FILE", help="put the table between a file's markers")
@@ -400,15 +400,13 @@ def chosen(options):
     return cases
 
 
-def _table_of(everything, cases, options, measured):
+def _table_of(everything, cases, options, title, measured):
     """Measure case by case, and print as it goes; the table of all, whose figures are added to `everything`."""
     from .progress import Progress
 
     text, progress = "", Progress()
     for i, case in enumerate(cases):
-        progress.step(
-            f"{measured.__name__.strip('_').replace('_', ' ')}: {case.name}", i + 1, len(cases)
-        )
+        progress.step(f"{title}: {case.name}", i + 1, len(cases))
         found, rows, made = measured(case, options, progress)
         progress.done()
         more = "\n".join(made.splitlines()[2:]) if text else made
@@ -420,7 +418,7 @@ def _table_of(everything, cases, options, measured):
                 print(
                     f"{row['case']}, {row['chain']}: torque was enabled in {share} of the samples"
                 )
-        everything.append({"case": case.name, "found": found, "rows": rows})
+        everything.append({"case": case.name, "title": title, "found": found, "rows": rows})
     return text
 
 
@@ -430,7 +428,7 @@ def _beside_the_relay(case, options, progress):
     # Planning a motion of many joints takes longer than a quick run may.
     moving = not (options.quick and case.file)
     found = measure(case, rounds, chains, options.relay_spin, moving, progress.fraction)
-    rows = summary(case, found)
+    rows = [{**row, "moving": moving} for row in summary(case, found)]
     return found, rows, table(rows)
 
 
@@ -446,10 +444,12 @@ def latency(options):
     """The sub-command."""
     tables, everything = [], []
     cases = chosen(options)
-    tables.append(_table_of(everything, cases, options, _beside_the_relay))
+    again = [case for case in cases if case.rate == 500.0]
+    if options.redesign and not again:
+        raise FlexarmError("latency --redesign is measured at 500 Hz: have it among the --rates")
+    tables.append(_table_of(everything, cases, options, "beside a relay", _beside_the_relay))
     if options.redesign:
-        again = [case for case in cases if case.rate == 500.0]
-        tables.append(_table_of(everything, again, options, _while_designing))
+        tables.append(_table_of(everything, again, options, "while designing", _while_designing))
     if options.json:
         Path(options.json).write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
     if options.write:

@@ -19,8 +19,8 @@ from .latency import Chain
 
 #: From one set to the next [s].
 EVERY = 1.0
-#: Length of a window [s].
-WINDOW = 3.0
+#: Length of a window, and of the rest after one with designs [s].
+WINDOW, REST = 3.0, 2.0
 
 NOTHING, ALPHA, GRID = "nothing", "`fast.alpha` set", "`scheduled_lqr` grid built"
 
@@ -35,20 +35,37 @@ class Redesign:
         Of `fast.alpha`.
     grids : tuple of int
         Of `fast.grid`, with `fast.type` scheduled_lqr.
+    reach : float
+        Of the grid, either side of the middle of the motion [rad].
     """
 
     alphas: tuple
     grids: tuple
+    reach: float
 
 
-#: By arm. The grids of the long arm are coarse: they are built, and then refused for what lies between their points.
-REDESIGNS = {"R": Redesign((4.0, 5.0), (3, 4)), "long_reach": Redesign((0.0, 0.05), (5, 6))}
+#: By arm.
+REDESIGNS = {
+    "R": Redesign((4.0, 5.0), (3, 4), 1.0),
+    "long_reach": Redesign((0.0, 0.05), (3, 4), 0.3),
+}
+
+
+def values_of(case):
+    """What is set in turns, by `ALPHA` and `GRID`: lists of name to value."""
+    redesign, middle = REDESIGNS[case.arm], 0.5 * (np.array(case.begin) + np.array(case.end))
+    low, high = (middle + side * redesign.reach for side in (-1.0, 1.0))
+    ends = {"fast.low": low.tolist(), "fast.high": high.tolist()}
+    return {
+        ALPHA: [{"fast.type": "lqr", "fast.alpha": alpha} for alpha in redesign.alphas],
+        GRID: [{"fast.type": "scheduled_lqr", "fast.grid": g, **ends} for g in redesign.grids],
+    }
 
 
 class Setter:
     """Sets parameters of the controller of a chain, one answer after the other."""
 
-    def __init__(self, chain, redesign):
+    def __init__(self, chain, case):
         from rcl_interfaces.srv import SetParametersAtomically
 
         self.chain, self.answers = chain, []
@@ -56,20 +73,14 @@ class Setter:
             SetParametersAtomically, "controller/set_parameters_atomically"
         )
         self._request = SetParametersAtomically.Request
-        self._alphas, self._grids = (
-            itertools.cycle(redesign.alphas),
-            itertools.cycle(redesign.grids),
-        )
+        self._values = {what: itertools.cycle(all_) for what, all_ in values_of(case).items()}
         chain.wait_for("the controller's parameters", self._client.service_is_ready)
 
     def set(self, what):
         """Ask for `ALPHA` or `GRID`; the future of the answer."""
         from rclpy.parameter import Parameter
 
-        if what == ALPHA:
-            values = {"fast.type": "lqr", "fast.alpha": next(self._alphas)}
-        else:
-            values = {"fast.type": "scheduled_lqr", "fast.grid": next(self._grids)}
+        values = next(self._values[what])
         wanted = [Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
         return self._client.call_async(self._request(parameters=wanted))
 
@@ -86,7 +97,15 @@ class Setter:
             chain.executor.spin_once(timeout_sec=0.05)
         self._take(answer)
         chain.pause(True)
+        if what != NOTHING:
+            self._wait_for_design()
         return chain.wait_for("the simulator's figures", lambda: chain.figures()[before:])[-1]
+
+    def _wait_for_design(self):
+        """Let what is still being designed end, with the machine to itself: the next window is to be without."""
+        end = time.monotonic() + REST
+        while time.monotonic() < end:
+            self.chain.executor.spin_once(timeout_sec=0.05)
 
     def _take(self, answer):
         if answer is not None:
@@ -113,7 +132,7 @@ def measure(case, rounds, fraction=lambda done: None):
     Raises
     ------
     FlexarmError
-        When the controller refuses a value.
+        When the controller refuses a value or a design.
     """
     from flexarm_dynamics.errors import FlexarmError
 
@@ -123,7 +142,7 @@ def measure(case, rounds, fraction=lambda done: None):
         chain = Chain(stack, "three processes", case, Path(folder), "executor")
         chain.get_ready()
         chain.offer((len(kinds) * rounds + 2) * WINDOW * case.pace)
-        setter = Setter(chain, REDESIGNS[case.arm])
+        setter = Setter(chain, case)
         for kind in kinds:  # the first starts the process of the designs
             setter.window(kind)
         for i in range(rounds):
@@ -131,6 +150,9 @@ def measure(case, rounds, fraction=lambda done: None):
                 found[kind].append(setter.window(kind))
             fraction((i + 1) / rounds)
         chain.processes.stop()
+        refused = [x for x in chain.processes.log("controller").splitlines() if "refused" in x]
+    if refused:
+        raise FlexarmError(f"{case.name}: a design was refused: {refused[0]}")
     for answer in setter.answers:
         if not answer.successful:
             raise FlexarmError(f"{case.name}: the controller refused: {answer.reason}")

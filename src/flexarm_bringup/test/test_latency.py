@@ -2,11 +2,13 @@
 """What `flexarm latency` makes of the windows that it measured."""
 
 import argparse
+import itertools
 
 import numpy as np
 import pytest
 
-from flexarm_bringup import latency, latency_redesign
+from flexarm_bringup import latency, latency_redesign, scenario
+from flexarm_bringup.scenario import parameters
 from flexarm_dynamics.errors import FlexarmError
 
 CASE = latency.CASES[1]
@@ -46,6 +48,19 @@ def test_redesigning_is_compared_within_each_round():
     text = latency_redesign.table(rows).splitlines()
     assert text[-1] == "| R, 500 Hz | `fast.alpha` set | 3.30 | 3.30 | 3.30 | 1.10 | 1.10 | 1.10 |"
     assert all(line.count("|") == text[0].count("|") for line in text)
+
+
+def test_redesigning_needs_a_case_at_500_hz():
+    with pytest.raises(FlexarmError, match="at 500 Hz: have it among the --rates"):
+        latency.latency(options("--redesign", "--rates", "200", "--arms", "R"))
+
+
+@pytest.mark.parametrize("name", latency_redesign.REDESIGNS)
+def test_what_is_set_meanwhile_are_designs_that_are_accepted(name):
+    case = next(c for c in latency.CASES if c.arm == name and c.rate == 500.0)
+    given = parameters(case.file) if case.file else {}
+    for values in itertools.chain(*latency_redesign.values_of(case).values()):
+        scenario.loop_of(scenario.Scenario(name, {**given, **values}, rate=case.rate))
 
 
 def test_missed_samples_count_with_those_answered():

@@ -32,6 +32,15 @@ REALTIME_PRIORITY = Parameter(
 PARAMETERS = (CPU_AFFINITY, REALTIME_PRIORITY)
 
 
+#: See `spare`.
+_spare = set()
+
+
+def spare():
+    """CPUs that this process might run on and is not bound to; empty unless `apply` has bound it to some."""
+    return frozenset(_spare)
+
+
 def threads():
     """Thread ids of this process."""
     return [int(name) for name in os.listdir("/proc/self/task")]
@@ -60,14 +69,6 @@ def apply(cpus, priority, warn):
         _hurry(priority, warn)
 
 
-_spare = set()
-
-
-def spare():
-    """CPUs that this process might run on and is not bound to; empty unless `apply` has bound it to some."""
-    return frozenset(_spare)
-
-
 def _pin(cpus):
     if not hasattr(os, "sched_setaffinity"):
         raise ParameterError("cpu_affinity: this system can't bind a process to CPUs: leave it out")
@@ -80,8 +81,6 @@ def _pin(cpus):
     try:
         before = os.sched_getaffinity(0) | _spare
         _each(lambda thread: os.sched_setaffinity(thread, cpus))
-        _spare.clear()
-        _spare.update(before - set(cpus))
         refused = set(cpus) - os.sched_getaffinity(0)
     except OSError:
         refused = set(cpus)
@@ -90,6 +89,8 @@ def _pin(cpus):
             f"cpu_affinity: this process may not run on CPU {', '.join(map(str, sorted(refused)))}: its container"
             " or cpuset leaves it out"
         )
+    _spare.clear()
+    _spare.update(before - set(cpus))
 
 
 def _hurry(priority, warn):

@@ -103,8 +103,10 @@ class ExciteNode(ArmNode):
         if self._torque_pub.get_subscription_count() < self.parameters["readers"]:
             return False
         name = self.parameters["recorder"]
+        if not name:
+            return True
         readers = self.get_subscriptions_info_by_topic(self._torque_pub.topic_name)
-        return not name or any(reader.node_name == name for reader in readers)
+        return any(reader.node_name == name for reader in readers)
 
     def _tell(self):
         """Say once how it ended."""

@@ -89,9 +89,8 @@ class Path:
         self._once = np.arange(1.0, order)[:, None]
         self._twice = self._once[:-1] * self._once[1:]
         self._x = np.zeros(())
-        self._last = np.zeros(
-            (3, n)
-        )  # what was evaluated last: looked up ahead first, then sampled
+        # What was evaluated last: a stamp is looked up ahead first, then sampled.
+        self._last = np.zeros((3, n))
         self._forget_segment()
 
     def _forget_segment(self):
