@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 
@@ -49,7 +50,7 @@ def chain(p, links=None, modes=2, foreshortening=False):
 
     Returns
     -------
-    flexarm_dynamics.chain.Chain
+    flexarm_dynamics.models.chain.Chain
     """
     hubs = [p["Jh"]] if "Jh" in p else [p["Jh1"], p["Jh2"]]
     count = len(hubs) if links is None else links

@@ -47,7 +47,7 @@ def linear_torque(torque, intervals, length):
 
 
 class Flexarm(Peer):
-    """`flexarm_dynamics.chain.Chain` with a fixed step.
+    """`flexarm_dynamics.models.chain.Chain` with a fixed step.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from flexarm_bringup import latency
+from benchmarks.latency import command as latency
 
 ROUNDS = 12
 TWO_LINK = latency.Case("two_link", "two_link", 1000.0, (0.0, 0.0), (1.0, 1.0), 1.5, pace=0.25)

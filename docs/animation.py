@@ -14,8 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 
-from flexarm_bringup import scenario
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
+from flexarm_studies.loop import scenario
 
 HERE = Path(__file__).resolve().parent
 SHIPPED = HERE.parent / "config" / "controllers" / "composite.yaml"

@@ -10,12 +10,13 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from flexarm_bringup.markdown import write_between
+from flexarm_studies.markdown import write_between
 
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parent / "src"
 PACKAGES = (
-    "flexarm_dynamics", "flexarm_msgs", "flexarm_ros", "flexarm_sim", "flexarm_control", "flexarm_bringup",
+    "flexarm_dynamics", "flexarm_msgs", "flexarm_ros", "flexarm_sim", "flexarm_control", "flexarm_studies",
+    "flexarm_tools", "flexarm_bringup",
 )  # fmt: skip
 BEGIN, END = "<!-- modules: begin -->", "<!-- modules: end -->"
 #: Size of a box, distance of boxes and of rows of them, height of a line of text [drawing units].

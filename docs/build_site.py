@@ -26,7 +26,15 @@ ROOT = HERE.parent
 sys.path[:0] = [str(HERE), *(str(path) for path in (ROOT / "src").glob("*/"))]
 import links  # noqa: E402
 
-PACKAGES = ("flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_ros", "flexarm_bringup")
+PACKAGES = (
+    "flexarm_dynamics",
+    "flexarm_control",
+    "flexarm_sim",
+    "flexarm_studies",
+    "flexarm_ros",
+    "flexarm_tools",
+    "flexarm_bringup",
+)
 #: Pages outside of docs/.
 AT_THE_ROOT = ("README.md", "CONTRIBUTING.md")
 
@@ -94,7 +102,7 @@ def write_messages(file):
 
 def write_parameters(file):
     """The page with the tables of the declarations, made now."""
-    from flexarm_bringup import parameter_tables
+    from flexarm_tools import parameter_tables
 
     parameter_tables.write(file)
 

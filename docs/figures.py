@@ -15,10 +15,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from flexarm_bringup import scenario
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Arm, Flexibility, Joint, Link, Payload
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm, Flexibility, Joint, Link, Payload
+from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS
+from flexarm_studies.loop import scenario
 
 HERE = Path(__file__).resolve().parent
 TRUTH = HERE.parent / "tests" / "data"

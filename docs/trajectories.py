@@ -8,9 +8,10 @@ The arm gets the slow torque (10) of the motion and nothing else, no feedback: t
 
 import numpy as np
 
-from flexarm_control import excitation, profiles, shapers
-from flexarm_control.least_exciting import least_exciting
-from flexarm_dynamics import arm_file, model
+from flexarm_control.motions import excitation, profiles, shapers
+from flexarm_control.motions.least_exciting import least_exciting
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS
 
 STEP, AFTER = 1e-3, 2.0  # [s]

@@ -9,6 +9,7 @@ import traceback
 
 from . import reader as frame
 from .reader import Violation
+from .tally import Tally
 
 
 def readers():
@@ -57,20 +58,6 @@ def parser():
     )
     top.add_argument("--list", action="store_true", help="list the readers")
     return top
-
-
-class Tally:
-    """What came of one reader's inputs."""
-
-    def __init__(self, name):
-        self.name, self.inputs, self.refused, self.failures = name, 0, 0, 0
-        self.first = {}  # kind of failure -> the first one of it, as text
-        self.seconds = 0.0
-
-    @property
-    def accepted(self):
-        """Inputs that were read."""
-        return self.inputs - self.refused
 
 
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")

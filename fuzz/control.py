@@ -3,16 +3,20 @@
 
 import numpy as np
 
-from flexarm_bringup.closed_loop import ClosedLoop
-from flexarm_control import arm_observer, composite, trajectory
-from flexarm_control.arm_controller import PARAMETERS, ArmController
-from flexarm_control.arm_observer import observe
-from flexarm_control.composite import FAST, MANIFOLD, SLOW, design
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model, registry
+from flexarm_control import trajectory
+from flexarm_control.composite import law as composite
+from flexarm_control.composite.law import FAST, MANIFOLD, SLOW, design
+from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers import arm_observer
+from flexarm_control.observers.arm_observer import observe
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 from flexarm_ros.messages import CompositeStateWriter
+from flexarm_studies.loop.closed_loop import ClosedLoop
 
 from . import odd
 from .files import Parameters

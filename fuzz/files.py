@@ -13,16 +13,18 @@ from types import SimpleNamespace
 import numpy as np
 import yaml
 
-from flexarm_bringup import gauges, parameter_files
-from flexarm_bringup.check_driver import listening
-from flexarm_bringup.check_driver.samples import Heard, Verdict, samples
-from flexarm_bringup.identification import recording
 from flexarm_control.nodes import controller, observer
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, FlexarmError, ParameterError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.nodes import simulator
 from flexarm_sim.simulator import PARAMETERS as PLANT
+from flexarm_studies.commands import gauges
+from flexarm_studies.identification import recording
+from flexarm_studies.loop import parameter_files
+from flexarm_tools.check_driver import listening
+from flexarm_tools.check_driver.samples import Heard, Verdict, samples
 
 from . import odd
 from .messages import good_state, spoil_state

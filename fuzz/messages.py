@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file
+from flexarm_control.loop.samples import ArmSample
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros.messages import StateReader, TorqueReader, set_stamp, stamp_ns

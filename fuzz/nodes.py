@@ -12,14 +12,14 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import SetBool, Trigger
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
 
 from . import odd
-from .__main__ import Tally
 from .files import Parameters, declared
 from .messages import good_state, good_torque, spoil_state, spoil_torque
+from .tally import Tally
 from .trajectories import good_points, spoil_points
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))

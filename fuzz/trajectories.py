@@ -11,8 +11,9 @@ import yaml
 
 from flexarm_control import trajectory
 from flexarm_control.trajectory import ReferenceGenerator, files, specs
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.models import model
 
 from . import odd
 from .reader import Reader, demand

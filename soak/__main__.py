@@ -6,7 +6,7 @@ import sys
 import tempfile
 import time
 
-from flexarm_bringup.processes import ProcessError
+from flexarm_tools.running.processes import ProcessError
 
 #: Growth of a process's memory that is none: the allocator's own coming and going [MiB].
 FLAT = 8.0

@@ -11,9 +11,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import Trigger
 
-from flexarm_bringup.recorder import keep_for_recording
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import CompositeState
+from flexarm_tools.recording.recorder import keep_for_recording
 
 from .invariants import RUNNING, Invariants
 

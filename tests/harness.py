@@ -25,12 +25,12 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from flexarm_bringup.processes import NODES, Processes, arguments, executable, own_domain
 from flexarm_dynamics.parameters import check_all
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 from flexarm_ros import qos
 from flexarm_ros.messages import SECOND, StateWriter, set_stamp, stamp_ns
 from flexarm_sim import simulator
+from flexarm_tools.running.processes import NODES, Processes, arguments, executable, own_domain
 
 SHM = Path("/dev/shm")
 #: Deep enough for a reader that falls behind for seconds.

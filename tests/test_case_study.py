@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexarm_bringup import case_study, recorder
-from flexarm_bringup.closed_loop import TRAJECTORY_START_NS
+from flexarm_studies.case_study import runs as case_study
+from flexarm_studies.case_study import tables
+from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
+from flexarm_tools.recording import recorder
 
 #: The nonlinear rows of the reference table (lbf ft, ft, deg), see tests/data/README.md.
 COLUMNS = (
@@ -94,9 +96,9 @@ def test_p3_reproduces_the_printed_design(demo):
     _, summary, _ = demo
     run = entry(summary, "P3_m11", "composite")
     np.testing.assert_allclose(np.abs(run["k_f"]), [75.505, 6376.58, 17.072, 173.098], rtol=2e-4)
-    np.testing.assert_allclose(np.abs(run["k_f"]), case_study.PRINT["k_f"], rtol=2e-4)
+    np.testing.assert_allclose(np.abs(run["k_f"]), tables.PRINT["k_f"], rtol=2e-4)
     for key in ("closed_loop_frequencies_rad_s", "closed_loop_damping"):
-        np.testing.assert_allclose(run[key], case_study.PRINT[key], rtol=3e-4)
+        np.testing.assert_allclose(run[key], tables.PRINT[key], rtol=3e-4)
 
 
 def test_the_observer_row_stays_close_to_the_one_with_true_rates(demo):

@@ -3,12 +3,14 @@
 
 import pytest
 
-from flexarm_bringup import closed_loop, lockstep, metrics, recorder
-from flexarm_bringup.processes import Processes, own_domain
-from flexarm_control import profiles
-from flexarm_dynamics import arm_file
-from flexarm_dynamics.model import build
-from flexarm_dynamics.units import POUND_FORCE_FOOT
+from flexarm_control.motions import profiles
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
+from flexarm_dynamics.models.model import build
+from flexarm_studies.loop import closed_loop, metrics
+from flexarm_tools.recording import recorder
+from flexarm_tools.running import lockstep
+from flexarm_tools.running.processes import Processes, own_domain
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_ros", "flexarm_bringup")
+PACKAGES = (
+    "flexarm_dynamics",
+    "flexarm_control",
+    "flexarm_sim",
+    "flexarm_studies",
+    "flexarm_ros",
+    "flexarm_tools",
+    "flexarm_bringup",
+)
 #: Arguments that mean the same wherever they stand; docs/theory.md has the symbols.
 EVERYWHERE = {
     "q": "joint angles [rad]",

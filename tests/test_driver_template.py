@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from harness import PATIENT, Arm, Bench, trajectory
 
-from flexarm_bringup.processes import arguments, executable
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_tools.running.processes import arguments, executable
 
 TEMPLATE = Path(__file__).resolve().parents[1] / "examples" / "flexarm_driver_template"
 RATE = 200.0  # [Hz]

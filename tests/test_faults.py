@@ -10,10 +10,10 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from harness import Arm, Bench, Drive, Source, trajectory
 
-from flexarm_bringup import parameter_files
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import stamp_ns
 from flexarm_sim.nodes.simulator import ALONE_SAMPLES
+from flexarm_studies.loop import parameter_files
 
 NAN, INF = math.nan, math.inf
 J = ["joint1"]

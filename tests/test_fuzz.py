@@ -12,13 +12,11 @@ sys.path.insert(
     0, str(Path(__file__).resolve().parents[1])
 )  # the folder is no package of the workspace
 
-from flexarm_bringup import parameter_files
-from flexarm_bringup.identification import recording
-from flexarm_control.arm_observer import observe
-from flexarm_control.composite import design
-from flexarm_control.samples import ArmSample
+from flexarm_control.composite.law import design
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import observe
 from flexarm_control.trajectory import files
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import (
     DesignError,
     FlexarmError,
@@ -26,9 +24,12 @@ from flexarm_dynamics.errors import (
     ParameterError,
     TrajectoryError,
 )
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState
 from flexarm_ros.messages import StateReader
+from flexarm_studies.identification import recording
+from flexarm_studies.loop import parameter_files
 from fuzz import __main__ as command
 from fuzz import reader
 

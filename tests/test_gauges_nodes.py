@@ -10,8 +10,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from harness import Bench, Source
 from std_srvs.srv import Trigger
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.strain_map import StrainMap
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import StrainMap
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import CompositeState, JointTorque, ObserverState
 
 #: Few, so that the loop need not run for long.
@@ -135,7 +136,7 @@ def test_the_loop_goes_on_without_one_gauge_or_two_and_stops_without_three(sourc
 
 
 def test_the_health_numbers_are_those_of_the_message():
-    from flexarm_control import gauge_health as g
+    from flexarm_control.observers import gauge_health as g
 
     m = ObserverState
     assert (g.GOOD, g.MISSING, g.STUCK, g.SATURATED, g.SUSPECT) == (

@@ -7,11 +7,11 @@ import pytest
 from rclpy.node import Node
 
 from flexarm_bringup import cli
-from flexarm_bringup.processes import arguments, executable
-from flexarm_bringup.recorder import keep_for_recording
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import JointTorque
 from flexarm_ros import qos
+from flexarm_tools.recording.recorder import keep_for_recording
+from flexarm_tools.running.processes import arguments, executable
 
 RATE = 100.0
 #: What the file that is given says wrongly.

@@ -9,10 +9,14 @@ import sys
 import pytest
 from rclpy.serialization import deserialize_message
 
-from flexarm_bringup import case_study, closed_loop, lockstep, recorder, relay
-from flexarm_bringup.processes import Processes, own_domain
-from flexarm_control import profiles
-from flexarm_dynamics import arm_file
+from flexarm_control.motions import profiles
+from flexarm_dynamics.arm import arm_file
+from flexarm_studies.case_study import runs as case_study
+from flexarm_studies.loop import closed_loop
+from flexarm_tools.case_study import nodes
+from flexarm_tools.recording import recorder
+from flexarm_tools.running import lockstep, relay
+from flexarm_tools.running.processes import Processes, own_domain
 
 RUN = case_study.Run("R", "m11", "composite", "observer")
 
@@ -20,7 +24,7 @@ RUN = case_study.Run("R", "m11", "composite", "observer")
 def record(directory, duration, run=RUN):
     """Samples and timing of a lockstep run of three new processes."""
     with own_domain() as domain, Processes(domain, directory) as processes:
-        case_study.start_nodes(processes, run)
+        nodes.start_nodes(processes, run)
         with lockstep.LockstepRun(processes) as line:
             joints = arm_file.load(run.arm).joint_names
             message = lockstep.trajectory_message(

@@ -5,13 +5,17 @@ import numpy as np
 import pytest
 from harness import Bench
 
-from flexarm_bringup import closed_loop, lockstep, parameter_files, recorder
-from flexarm_bringup.parameter_files import under
-from flexarm_bringup.processes import Processes, own_domain
-from flexarm_bringup.recorder import keep_for_recording
-from flexarm_control import profiles, trajectory
-from flexarm_dynamics import arm_file, model
+from flexarm_control import trajectory
+from flexarm_control.motions import profiles
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState
+from flexarm_studies.loop import closed_loop, parameter_files
+from flexarm_studies.loop.parameter_files import under
+from flexarm_tools.recording import recorder
+from flexarm_tools.recording.recorder import keep_for_recording
+from flexarm_tools.running import lockstep
+from flexarm_tools.running.processes import Processes, own_domain
 
 FILE, GOAL, DURATION = "two_link_composite", (0.8, 0.8), 6.0
 

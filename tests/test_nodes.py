@@ -13,12 +13,13 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from flexarm_bringup import parameter_files
-from flexarm_control import composite
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.strain_map import gauge_rows
+from flexarm_control.composite import law as composite
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import stamp_ns
+from flexarm_studies.loop import parameter_files
 
 NODES = ("simulator", "observer", "controller")
 LOCKSTEP = {"lockstep": True, "resend_period": 0.02}

@@ -11,9 +11,11 @@ import pytest
 from harness import Bench
 from test_lockstep import without_identity
 
-from flexarm_bringup import closed_loop, lockstep, recorder
-from flexarm_bringup.processes import Processes, own_domain
-from flexarm_control import profiles
+from flexarm_control.motions import profiles
+from flexarm_studies.loop import closed_loop
+from flexarm_tools.recording import recorder
+from flexarm_tools.running import lockstep
+from flexarm_tools.running.processes import Processes, own_domain
 
 SEPARATE = {"observer": ("observer",), "controller": ("controller",)}
 TOGETHER = {"observer_controller": ("observer", "controller")}
@@ -67,7 +69,7 @@ def test_both_nodes_of_one_process_keep_names_parameters_and_life_cycle(tmp_path
 
 PARENT = """
 import os, signal, sys
-from flexarm_bringup.processes import Processes, own_domain
+from flexarm_tools.running.processes import Processes, own_domain
 with own_domain() as domain, Processes(domain, sys.argv[1]) as processes:
     for key in ("first", "second"):
         print(processes.start_node("observer", {"arm": "R"}).pid, flush=True)

@@ -19,10 +19,11 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from flexarm_bringup import cli, launching, parameter_tables
-from flexarm_bringup.lockstep import LockstepRun
-from flexarm_bringup.processes import Processes, executable, installed, own_domain
+from flexarm_bringup import cli, launching
 from flexarm_msgs.msg import CompositeState
+from flexarm_tools import parameter_tables
+from flexarm_tools.running.lockstep import LockstepRun
+from flexarm_tools.running.processes import Processes, executable, installed, own_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 README = "".join(
@@ -257,7 +258,8 @@ def test_own_law_example_is_found_by_name_and_runs(tmp_path):
     (info / "METADATA").write_text(f"Name: {module}\nVersion: 0\n")
     (info / "entry_points.txt").write_text(f"[flexarm.slow_laws]\n{point}\n")
     script = (
-        "from flexarm_bringup import closed_loop, case_study\n"
+        "from flexarm_studies.case_study import runs as case_study\n"
+        "from flexarm_studies.loop import closed_loop\n"
         "loop = closed_loop.ClosedLoop('R', {'type': 'pd', 'kp': [40.0], 'kv': [12.0]},"
         " {'type': 'none'}, {'type': 'filtered_derivative'})\n"
         "record = loop.run(case_study.paper_trajectory(['joint1']), 4.0)\n"

@@ -9,9 +9,9 @@ from harness import Bench
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from flexarm_bringup.processes import arguments, executable
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros.messages import set_stamp, stamp_ns
+from flexarm_tools.running.processes import arguments, executable
 
 PARAMETERS = {
     "arm": "two_link",

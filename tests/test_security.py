@@ -10,10 +10,10 @@ import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 
-from flexarm_bringup.processes import own_domain
 from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
 from flexarm_sim.nodes.simulator import SimulatorNode
+from flexarm_tools.running.processes import own_domain
 
 POLICY = Path(__file__).resolve().parents[1] / "config" / "security" / "flexarm.policy.xml"
 CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}

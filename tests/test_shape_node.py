@@ -5,11 +5,12 @@ import numpy as np
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
-from flexarm_bringup.processes import arguments, executable
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.urdf import PieceChain
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.urdf import PieceChain
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState
 from flexarm_ros.messages import StateWriter
+from flexarm_tools.running.processes import arguments, executable
 
 
 def test_markers_and_joint_states_are_of_the_state_that_came(bench):

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from flexarm_control import composite, full_order
-from flexarm_dynamics import arm_file, singular_perturbation
-from flexarm_dynamics.model import build
+from flexarm_control.composite import full_order
+from flexarm_control.composite import law as composite
+from flexarm_dynamics import singular_perturbation
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models.model import build
 
 TEXT = (Path(__file__).resolve().parents[1] / "docs" / "theory.md").read_text("utf-8")
 ARMS = ("R", "P3", "two_link")

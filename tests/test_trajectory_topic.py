@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from harness import Arm, trajectory
 
-from flexarm_control import profiles
+from flexarm_control.motions import profiles
 from flexarm_msgs.msg import CompositeState, JointTorque
 
 J = ["joint1"]

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from flexarm_bringup import cli
-from flexarm_bringup.lockstep import LockstepRun
-from flexarm_bringup.processes import Processes, executable, own_domain
+from flexarm_tools.running.lockstep import LockstepRun
+from flexarm_tools.running.processes import Processes, executable, own_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 LESSONS = ROOT / "docs" / "tutorial"

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from pyroute2 import IPRoute
 from two_hosts import ADDRESSES, RATE, SUBNET, TORQUE_TIMEOUT, Loop, TwoHosts
 
-from flexarm_control.supervisor import RUNNING, State
+from flexarm_control.loop.supervisor import RUNNING, State
 
 WARN, ERROR = DiagnosticStatus.WARN[0], DiagnosticStatus.ERROR[0]
 #: Without torque; HOLDING where a controller comes back by itself.

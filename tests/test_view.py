@@ -11,9 +11,10 @@ from urllib.request import urlopen
 import pytest
 from harness import Arm, Bench
 
-from flexarm_bringup.shape.drawing import Drawer
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import CompositeState
+from flexarm_tools.shape.drawing import Drawer
 
 CHROMIUM = Path("/usr/bin/chromium")
 #: Nothing of the network, no GPU; WebGL in software.

@@ -23,7 +23,9 @@ from pathlib import Path
 
 from pyroute2 import IPRoute
 
-from flexarm_bringup.processes import (
+from flexarm_control.loop.supervisor import RUNNING, State
+from flexarm_msgs.msg import JointTorque
+from flexarm_tools.running.processes import (
     NODES,
     Processes,
     arguments,
@@ -31,8 +33,6 @@ from flexarm_bringup.processes import (
     executable,
     own_domain,
 )
-from flexarm_control.supervisor import RUNNING, State
-from flexarm_msgs.msg import JointTorque
 
 CLONE_NEWNET = 0x40000000  # of sched.h
 LIBC = ctypes.CDLL(None, use_errno=True)

@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-WITHOUT_ROS = ("flexarm_dynamics", "flexarm_control", "flexarm_sim")
+WITHOUT_ROS = ("flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_studies")
 OLDEST = (3, 10)
 IMPORT_ALL = """
 import importlib, pkgutil, sys
@@ -29,8 +29,9 @@ for top in sys.argv[1:]:
     for found in pkgutil.walk_packages(package.__path__, top + "."):
         if ".nodes" not in found.name:
             importlib.import_module(found.name)
-from flexarm_dynamics import arm_file, model
-from flexarm_control import composite
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
+from flexarm_control.composite import law as composite
 arm = model.build(arm_file.load(sys.path[0] + "/R.yaml"))
 composite.design(arm, {"type": "linear_model_following"}, {"type": "lqr"})
 """

@@ -14,7 +14,7 @@ State of one link: :math:`(q, \delta, \dot q, \dot\delta)`, of two :math:`(q_1, 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from flexarm_dynamics.beam import loaded
+from flexarm_dynamics.models.beam import loaded
 
 from . import Peer, steps_per_sample, times
 

@@ -8,7 +8,7 @@ name = "flexarm_bringup"
 setup(
     name=name,
     version="0.1.0",
-    description="Launch files, arm and controller files, case study and command line of flexarm.",
+    description="Launch files, arm and controller files and the command line of flexarm.",
     license="Apache-2.0",
     maintainer="flexarm maintainers",
     maintainer_email="maintainers@flexarm.invalid",
@@ -26,9 +26,9 @@ setup(
     entry_points={
         "console_scripts": [
             "flexarm = flexarm_bringup.cli:entry",
-            "publish_trajectory = flexarm_bringup.publish_trajectory:entry",
-            "shape = flexarm_bringup.shape:start_shape",
-            "ros2_control_adapter = flexarm_bringup.adapters:start_ros2_control_adapter",
+            "publish_trajectory = flexarm_tools.publish_trajectory:entry",
+            "shape = flexarm_tools.shape:start_shape",
+            "ros2_control_adapter = flexarm_tools.adapters:start_ros2_control_adapter",
         ],
     },
 )

@@ -18,9 +18,9 @@ setup(
     zip_safe=False,
     entry_points={
         "flexarm.models": [
-            "chain = flexarm_dynamics.chain:Chain",
-            "one_link = flexarm_dynamics.one_link:OneLink",
-            "paper_appendix = flexarm_dynamics.paper_appendix:PaperAppendix",
+            "chain = flexarm_dynamics.models.chain:Chain",
+            "one_link = flexarm_dynamics.models.one_link:OneLink",
+            "paper_appendix = flexarm_dynamics.models.paper_appendix:PaperAppendix",
         ],
     },
 )

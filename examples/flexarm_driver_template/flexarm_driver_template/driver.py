@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos

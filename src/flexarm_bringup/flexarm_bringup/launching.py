@@ -8,8 +8,7 @@ installation lacks.
 from dataclasses import dataclass, field
 
 from flexarm_dynamics.errors import ParameterError
-
-from . import parameter_files
+from flexarm_studies.loop import parameter_files
 
 LEVELS = ("debug", "info", "warn", "error", "fatal")
 SWITCH = ("true", "false")

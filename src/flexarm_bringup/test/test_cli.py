@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from flexarm_bringup import cli
-from flexarm_bringup.record import Taken
+from flexarm_tools.recording.record import Taken
 
 COMMANDS = sorted(next(a for a in cli.parser()._actions if getattr(a, "choices", None)).choices)
 #: They go on until they are stopped: what they have to say is in the log, or on a page.

@@ -8,8 +8,9 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from flexarm_bringup import launching, parameter_files
+from flexarm_bringup import launching
 from flexarm_dynamics.errors import ParameterError
+from flexarm_studies.loop import parameter_files
 
 FILES = {
     "arm": (launching.ONE_ARM, launching.one_arm),

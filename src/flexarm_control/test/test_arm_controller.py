@@ -9,15 +9,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control import trajectory
-from flexarm_control.arm_controller import PARAMETERS, ArmController
-from flexarm_control.composite import design
-from flexarm_control.samples import ArmSample
-from flexarm_control.supervisor import State
-from flexarm_dynamics import arm_file
+from flexarm_control.composite.law import design
+from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.loop.supervisor import State
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
 from flexarm_dynamics.errors import DesignError, ParameterError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models.model import build
 from flexarm_dynamics.parameters import check_all
-from flexarm_dynamics.units import POUND_FORCE_FOOT
 
 MS = 10**6  # [ns]
 FILE_LIMIT = 10.0 * POUND_FORCE_FOOT  # [N m] of arm R

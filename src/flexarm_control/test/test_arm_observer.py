@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_control.arm_observer import ArmObserver, design_observer
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import MessageError, ModelError
-from flexarm_dynamics.strain_map import gauge_rows
+from flexarm_dynamics.models import model
 
 MS = 10**6  # [ns]
 

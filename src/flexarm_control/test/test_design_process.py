@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexarm_control import composite, design_process, priority
-from flexarm_control.design_process import AwayError, DesignProcess
-from flexarm_dynamics import arm_file
+from flexarm_control.composite import design_process, priority
+from flexarm_control.composite import law as composite
+from flexarm_control.composite.design_process import AwayError, DesignProcess
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models.model import build
 
 FAST, CORRECTED = {"type": "lqr"}, {"type": "corrected"}
 

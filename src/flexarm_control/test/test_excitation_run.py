@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_control import excitation_run
-from flexarm_control.excitation_run import ExcitationRun, Stage
-from flexarm_control.excitation_torque import ExcitationTorque
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.motions import excitation_run
+from flexarm_control.motions.excitation_run import ExcitationRun, Stage
+from flexarm_control.motions.excitation_torque import ExcitationTorque
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, ParameterError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 

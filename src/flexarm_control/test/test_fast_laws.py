@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import solve_continuous_are
 
-from flexarm_control.composite import FAST, design_law
+from flexarm_control.composite.law import FAST, design_law
+from flexarm_dynamics.arm.units import POUND_FORCE
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import Terms
+from flexarm_dynamics.models.model import Terms
 from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
-from flexarm_dynamics.units import POUND_FORCE
 
 # Q = diag(1, 1, 50, 30000), r = 1 in ft and lbf ft
 PAPER = {

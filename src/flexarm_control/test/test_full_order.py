@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexarm_control import full_order
-from flexarm_control.composite import design
-from flexarm_dynamics import arm_file
+from flexarm_control.composite import full_order
+from flexarm_control.composite.law import design
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import full_order_matrix
 
 SLOW = {"type": "linear_model_following"}

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_control import gauge_health
-from flexarm_control.arm_observer import ArmObserver, design_observer
-from flexarm_control.gauge_health import (
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers import gauge_health
+from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_control.observers.gauge_health import (
     GOOD,
     MISSING,
     SATURATED,
@@ -18,10 +19,10 @@ from flexarm_control.gauge_health import (
     BiasCalibration,
     GaugeHealth,
 )
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.errors import MessageError
-from flexarm_dynamics.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.models import model
 
 MS = 10**6  # [ns]
 NOISE, COUNT = 0.5e-6, 2e-3 / 4096  # [strain], of R_lab

@@ -10,13 +10,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag, expm, solve_discrete_are
 from scipy.stats import chi2
 
-from flexarm_control.arm_observer import ArmObserver, design_observer, observe
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import ArmObserver, design_observer, observe
 from flexarm_control.observers.motion import Motion, discretise
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Friction
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import DesignError, MessageError
-from flexarm_dynamics.strain_map import StrainMap
+from flexarm_dynamics.models import model
 from flexarm_sim.integrators import integrate
 
 MS = 10**6  # [ns]

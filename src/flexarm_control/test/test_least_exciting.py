@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from flexarm_control import excitation, profiles
-from flexarm_control.least_exciting import _Problem, least_exciting, least_squares
-from flexarm_dynamics import arm_file, model
+from flexarm_control.motions import excitation, profiles
+from flexarm_control.motions.least_exciting import _Problem, least_exciting, least_squares
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS
 
 QUARTER = np.pi / 2

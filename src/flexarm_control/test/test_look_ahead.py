@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexarm_control import composite, trajectory
+from flexarm_control import trajectory
+from flexarm_control.composite import law as composite
 from flexarm_control.trajectory import ReferenceGenerator
 
 SLOW, FAST = {"type": "linear_model_following"}, {"type": "lqr"}

@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.linalg import schur
 
-from flexarm_control.composite import MANIFOLD, design, design_law
-from flexarm_control.full_order import at_rest
-from flexarm_dynamics import arm_file
+from flexarm_control.composite.full_order import at_rest
+from flexarm_control.composite.law import MANIFOLD, design, design_law
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import quasi_steady_state, slow_subsystem
 
 SLOW = {"type": "model_following", "kp": [6.25], "kv": [5.0]}
@@ -155,7 +155,7 @@ def slow_eigenspace(order, stiffness):
 
 def softened(stiffness):
     """Arm one_link with its bending stiffness scaled."""
-    from flexarm_dynamics.arm import scaled
+    from flexarm_dynamics.arm.description import scaled
 
     return build(scaled(arm_file.load("one_link"), stiffness=stiffness, damping=0.0))
 

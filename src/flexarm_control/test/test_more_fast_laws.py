@@ -9,12 +9,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import place_poles
 
-from flexarm_control import full_order
-from flexarm_control.composite import FAST, design, design_law
+from flexarm_control.composite import full_order
+from flexarm_control.composite.law import FAST, design, design_law
 from flexarm_control.fast.scheduled_lqr import GainTable
-from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, ParameterError
-from flexarm_dynamics.model import Terms
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.model import Terms
 from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
 
 ARMS = ("R", "one_link", "two_link", "long_reach")

@@ -9,14 +9,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from flexarm_control import profiles
-from flexarm_control.composite import SLOW, design, design_law
+from flexarm_control.composite.law import SLOW, design, design_law
+from flexarm_control.motions import profiles
 from flexarm_control.slow.payload_model import PayloadModel
 from flexarm_control.slow.rigid_arm import Tip, rigid_arm
-from flexarm_dynamics import arm_file, model, registry
-from flexarm_dynamics.arm import Friction
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
 from flexarm_dynamics.errors import DesignError, ParameterError
-from flexarm_dynamics.model import Tableau
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.model import Tableau
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 LAWS = ("computed_torque", "resolved_acceleration", "sliding_mode", "adaptive_model_following")

@@ -8,8 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
-from flexarm_control.arm_observer import design_observer
-from flexarm_control.samples import ArmSample
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import design_observer
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 

@@ -13,10 +13,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from flexarm_control import composite
-from flexarm_dynamics import arm_file
-from flexarm_dynamics.arm import scaled
-from flexarm_dynamics.model import build
+from flexarm_control.composite import law as composite
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 KP, KV = 6.25, 5.0

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_control.arm_observer import ArmObserver, design_observer
-from flexarm_control.composite import FAST, SLOW, design_law
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model, registry
+from flexarm_control.composite.law import FAST, SLOW, design_law
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, MessageError, UnknownComponentError
+from flexarm_dynamics.models import model
 
 
 def test_strain_in_microstrain_is_refused_by_name(arm_r):

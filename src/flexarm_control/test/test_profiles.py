@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from flexarm_control.profiles import MOST_SMOOTHNESS, paper_profile, quintic, sample, smooth
+from flexarm_control.motions.profiles import (
+    MOST_SMOOTHNESS,
+    paper_profile,
+    quintic,
+    sample,
+    smooth,
+)
 from flexarm_control.trajectory import ReferenceGenerator, validate
 from flexarm_dynamics.errors import TrajectoryError
 

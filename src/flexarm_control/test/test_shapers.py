@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from flexarm_control import excitation, shapers
-from flexarm_control.profiles import quintic, smooth
+from flexarm_control.motions import excitation, shapers
+from flexarm_control.motions.profiles import quintic, smooth
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 

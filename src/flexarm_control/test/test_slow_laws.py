@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from flexarm_control import profiles
-from flexarm_control.composite import SLOW, design_law
-from flexarm_dynamics.model import Terms
+from flexarm_control.composite.law import SLOW, design_law
+from flexarm_control.motions import profiles
+from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
+from flexarm_dynamics.models.model import Terms
 from flexarm_dynamics.singular_perturbation import slow_subsystem
-from flexarm_dynamics.units import POUND_FORCE_FOOT
 
 # (A2) of arms R and P3: J0 + M L^2 + I0 = 0.109 + 3.1e-3 * 16 + 1 [lbf ft s^2]
 M11 = 1.1586 * POUND_FORCE_FOOT  # [kg m^2]

@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 
-from flexarm_control import profiles, shapers, tip_paths
+from flexarm_control.motions import profiles, shapers, tip_paths
 from flexarm_control.trajectory import specs
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_dynamics.models import model
 
 START = np.array([0.2, -0.3, 0.9, 0.2])
 

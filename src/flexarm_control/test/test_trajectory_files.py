@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flexarm_control.profiles import quintic, sample
+from flexarm_control.motions.profiles import quintic, sample
 from flexarm_control.trajectory import files, validate
 from flexarm_dynamics.errors import TrajectoryError
 

@@ -4,10 +4,11 @@
 import numpy as np
 import pytest
 
-from flexarm_control import profiles, shapers
+from flexarm_control.motions import profiles, shapers
 from flexarm_control.trajectory import files, specs
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models import model
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 
 
 def data_directory():

@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Arm, Flexibility, Gauge, Joint, Link, Mode
-from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm, Flexibility, Gauge, Joint, Link, Mode
+from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import ModelError, UnknownComponentError
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.strain_map import gauge_rows
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.chain import Chain
+from flexarm_dynamics.models.one_link import OneLink
 
 
 def two_links():

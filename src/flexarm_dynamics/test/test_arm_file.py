@@ -12,11 +12,12 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Arm
-from flexarm_dynamics.beam import natural_frequencies
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import ArmFileError, ModelError
-from flexarm_dynamics.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.beam import natural_frequencies
 
 FULL = """
 name: full

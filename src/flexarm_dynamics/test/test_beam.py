@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from flexarm_dynamics import beam
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.units import FOOT, POUND_FORCE
+from flexarm_dynamics.models import beam
 
 # Roots of cos(b) cosh(b) = -1 to 15 digits (Young & Felgar's table, extended).
 CLAMPED_FREE_ROOTS = (

@@ -18,11 +18,11 @@ from scipy.integrate import DOP853, solve_ivp
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from flexarm_dynamics.arm import Arm, Flexibility, Friction, Joint, Link, Payload
-from flexarm_dynamics.chain import Chain, work_space
+from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
 from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.kernels import generated
-from flexarm_dynamics.model import Tableau, rotation
+from flexarm_dynamics.models.chain import Chain, work_space
+from flexarm_dynamics.models.model import Tableau, rotation
 
 #: As in the other tests: the same examples on every run and every machine.
 examples = settings(max_examples=40, deadline=None, derandomize=True, database=None)

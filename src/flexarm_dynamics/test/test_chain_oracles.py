@@ -15,7 +15,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 
 
 def _neighbour(name):

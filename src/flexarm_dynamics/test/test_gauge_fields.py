@@ -6,7 +6,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError
 
 ARM = """

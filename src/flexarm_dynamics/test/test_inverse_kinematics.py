@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_dynamics import inverse_kinematics as ik
 from flexarm_dynamics.errors import ModelError, ShapeError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models import inverse_kinematics as ik
+from flexarm_dynamics.models.model import build
 
 BENT = np.array([0.2, -0.3, 0.9, 0.2])
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import eigh
 
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.model import Terms, damping_matrix
+from flexarm_dynamics.models.model import Terms, damping_matrix
 
 
 def matrices(m=3):

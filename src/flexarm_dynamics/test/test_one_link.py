@@ -12,12 +12,12 @@ from numpy.polynomial.legendre import leggauss
 from scipy.integrate import DOP853, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from flexarm_dynamics.arm import Arm, Flexibility, Friction, Joint, Link, Payload
+from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE
 from flexarm_dynamics.errors import ModelError, ShapeError
-from flexarm_dynamics.model import Tableau
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.paper_appendix import PaperAppendix
-from flexarm_dynamics.units import FOOT, POUND_FORCE
+from flexarm_dynamics.models.model import Tableau
+from flexarm_dynamics.models.one_link import OneLink
+from flexarm_dynamics.models.paper_appendix import PaperAppendix
 
 METHOD = Tableau(
     np.ascontiguousarray(DOP853.A[: DOP853.n_stages, : DOP853.n_stages]),

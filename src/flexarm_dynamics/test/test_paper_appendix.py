@@ -8,13 +8,14 @@ import pytest
 from scipy.integrate import DOP853, solve_ivp
 from scipy.linalg import solve_continuous_are
 
-from flexarm_dynamics import arm_file, model
 from flexarm_dynamics import singular_perturbation as sp
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.model import Tableau
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.paper_appendix import PaperAppendix
-from flexarm_dynamics.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.model import Tableau
+from flexarm_dynamics.models.one_link import OneLink
+from flexarm_dynamics.models.paper_appendix import PaperAppendix
 
 SLUG = POUND_FORCE / FOOT  # [kg] one lbf s^2/ft
 REST = np.zeros(1)

@@ -7,8 +7,8 @@ import pytest
 
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import UnknownComponentError
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.paper_appendix import PaperAppendix
+from flexarm_dynamics.models.one_link import OneLink
+from flexarm_dynamics.models.paper_appendix import PaperAppendix
 
 
 @pytest.fixture

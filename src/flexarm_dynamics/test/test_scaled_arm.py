@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import scaled
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.models import model
 
 ARMS = ("R", "P3", "one_link", "two_link", "long_reach")
 

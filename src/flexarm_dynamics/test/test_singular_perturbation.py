@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from flexarm_dynamics import arm_file
 from flexarm_dynamics import singular_perturbation as sp
-from flexarm_dynamics.arm import Friction
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.arm.units import POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import Terms, build
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.units import POUND_FORCE, POUND_FORCE_FOOT
+from flexarm_dynamics.models.model import Terms, build
+from flexarm_dynamics.models.one_link import OneLink
 
 REST = np.zeros(1)
 STATES = [(0.0, 0.0), (0.7, 0.0), (-2.1, 3.0), (1.2, -0.4)]

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_dynamics import arm_file, beam
-from flexarm_dynamics.arm import Gauge
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Gauge
+from flexarm_dynamics.arm.strain_map import StrainMap, confused, gauge_rows
 from flexarm_dynamics.errors import ModelError, ShapeError
-from flexarm_dynamics.one_link import OneLink
-from flexarm_dynamics.strain_map import StrainMap, confused, gauge_rows
+from flexarm_dynamics.models import beam
+from flexarm_dynamics.models.one_link import OneLink
 
 LENGTH, DISTANCE = 1.2192, 2.0e-3
 

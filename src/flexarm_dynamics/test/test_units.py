@@ -3,7 +3,7 @@
 
 import pytest
 
-from flexarm_dynamics.units import (
+from flexarm_dynamics.arm.units import (
     DIMENSIONS,
     FOOT,
     POUND_FORCE,

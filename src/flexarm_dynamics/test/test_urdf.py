@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_dynamics import arm_file, model, urdf
-from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.arm import arm_file, urdf
+from flexarm_dynamics.arm.sections import Sections, chain_of
 from flexarm_dynamics.errors import ModelError, ShapeError
-from flexarm_dynamics.sections import Sections, chain_of
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.chain import Chain
 
 ARMS = ("R", "two_link", "long_reach")
 

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from flexarm_control.arm_observer import ArmObserver, design_observer
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros.messages import (
     StateReader,
@@ -300,10 +301,11 @@ from types import SimpleNamespace
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-from flexarm_control.arm_controller import PARAMETERS, ArmController
-from flexarm_control.composite import design
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
+from flexarm_control.composite.law import design
+from flexarm_control.loop.samples import ArmSample
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 from flexarm_ros.messages import CompositeStateWriter, ObserverStateWriter, StateWriter, TorqueWriter
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import JointTorque
 from flexarm_ros.torque_gate import Controllers, TorqueGate, TorqueLimit
 

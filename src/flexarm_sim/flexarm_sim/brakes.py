@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from flexarm_dynamics.fixed_step import METHODS
+from flexarm_dynamics.models.fixed_step import METHODS
 
 from . import integrators
 

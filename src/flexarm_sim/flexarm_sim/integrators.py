@@ -5,7 +5,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.fixed_step import METHODS, MOST_SUBSTEPS, PHASE_PER_STEP, substeps
+from flexarm_dynamics.models.fixed_step import METHODS, MOST_SUBSTEPS, PHASE_PER_STEP, substeps
 
 __all__ = ["METHODS", "MOST_SUBSTEPS", "PHASE_PER_STEP", "integrate", "substeps"]
 

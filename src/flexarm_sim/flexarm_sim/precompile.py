@@ -5,7 +5,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
 
 from .integrators import METHODS
 from .plant import Plant

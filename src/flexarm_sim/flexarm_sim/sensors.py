@@ -12,7 +12,7 @@ there where the arm file states them, noise and drift when they are asked for.
 
 import numpy as np
 
-from flexarm_dynamics.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import gauge_rows
 
 
 class Sensors:

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Arm
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm
+from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
-from flexarm_dynamics.strain_map import StrainMap
 
 from . import integrators
 from .plant import Plant

@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Friction
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.models import model
 
 
 @pytest.fixture(scope="session")

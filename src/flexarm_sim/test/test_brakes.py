@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics import arm_file, model
-from flexarm_dynamics.arm import Friction
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.models import model
 from flexarm_sim.brakes import pivot
 from flexarm_sim.plant import Plant
 

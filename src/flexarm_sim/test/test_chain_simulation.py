@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics.arm import Arm, Flexibility, Friction, Joint, Link, Payload
-from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
 from flexarm_dynamics.errors import ShapeError
+from flexarm_dynamics.models.chain import Chain
 from flexarm_sim import batch
 from flexarm_sim.integrators import METHODS, integrate, substeps
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
 from flexarm_sim import fault_injector
 from flexarm_sim.fault_injector import FIELDS, Fault, FaultInjector, Sample, parse

@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ModelError
-from flexarm_sim.integrators import (
-    METHODS,
-    MOST_SUBSTEPS,
-    PHASE_PER_STEP,
-    integrate,
-    substeps,
-)
+from flexarm_dynamics.models import model
+from flexarm_sim.integrators import METHODS, MOST_SUBSTEPS, PHASE_PER_STEP, integrate, substeps
 
 METHOD = METHODS["dop853"]
 TABLEAU, WEIGHTS = METHOD.A, METHOD.weights

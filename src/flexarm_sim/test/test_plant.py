@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ModelError, ShapeError
+from flexarm_dynamics.models import model
 from flexarm_sim.integrators import integrate
 from flexarm_sim.plant import Plant
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics import model
+from flexarm_dynamics.models import model
 from flexarm_sim.sensors import Sensors
 
 

@@ -6,7 +6,7 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics.arm_file import find
+from flexarm_dynamics.arm.arm_file import find
 from flexarm_dynamics.errors import ArmFileError, ModelError, ParameterError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.simulator import PARAMETERS, Simulator

@@ -28,7 +28,7 @@ from scipy.linalg import eigh
 from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.model import build
+from flexarm_dynamics.models.model import build
 
 from ..trajectory.values import SECOND
 from .model import ModelFeedforward, Preparation, gains_along, path_of

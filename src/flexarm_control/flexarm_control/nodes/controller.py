@@ -13,14 +13,10 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from flexarm_control import arm_controller, composite, trajectory
-from flexarm_control.arm_controller import ArmController
-from flexarm_control.composite import FAST, MANIFOLD, PREFIX, SLOW
-from flexarm_control.design_process import AwayError, DesignProcess
-from flexarm_control.samples import ArmSample
-from flexarm_control.supervisor import State
-from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros import qos, scheduling
@@ -35,6 +31,15 @@ from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
 from flexarm_ros.statistics import Latency
+
+from .. import trajectory
+from ..composite import law as composite
+from ..composite.design_process import AwayError, DesignProcess
+from ..composite.law import FAST, MANIFOLD, PREFIX, SLOW
+from ..loop import arm_controller
+from ..loop.arm_controller import ArmController
+from ..loop.samples import ArmSample
+from ..loop.supervisor import State
 
 SLOW_TYPE = Parameter(
     "type",

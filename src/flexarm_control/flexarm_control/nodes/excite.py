@@ -5,17 +5,19 @@ import os
 
 from rclpy.duration import Duration
 
-from flexarm_control import excitation_run
-from flexarm_control.excitation_run import ExcitationRun, Stage
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import StateReader, TorqueWriter
 from flexarm_ros.node import ARM, ERROR, OK, ArmNode, run
 from flexarm_ros.start import leave
+
+from ..loop.samples import ArmSample
+from ..motions import excitation_run
+from ..motions.excitation_run import ExcitationRun, Stage
 
 PARAMETERS = (
     Parameter(

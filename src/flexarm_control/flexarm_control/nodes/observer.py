@@ -8,10 +8,10 @@ from time import perf_counter
 import numpy as np
 from std_srvs.srv import Trigger
 
-from flexarm_control import arm_observer, composite, gauge_health
-from flexarm_control.samples import ArmSample
-from flexarm_dynamics import arm_file, model, registry
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
@@ -20,6 +20,10 @@ from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
 from flexarm_ros.statistics import Gaps, Latency, Percentiles
+
+from ..composite import law as composite
+from ..loop.samples import ArmSample
+from ..observers import arm_observer, gauge_health
 
 #: So large a part of the samples may get lost in a second before it is worth a warning.
 MANY_LOST = 0.01

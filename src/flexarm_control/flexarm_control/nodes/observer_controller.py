@@ -5,10 +5,11 @@ The two nodes are those of `observer` and `controller`, with their names, parame
 `arm_state_estimate` is not subscribed to any more. It is published after the torque, where somebody listens.
 """
 
-from flexarm_control.nodes.controller import ControllerNode
-from flexarm_control.nodes.observer import ObserverNode
 from flexarm_ros.node import run
 from flexarm_ros.start import leave
+
+from .controller import ControllerNode
+from .observer import ObserverNode
 
 ESTIMATE = "arm_state_estimate"
 

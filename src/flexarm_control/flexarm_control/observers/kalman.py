@@ -29,9 +29,9 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import chi2
 
+from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import Parameter
-from flexarm_dynamics.strain_map import StrainMap
 
 from .base import Observer
 from .motion import Motion

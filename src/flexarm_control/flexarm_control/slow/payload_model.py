@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flexarm_dynamics.model import Terms
+from flexarm_dynamics.models.model import Terms
 
 
 class PayloadModel:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexarm_dynamics.chain import Chain
+from flexarm_dynamics.models.chain import Chain
 
 
 def rigid_arm(arm):

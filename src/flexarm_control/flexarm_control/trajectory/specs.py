@@ -25,9 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flexarm_control import profiles, shapers
 from flexarm_dynamics.errors import TrajectoryError
 
+from ..motions import profiles, shapers
 from . import files
 from .request import JointTrajectoryData, validate
 from .values import MAX_POINTS, SECOND
@@ -207,7 +207,7 @@ def _point_to_point(family, settings, model, start, duration):
 
 
 def _least_exciting(settings, model, start, to, duration):
-    from flexarm_control.least_exciting import least_exciting
+    from ..motions.least_exciting import least_exciting
 
     bounds = {}
     for key in ("torque-limit", "velocity-limit"):
@@ -221,7 +221,7 @@ def _least_exciting(settings, model, start, to, duration):
 def _tip_path(family, settings, model, start, duration):
     tip = numbers(settings["tip"], 3, "tip", "coordinates x;y;z", spread=False)
 
-    from flexarm_control import tip_paths
+    from ..motions import tip_paths
 
     law = profiles.smooth(0.0, 1.0, duration, _smoothness(settings))
     if family == "line":

@@ -9,7 +9,7 @@ from rcl_interfaces.msg import SetParametersResult
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from flexarm_dynamics import arm_file
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError, ModelError, ParameterError
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, JointTorque
@@ -18,8 +18,9 @@ from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
 from flexarm_ros.node import ERROR, OK, WARN, ArmNode, run
 from flexarm_ros.start import leave
 from flexarm_ros.torque_gate import Controllers, TorqueGate, TorqueLimit
-from flexarm_sim import simulator
-from flexarm_sim.fault_injector import FIELDS, FaultInjector, Sample
+
+from .. import simulator
+from ..fault_injector import FIELDS, FaultInjector, Sample
 
 #: In lockstep, after two controllers were heard in turn one has to be silent for so many samples.
 ALONE_SAMPLES = 100

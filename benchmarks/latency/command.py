@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm latency``: its options, and the tables that it writes; `measure` has what is measured."""
+
+import json
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.markdown import write_between
+from flexarm_studies.progress import Progress
+
+from . import redesign
+from .measure import CASES, CHAINS, measure, summary, table
+
+BEGIN, END = "<!-- latency: begin -->", "<!-- latency: end -->"
+
+
+def write(file, text):
+    """Put the tables between the markers of a Markdown file.
+
+    `text` is the tables in Markdown.
+
+    Raises
+    ------
+    FlexarmError
+        When the file has no markers.
+    """
+    write_between(file, BEGIN, END, text)
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Runs loop and relay in real time, in turns, at several rates; three to four minutes."
+    )
+    parser.epilog = "example: flexarm latency --quick --json results/latency.json"
+    parser.add_argument(
+        "--quick", action="store_true", help="500 Hz alone, fewer rounds, under a minute"
+    )
+    parser.add_argument("--rounds", type=int, help="turns of each (default 5; 3 with --quick)")
+    parser.add_argument("--arms", default="R,long_reach", help="of R and long_reach")
+    parser.add_argument("--rates", default="200,500,1000", help="of arm R [Hz]")
+    parser.add_argument(
+        "--relay-spin",
+        choices=("executor", "line"),
+        default="executor",
+        help="relay's nodes served by rclpy's executor (default), or as the loop's nodes are",
+    )
+    parser.add_argument(
+        "--redesign",
+        action="store_true",
+        help="then, at 500 Hz, the loop while its fast law is designed anew; five minutes more",
+    )
+    parser.add_argument("--json", metavar="FILE", help="all figures, window by window")
+    parser.add_argument("--write", metavar="FILE", help="put the table between a file's markers")
+
+
+def chosen(options):
+    """Cases that the options ask for."""
+    arms, rates = options.arms.split(","), [float(r) for r in options.rates.split(",")]
+    rates = [500.0] if options.quick else rates
+    cases = [c for c in CASES if c.arm in arms and (c.arm != "R" or c.rate in rates)]
+    if not cases:
+        raise FlexarmError(
+            f"latency: nothing to measure of arms {options.arms} at {options.rates} Hz; there are"
+            f" {'; '.join(c.name for c in CASES)}"
+        )
+    return cases
+
+
+def _table_of(everything, cases, options, title, measured):
+    """Measure case by case, and print as it goes; the table of all, whose figures are added to `everything`."""
+    text, progress = "", Progress()
+    for i, case in enumerate(cases):
+        progress.step(f"{title}: {case.name}", i + 1, len(cases))
+        found, rows, made = measured(case, options, progress)
+        progress.done()
+        more = "\n".join(made.splitlines()[2:]) if text else made
+        print(more, flush=True)
+        text = f"{text}\n{more}" if text else more
+        for row in rows:
+            if row.get("chain", "relay") != "relay" and row["enabled"] < 0.99:
+                share = f"{100.0 * row['enabled']:.0f} %"
+                print(
+                    f"{row['case']}, {row['chain']}: torque was enabled in {share} of the samples"
+                )
+        everything.append({"case": case.name, "title": title, "found": found, "rows": rows})
+    return text
+
+
+def _beside_the_relay(case, options, progress):
+    rounds = options.rounds or (3 if options.quick else 5)
+    chains = tuple(CHAINS)[:2] if options.quick else tuple(CHAINS)
+    # Planning a motion of many joints takes longer than a quick run may.
+    moving = not (options.quick and case.file)
+    found = measure(case, rounds, chains, options.relay_spin, moving, progress.fraction)
+    rows = [{**row, "moving": moving} for row in summary(case, found)]
+    return found, rows, table(rows)
+
+
+def _while_designing(case, options, progress):
+    found = redesign.measure(case, options.rounds or 10, progress.fraction)
+    rows = redesign.summary(case, found)
+    return found, rows, redesign.table(rows)
+
+
+def latency(options):
+    """The sub-command."""
+    tables, everything = [], []
+    cases = chosen(options)
+    again = [case for case in cases if case.rate == 500.0]
+    if options.redesign and not again:
+        raise FlexarmError("latency --redesign is measured at 500 Hz: have it among the --rates")
+    tables.append(_table_of(everything, cases, options, "beside a relay", _beside_the_relay))
+    if options.redesign:
+        tables.append(_table_of(everything, again, options, "while designing", _while_designing))
+    if options.json:
+        Path(options.json).write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
+    if options.write:
+        write(options.write, "\n\n".join(tables))

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""``flexarm latency``: from measurement to torque, in real time, beside a bare relay of the same messages.
+
+A loop is the shipped nodes in the shipped control, on the moving arm: simulator, observer and controller as three
+processes, or observer and controller in one. The relay is three plain nodes that answer each message with a
+ready-made one of the same type, size and quality of service (`relay`); the same simulator, with the same plant, is at
+its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's publish
+to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that what
+slows the machine slows all of them, and the ratio of each round's medians is told.
+"""
+
+import json
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.loop import parameter_files
+
+#: What takes turns: the processes beside the simulator, and whether they are the loop's.
+CHAINS = {
+    "relay": ("observer", "controller"),
+    "three processes": ("observer", "controller"),
+    "observer and controller in one": ("observer_controller",),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm, control and rate.
+
+    Attributes
+    ----------
+    arm : str
+    file : str
+        Controller file; empty: the nodes' defaults.
+    rate : float
+        [Hz]
+    begin, end : tuple of float
+        Ends of the motion [rad].
+    window : float
+        Length of one window [s].
+    pace : float
+        Simulated seconds per second.
+    """
+
+    arm: str
+    file: str
+    rate: float
+    begin: tuple
+    end: tuple
+    window: float
+    pace: float = 1.0
+
+    @property
+    def name(self):
+        """For tables."""
+        pace = "" if self.pace == 1.0 else f" x {self.pace:g}"
+        return f"{self.arm}, {self.rate:g} Hz{pace}"
+
+
+R = {"arm": "R", "file": "", "begin": (0.0,), "end": (1.5,)}
+LONG_REACH = {
+    "arm": "long_reach",
+    "file": "long_reach",
+    "begin": (0.0, 1.2, 0.8, -0.8),
+    "end": (1.0472, 0.1528, 1.8472, 0.2472),
+}
+CASES = (
+    *(Case(**R, rate=rate, window=1.5) for rate in (200.0, 500.0, 1000.0)),
+    # A motion of this arm is planned for seconds at its receipt: one of two seconds serves all windows. It does not
+    # forgive a torque that is late by more than a period: slowed down, it is controlled on a busy machine, too.
+    Case(**LONG_REACH, rate=500.0, window=1.6, pace=0.25),
+)
+
+
+#: A machine that comes too late is to show in the figures, not to have the arm stopped.
+OPEN = {
+    "state_timeout": 60.0,
+    "max_gap": 60.0,
+    "tracking_error_limit": 100.0,
+    "velocity_margin": 100.0,
+    "position_margin": 10.0,
+    "saturation_time": 1e4,
+    "limit_patience": 1e3,
+}
+
+
+class Chain:
+    """One loop or relay on a domain of its own, paused between windows."""
+
+    #: Longest wait for any one thing [s].
+    PATIENCE = 180.0
+
+    def __init__(self, stack, name, case, directory, relay_spin):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        from std_srvs.srv import SetBool
+        from trajectory_msgs.msg import JointTrajectory
+
+        from flexarm_ros import qos
+        from flexarm_tools.running.processes import Processes, own_domain
+
+        self.name, self.case = name, case
+        self.processes = stack.enter_context(
+            Processes(stack.enter_context(own_domain()), directory / name)
+        )
+        self._start(relay_spin)
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=self.processes.domain)
+        stack.callback(rclpy.try_shutdown, context=self.context)
+        quiet = {"start_parameter_services": False, "enable_rosout": False}
+        self.node = Node("latency", context=self.context, **quiet)
+        stack.callback(self.node.destroy_node)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        stack.callback(self.executor.shutdown)
+        self._pause = self.node.create_client(SetBool, "simulator/pause")
+        self._trajectory = self.node.create_publisher(
+            JointTrajectory, "joint_trajectory", qos.COMMAND
+        )
+
+    def _start(self, relay_spin):
+        from flexarm_tools.running.processes import arguments
+
+        case, start = self.case, self.processes.start_module
+        file = parameter_files.find(case.file) if case.file else None
+        given = {"arm": case.arm, "rate": case.rate, "real_time_factor": case.pace}
+        given["initial_position"] = list(case.begin)
+        timed = f"{__package__}.nodes"
+        start("simulator", timed, "simulator", *arguments(given, file))
+        for role in CHAINS[self.name]:
+            if self.name == "relay":
+                start(role, f"{__package__}.relay", role, case.arm, relay_spin)
+            else:
+                given = {"arm": case.arm, "rate": case.rate, **OPEN}
+                start(role, timed, role, *arguments(given, file))
+
+    def wait_for(self, what, condition):
+        """Serve the executor until `condition` holds."""
+        from flexarm_tools.running.processes import ProcessError
+
+        end = time.monotonic() + self.PATIENCE
+        while not (value := condition()):
+            self.executor.spin_once(timeout_sec=0.05)
+            self.processes.check()
+            if time.monotonic() > end:
+                raise ProcessError(f"{self.name}: waited {self.PATIENCE:g} s in vain for {what}")
+        return value
+
+    def get_ready(self):
+        """Wait for the nodes; the first calls, which load code, are not measured."""
+        for topic in ("arm_state", "arm_state_estimate", "joint_torque"):
+            self.wait_for(f"who publishes {topic}", lambda t=topic: self.node.count_publishers(t))
+        wanted = "latencies" if self.name == "relay" else "enabled"
+        self.wait_for("a torque", lambda: self.window(0.2)[wanted])
+
+    def pause(self, paused):
+        """Call the simulator's `~/pause`."""
+        from std_srvs.srv import SetBool
+
+        self.wait_for("simulator/pause", self._pause.service_is_ready)
+        future = self._pause.call_async(SetBool.Request(data=paused))
+        self.wait_for("an answer of simulator/pause", future.done)
+
+    def offer(self, duration):
+        """Have the loop begin a motion of this duration [s] with its next window."""
+        from flexarm_control.motions.profiles import quintic
+        from flexarm_msgs.msg import CompositeState
+        from flexarm_ros import qos
+        from flexarm_tools.running.lockstep import trajectory_message
+
+        states = []
+        listener = self.node.create_subscription(
+            CompositeState, "controller/state", states.append, qos.LINE
+        )
+        self.wait_for("the controller to be ready", lambda: any(s.supervisor_state for s in states))
+        self.wait_for("the controller", self._trajectory.get_subscription_count)
+        joints = arm_file.load(self.case.arm).joint_names
+        profile = quintic(np.array(self.case.begin), np.array(self.case.end), duration)
+        self._trajectory.publish(trajectory_message(joints, profile))
+        del states[:]
+        self.wait_for(
+            "the motion to be accepted",
+            lambda: any(s.accepted_trajectory_id for s in states[-3:]),
+        )
+        self.node.destroy_subscription(listener)
+
+    def window(self, seconds):
+        """Let it run for a while; what the simulator found."""
+        before = len(self.figures())
+        self.pause(False)
+        time.sleep(seconds)
+        self.pause(True)
+        said = self.wait_for("the simulator's figures", lambda: self.figures()[before:])
+        return said[-1]
+
+    def figures(self):
+        """What the simulator found, one for each window so far."""
+        return self._said("simulator")
+
+    def _said(self, name):
+        lines = self.processes.log(name).splitlines()
+        return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+
+    def mathematics(self):
+        """End the processes; median time of one call of observer, controller and law [s]."""
+        logs = CHAINS[self.name]
+        self.processes.stop()
+        found = {}
+        for name in logs:
+            for said in self._said(name):
+                for part, times in said.items():
+                    # The first ones wait for code to be loaded.
+                    found[part] = statistics.median(times[20:] or times or [float("nan")])
+        return found
+
+
+def measure(
+    case,
+    rounds,
+    chains=tuple(CHAINS),
+    relay_spin="executor",
+    moving=True,
+    fraction=lambda done: None,
+):
+    """Windows of a case, in turns.
+
+    Parameters
+    ----------
+    case : Case
+    rounds : int
+    chains : sequence of str
+        Of `CHAINS`; the relay first.
+    relay_spin : str
+        How the relay's nodes are served: ``executor``, by rclpy; ``line``, as the loop's nodes are.
+    moving : bool
+        Whether the arm moves.
+    fraction : callable
+        Is told how much is done, 0 to 1.
+
+    Returns
+    -------
+    dict
+        Chain to ``{"windows": [what the simulator found …], "mathematics": {part: s}}``.
+    """
+    import contextlib
+
+    out = {}
+    with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        made = [Chain(stack, name, case, Path(folder), relay_spin) for name in chains]
+        for chain in made:
+            chain.get_ready()
+            if moving and chain.name != "relay":
+                chain.offer((rounds + 0.5) * case.window * case.pace)
+        for chain in made:
+            out[chain.name] = {"windows": []}
+        for i in range(rounds):
+            # In another order each time: none of them always comes first.
+            for chain in made[i % len(made) :] + made[: i % len(made)]:
+                out[chain.name]["windows"].append(chain.window(case.window))
+            fraction((i + 1) / rounds)
+        for chain in made:
+            out[chain.name]["mathematics"] = chain.mathematics()
+    return out
+
+
+def summary(case, found):
+    """Rows of the table of one case, and what they are made of.
+
+    `found` has the windows that were measured, by chain.
+
+    Returns
+    -------
+    list of dict
+        One for each chain; times in milliseconds.
+    """
+
+    def percentiles(windows):
+        return [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows]
+
+    for name, chain in found.items():
+        for window in chain["windows"]:
+            if not window["latencies"]:
+                raise FlexarmError(f"{case.name}: no torque came back in a window of {name}")
+    bare = percentiles(found["relay"]["windows"])
+    rows = []
+    for name, chain in found.items():
+        windows = chain["windows"]
+        each = percentiles(windows)
+        ratios = [a / b for a, b in zip(each, bare, strict=True)]
+        answered = sum(len(w["latencies"]) for w in windows)
+        sent = answered + sum(w["missed"] for w in windows)
+        row = {
+            "case": case.name,
+            "arm": case.arm,
+            "rate": case.rate,
+            "chain": name,
+            "rounds": len(windows),
+            "samples": answered,
+            "latency_ms": dict(
+                zip(("p50", "p95", "p99"), (1e3 * np.median(each, axis=0)).tolist(), strict=True)
+            ),
+            "ratio": dict(
+                zip(("p50", "p95", "p99"), np.median(ratios, axis=0).tolist(), strict=True)
+            ),
+            "missed": sum(w["missed"] for w in windows) / max(sent, 1),
+            "lost": sum(w["lost"] for w in windows) / max(sent, 1),
+            "enabled": sum(w["enabled"] for w in windows) / answered,
+        }
+        base = float(np.median([b[0] for b in bare]))
+        for part, seconds in chain.get("mathematics", {}).items():
+            row[f"{part}_ms"] = 1e3 * seconds
+            row[f"{part}_share"] = seconds / base
+        rows.append(row)
+    return rows
+
+
+def table(rows):
+    """Markdown table of `summary` rows."""
+    lines = [
+        "| arm, rate | | p50 [ms] | p95 | p99 | ratio of p50 | of p95 | late or missed | controller's step [ms] |"
+        " of relay's p50 | the law in it [ms] | of relay's p50 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        t, r = row["latency_ms"], row["ratio"]
+        cells = [row["case"], row["chain"], *(f"{t[p]:.2f}" for p in ("p50", "p95", "p99"))]
+        if row["chain"] == "relay":
+            cells += ["1", "1"]
+        else:
+            cells += [f"{r['p50']:.2f}", f"{r['p95']:.2f}"]
+        cells.append(f"{100.0 * row['missed']:.1f} %")
+        for part in ("controller", "law"):
+            took = row.get(f"{part}_ms")
+            share = "" if took is None else f"{100 * row[f'{part}_share']:.0f} %"
+            cells += ["" if took is None else f"{took:.3f}", share]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)

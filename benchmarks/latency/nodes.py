@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The line's nodes with a stopwatch: what `latency` starts. ``python -m benchmarks.latency.nodes ROLE …``.
+
+The nodes are the shipped ones. The simulator stamps each state as it publishes it and each torque as it comes in,
+on one steady clock of one process; observer and controller time their one call of mathematics. What they found they
+print, a line of JSON at the end of each window (simulator) or of the process (the others).
+"""
+
+import json
+import sys
+from time import perf_counter
+
+from flexarm_control.composite.law import CompositeControl
+from flexarm_control.loop.arm_controller import ArmController
+from flexarm_control.observers.arm_observer import ArmObserver
+from flexarm_sim.nodes import simulator
+
+
+class TimedSimulator(simulator.SimulatorNode):
+    """The simulator in real time, which is let go and paused for each window."""
+
+    def build(self):
+        super().build()
+        self._pending, self._latencies, self._latencies_enabled, self._lost_before = {}, [], 0, 0
+        self._paused = True
+
+    def _publish(self):
+        if not self._paused:
+            self._pending[self.sim.sequence] = perf_counter()
+        super()._publish()
+
+    def _on_torque(self, msg):
+        now = perf_counter()
+        if msg.session == self._session:
+            sent = self._pending.pop(msg.sequence, None)
+            if sent is not None:
+                self._latencies.append(now - sent)
+                self._latencies_enabled += msg.mode == msg.ENABLED
+        super()._on_torque(msg)
+
+    def _on_pause(self, request, response):
+        if request.data:
+            late = sum(wait > self.line.period for wait in self._latencies) if self.line else 0
+            found = {
+                "latencies": self._latencies,
+                "enabled": self._latencies_enabled,
+                # No torque when the next period began: late, or never (the one under way aside).
+                "missed": late + max(len(self._pending) - 1, 0),
+                "lost": self.line.lost - self._lost_before if self.line else 0,
+            }
+            print(json.dumps(found), flush=True)
+        self._pending, self._latencies, self._latencies_enabled = {}, [], 0
+        self._lost_before = self.line.lost if self.line else 0
+        return super()._on_pause(request, response)
+
+
+def timed(kind, key):
+    """Time `kind.step`, for new samples; what was found is printed at the end of the process."""
+    step, times, last = kind.step, [], [None]
+
+    def stepping(self, sample, *more):
+        begin = perf_counter()
+        result = step(self, sample, *more)
+        took = perf_counter() - begin
+        if sample.key != last[0]:  # one that was sent again is answered from the cache
+            last[0] = sample.key
+            if result:  # a controller that waits, or an observer that converges, does less
+                times.append(took)
+        return result
+
+    kind.step = stepping
+    return lambda: print(json.dumps({key: times}), flush=True)
+
+
+def timed_law():
+    """Time `CompositeControl.step`, the mathematics in a controller's step; printed at the end of the process."""
+    step, times = CompositeControl.step, []
+
+    def stepping(self, *state):
+        begin = perf_counter()
+        torque = step(self, *state)
+        times.append(perf_counter() - begin)
+        return torque
+
+    CompositeControl.step = stepping
+    return lambda: print(json.dumps({"law": times}), flush=True)
+
+
+def main():
+    """Entry point of one process: ROLE, then what the node takes."""
+    role = sys.argv.pop(1)
+    if role == "simulator":
+        simulator.SimulatorNode = TimedSimulator
+        return simulator.main()
+    says = [timed_law(), timed(ArmController, "controller")] if "controller" in role else []
+    says += [timed(ArmObserver, "observer")] if "observer" in role else []
+    from flexarm_control.nodes import controller, observer, observer_controller
+
+    module = {
+        "observer": observer,
+        "controller": controller,
+        "observer_controller": observer_controller,
+    }[role]
+
+    def leave(code, and_then=module.leave):
+        for say in says:
+            say()
+        and_then(code)
+
+    module.leave = leave
+    return module.main()
+
+
+if __name__ == "__main__":
+    from flexarm_ros.start import leave_after
+
+    leave_after(main)

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm latency --redesign``: the same loop's latency while its fast law is designed anew, beside without.
+
+Three processes, the moving arm; windows without and windows in which parameters of the controller are set once in
+`EVERY` seconds take turns, and the ratio of each round's percentiles is told. Each set is a whole design: gains,
+full-order check, feed-forward; or the Riccati gains over the workspace.
+"""
+
+import contextlib
+import itertools
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from .measure import Chain
+
+#: From one set to the next [s].
+EVERY = 1.0
+#: Length of a window, and of the rest after one with designs [s].
+WINDOW, REST = 3.0, 2.0
+
+NOTHING, ALPHA, GRID = "nothing", "`fast.alpha` set", "`scheduled_lqr` grid built"
+
+
+@dataclass(frozen=True)
+class Redesign:
+    """What is set in turns.
+
+    Attributes
+    ----------
+    alphas : tuple of float
+        Of `fast.alpha`.
+    grids : tuple of int
+        Of `fast.grid`, with `fast.type` scheduled_lqr.
+    reach : float
+        Of the grid, either side of the middle of the motion [rad].
+    """
+
+    alphas: tuple
+    grids: tuple
+    reach: float
+
+
+#: By arm.
+REDESIGNS = {
+    "R": Redesign((4.0, 5.0), (3, 4), 1.0),
+    "long_reach": Redesign((0.0, 0.05), (3, 4), 0.3),
+}
+
+
+def values_of(case):
+    """What is set in turns, by `ALPHA` and `GRID`: lists of name to value."""
+    redesign, middle = REDESIGNS[case.arm], 0.5 * (np.array(case.begin) + np.array(case.end))
+    low, high = (middle + side * redesign.reach for side in (-1.0, 1.0))
+    ends = {"fast.low": low.tolist(), "fast.high": high.tolist()}
+    return {
+        ALPHA: [{"fast.type": "lqr", "fast.alpha": alpha} for alpha in redesign.alphas],
+        GRID: [{"fast.type": "scheduled_lqr", "fast.grid": g, **ends} for g in redesign.grids],
+    }
+
+
+class Setter:
+    """Sets parameters of the controller of a chain, one answer after the other."""
+
+    def __init__(self, chain, case):
+        from rcl_interfaces.srv import SetParametersAtomically
+
+        self.chain, self.answers = chain, []
+        self._client = chain.node.create_client(
+            SetParametersAtomically, "controller/set_parameters_atomically"
+        )
+        self._request = SetParametersAtomically.Request
+        self._values = {what: itertools.cycle(all_) for what, all_ in values_of(case).items()}
+        chain.wait_for("the controller's parameters", self._client.service_is_ready)
+
+    def set(self, what):
+        """Ask for `ALPHA` or `GRID`; the future of the answer."""
+        from rclpy.parameter import Parameter
+
+        values = next(self._values[what])
+        wanted = [Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
+        return self._client.call_async(self._request(parameters=wanted))
+
+    def window(self, what):
+        """One window with `what` set once in a while; what the simulator found."""
+        chain, answer, due = self.chain, None, 0.0
+        before = len(chain.figures())
+        chain.pause(False)
+        end = time.monotonic() + WINDOW
+        while (now := time.monotonic()) < end:
+            if what != NOTHING and now >= due:
+                self._take(answer)
+                answer, due = self.set(what), now + EVERY
+            chain.executor.spin_once(timeout_sec=0.05)
+        self._take(answer)
+        chain.pause(True)
+        if what != NOTHING:
+            self._wait_for_design()
+        return chain.wait_for("the simulator's figures", lambda: chain.figures()[before:])[-1]
+
+    def _wait_for_design(self):
+        """Let what is still being designed end, with the machine to itself: the next window is to be without."""
+        end = time.monotonic() + REST
+        while time.monotonic() < end:
+            self.chain.executor.spin_once(timeout_sec=0.05)
+
+    def _take(self, answer):
+        if answer is not None:
+            self.chain.wait_for("parameters to be set", answer.done)
+            self.answers.append(answer.result().result)
+
+
+def measure(case, rounds, fraction=lambda done: None):
+    """Windows of a case, in turns.
+
+    Parameters
+    ----------
+    case : Case
+        Of an arm of `REDESIGNS`.
+    rounds : int
+    fraction : callable
+        Is told how much is done, 0 to 1.
+
+    Returns
+    -------
+    dict
+        What was done to what the simulator found in each window.
+
+    Raises
+    ------
+    FlexarmError
+        When the controller refuses a value or a design.
+    """
+    from flexarm_dynamics.errors import FlexarmError
+
+    kinds = (NOTHING, ALPHA, GRID)
+    found = {kind: [] for kind in kinds}
+    with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        chain = Chain(stack, "three processes", case, Path(folder), "executor")
+        chain.get_ready()
+        chain.offer((len(kinds) * rounds + 2) * WINDOW * case.pace)
+        setter = Setter(chain, case)
+        for kind in kinds:  # the first starts the process of the designs
+            setter.window(kind)
+        for i in range(rounds):
+            for kind in kinds if i % 2 == 0 else kinds[::-1]:
+                found[kind].append(setter.window(kind))
+            fraction((i + 1) / rounds)
+        chain.processes.stop()
+        refused = [x for x in chain.processes.log("controller").splitlines() if "refused" in x]
+    if refused:
+        raise FlexarmError(f"{case.name}: a design was refused: {refused[0]}")
+    for answer in setter.answers:
+        if not answer.successful:
+            raise FlexarmError(f"{case.name}: the controller refused: {answer.reason}")
+    return found
+
+
+def summary(case, found):
+    """Rows of the table of one case: percentiles [ms], and the ratio of each round's to that without.
+
+    `found` has the windows by what was done in them.
+
+    Returns
+    -------
+    list of dict
+    """
+    each = {
+        kind: 1e3 * np.array([np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows])
+        for kind, windows in found.items()
+    }
+    names = ("p50", "p95", "p99")
+    return [
+        {
+            "case": case.name,
+            "meanwhile": kind,
+            "latency_ms": dict(zip(names, np.median(mine, axis=0).tolist(), strict=True)),
+            "ratio": dict(
+                zip(names, np.median(mine / each[NOTHING], axis=0).tolist(), strict=True)
+            ),
+        }
+        for kind, mine in each.items()
+    ]
+
+
+def table(rows):
+    """Markdown table of `summary` rows."""
+    lines = [
+        "| arm, rate | meanwhile | p50 [ms] | p95 | p99 | ratio of p50 | of p95 | of p99 |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        cells = [row["case"], row["meanwhile"]]
+        cells += [f"{value:.2f}" for value in row["latency_ms"].values()]
+        cells += [f"{value:.2f}" for value in row["ratio"].values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)

@@ -1,0 +1,468 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Controller of an arm: reference, composite control, limits; what happens when a state is bad is `supervisor`'s."""
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.parameters import Parameter
+
+from ..arrays import clip
+from ..observers.arm_observer import check_finite
+from ..trajectory import ReferenceGenerator, Verdict, validate
+from . import supervisor
+from .samples import ArmSample, SampleOrder
+from .supervisor import State, Supervisor
+
+#: Time in which the fast control comes back, or goes, when it is switched [s].
+FAST_RAMP = 0.1
+
+#: Parameters of the controller that belong to no single law.
+PARAMETERS = (
+    Parameter(
+        "torque_limit",
+        "float_array",
+        [0.0],
+        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's.",
+        unit="N m",
+        low=0.0,
+        high=1e6,
+        length="joints",
+    ),
+    Parameter(
+        "torque_rate_limit",
+        "float_array",
+        [0.0],
+        "Largest change of torque per second, against the last torque sent; 0.0: none.",
+        unit="N m/s",
+        low=0.0,
+        high=1e9,
+        length="joints",
+    ),
+    *supervisor.PARAMETERS,
+)
+
+START_TOLERANCE = Parameter(
+    "start_tolerance",
+    "float",
+    0.01,
+    "How far a first point at time 0 may lie from the reference; farther is refused.",
+    unit="rad",
+    low=0.0,
+    high=10.0,
+    read_only=True,
+)
+
+
+class ArmController:
+    """One composite controller: samples in, torques out, without ROS.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm as the controller knows it.
+    law : CompositeControl
+    settings : mapping
+        Checked values of `PARAMETERS`.
+    start_tolerance : float
+        [rad], see `START_TOLERANCE`.
+
+    Attributes
+    ----------
+    torque : ndarray
+        What to send [N m], shape (n,); zero when not `enabled`.
+    enabled : bool
+        Whether the torque may be applied, or each joint's safe action is to be taken.
+    supervisor : Supervisor
+        State and limits.
+    law, answered_by : CompositeControl
+        For the next sample, and the one that made `torque`: `law` may be replaced whole at any time.
+    fast_enabled : bool
+        Whether the fast control takes part, see `enable_fast`.
+    saturated : bool
+        A limit was met at this sample.
+    late, missed : int
+        Samples that came after a later one, and were left out; and that never came.
+    """
+
+    def __init__(self, model, law, settings, start_tolerance=0.01):
+        n = model.n_joints
+        self.model, self.law, self.answered_by = model, law, law
+        fastest = [j.limits.velocity for j in model.arm.joints]
+        self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
+        self._start_tolerance = start_tolerance
+        self.torque = np.zeros(n)
+        self._before, self._nothing = np.zeros(n), np.zeros(0)
+        self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
+        self.enabled, self.saturated, self.fast_enabled = False, False, True
+        self._trajectory_reason = ""
+        self._waiting = False  # joints known, deflections not yet
+        self.late = self.missed = 0
+        self._order = SampleOrder()
+        self._last_ns = 0
+        limit = self._torque_limit(settings)
+        self.supervisor = Supervisor(model, settings, limit)
+        self._take_limits(settings, limit)
+
+    def configure(self, settings):
+        """Take new limits whole; call between two samples.
+
+        Raises
+        ------
+        ParameterError
+            Nothing has changed then.
+        """
+        limit = self._torque_limit(settings)
+        self.supervisor.configure(settings, limit)
+        self._take_limits(settings, limit)
+
+    def _torque_limit(self, settings):
+        from_file = np.array([j.limits.torque for j in self.model.arm.joints])
+        wanted = np.array(settings["torque_limit"])
+        return np.where(wanted > 0.0, np.minimum(wanted, from_file), from_file)
+
+    def _take_limits(self, settings, limit):
+        rate = np.array(settings["torque_rate_limit"])
+        rate = np.where(rate > 0.0, rate, np.inf)
+        self._limit, self._least, self._rate_limit = limit, -limit, rate
+        self._settings = dict(settings)
+        self._rate_limited = bool(np.isfinite(rate).any())
+        self._max_gap = round(1e9 * settings["max_gap"])
+        self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
+
+    @property
+    def state(self):
+        """The `State` of the supervisor."""
+        return self.supervisor.state
+
+    @property
+    def torque_limit(self):
+        """Limit in force, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
+        return self._limit
+
+    @property
+    def trajectory_id(self):
+        """Number of the last accepted trajectory; 0: none yet."""
+        return self.reference.accepted_id
+
+    @property
+    def reason(self):
+        """Why there is no torque, why the arm was stopped, or why the last trajectory was refused; else empty."""
+        return self.supervisor.reason or self._trajectory_reason
+
+    def refuse(self, reason):
+        """Note a trajectory that was refused before it could be offered."""
+        self._trajectory_reason = reason
+
+    @property
+    def plans(self):
+        """Whether a trajectory is worth a `prepare` before it is offered."""
+        return self.law.feedforward is not None and self.law.feedforward.plans
+
+    def prepare(self, trajectory, law, prepare=None):
+        """Design work for a trajectory that is about to be offered; off the control path, in any thread.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+        law : CompositeControl
+            The one in force.
+        prepare : callable, optional
+            Does that work, called with the feed-forward, the trajectory and the state (3, n) that it starts from:
+            in another process, say. Not given: here.
+
+        Returns
+        -------
+        object or None
+            For `offer`; None where there is none to do.
+
+        Raises
+        ------
+        DesignError
+            When it can't be done: the trajectory may be offered without.
+        """
+        if law.feedforward is None:
+            return None
+        start = self.reference.resting
+        if start is None:
+            return None
+        if prepare is not None:
+            return prepare(law.feedforward, trajectory, start)
+        return law.feedforward.prepare(trajectory, start)
+
+    def offer(self, trajectory, plan=None):
+        """Offer a trajectory.
+
+        While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
+        explicit start passes before that is given up.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+        plan : object, optional
+            What `prepare` made for it.
+
+        Returns
+        -------
+        Verdict
+            Refusals are kept in `reason`; repeats are none.
+        """
+        if self.state == State.FAULT:
+            verdict = Verdict(False, f"in fault, call ~/recover first: {self.supervisor.reason}", 0)
+        elif not (self.enabled or self._waiting):
+            verdict = Verdict(False, f"no valid state: {self.supervisor.reason or 'none yet'}", 0)
+        else:
+            verdict = self.reference.offer(trajectory)
+        if verdict.accepted:
+            self._trajectory_reason = ""
+            if self.law.feedforward is not None:
+                self.law.feedforward.take(plan, verdict.trajectory_id)
+        elif not verdict.repeat:
+            self._trajectory_reason = verdict.reason
+        return verdict
+
+    def step(self, sample, now_ns=None):
+        """Answer one estimated state; the control path.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            With amplitude and rate.
+        now_ns : int, optional
+            The time on the clock that stamps are of [ns]; wanted with `synchronised_clocks`.
+
+        Returns
+        -------
+        bool or None
+            `enabled`; None for a sample that came after a later one: it has had its answer, or needs none. A
+            repeated (session, sequence) is answered as before.
+        """
+        if not self.model.n_modes:
+            sample.amplitude = sample.rate = self._nothing  # on a topic none and unknown look alike
+        try:
+            verdict = self._judge(sample, now_ns)
+        except MessageError as error:
+            self.distrust(str(error))
+            return False
+        if verdict == SampleOrder.STALE:
+            self.late += 1
+            return None
+        if verdict == SampleOrder.REPEAT and (self.enabled or self._waiting):
+            return self.enabled
+        if self.state == State.FAULT:
+            return False
+        if verdict == SampleOrder.REPEAT and sample.stamp_ns != self._order.stamp_ns:
+            self.distrust(f"state {sample.sequence} came again with another stamp")
+            return False
+        law = self.answered_by = self.law
+        law.limit = self._limit
+        if sample.amplitude is None or (sample.rate is None and law.needs_rates):
+            self._wait(sample, verdict)
+            return False
+        if verdict == SampleOrder.RESTART or not self.supervisor.running:
+            self._begin(sample, verdict)
+            law.reset()
+        return self._control(sample, 1e-9 * (sample.stamp_ns - self._last_ns))  # 0 for the first
+
+    def _control(self, sample, dt):
+        """The torque for a sample that can be trusted; whether it may be applied."""
+        law, reference, supervisor = self.law, self.reference, self.supervisor
+        reference.sample(sample.stamp_ns)
+        q, qd = sample.position, sample.velocity
+        np.subtract(reference.position, q, out=self.position_error)
+        np.subtract(reference.velocity, qd, out=self.velocity_error)
+        law.fast_share = self._fast_share(law.fast_share, dt)
+        try:
+            u = law.step(q, qd, sample.amplitude, sample.rate, reference, dt)
+        except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
+            self.fail(f"the control law failed: {type(error).__name__}: {error}")
+            return False
+        if not (u.dot(u) < np.inf or np.isfinite(u).all()):
+            i = int(np.argmin(np.isfinite(u)))
+            self.fail(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
+            return False
+        self._limited(u, dt)
+        self._last_ns = sample.stamp_ns
+        error = None if law.free else self.position_error
+        verdict, why = supervisor.watch(q, qd, sample.amplitude, error, self.saturated, dt)
+        if verdict == State.FAULT:
+            self.fail(why)
+            return False
+        self.enabled = True
+        supervisor.follow(reference)
+        if verdict == State.STOPPING and (reference.active or reference.pending):
+            self.brake(why)  # from the next sample on
+        return self.enabled
+
+    def _fast_share(self, share, dt):
+        """Part of the fast control that takes part: in a ramp, where it was switched."""
+        goal = 1.0 if self.fast_enabled else 0.0
+        if share == goal:
+            return goal
+        step = dt / FAST_RAMP
+        return min(goal, share + step) if goal > share else max(goal, share - step)
+
+    def rehearse(self):
+        """Go through three samples and a trajectory on the side, so that compiled code is loaded before it counts."""
+        model = self.model
+        other = ArmController(model, self.law, self._settings)
+        sample = ArmSample(model.n_joints, model.n_modes)
+        sample.rate = np.zeros(model.n_modes)
+        still = np.zeros(model.n_joints)
+        names, point = model.joint_names, (10**9, still, still, still, ())
+        for k in range(3):
+            sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+            other.step(sample)
+            if k == 0:
+                other.offer(validate(names, names, 0, [point]))
+        self.law.reset()
+
+    # What a user or a process does beside -------------------------------------------------------
+
+    def brake(self, reason):
+        """Bring the reference to rest smoothly, and hold it there; trajectories are given up.
+
+        The `reason` is what the log and the controller's state then give.
+
+        Returns
+        -------
+        bool
+            False where there is no torque to do it with: nothing has changed.
+        """
+        if not self.enabled:
+            return False
+        try:
+            self.reference.stop(self._last_ns, self.supervisor.deceleration)
+        except FlexarmError as error:
+            self.fail(f"{reason}; and no smooth stop: {error}")
+            return True
+        self.supervisor.stop(reason)
+        return True
+
+    def recover(self):
+        """Leave a fault: torque again with the next valid state, from where the arm is then; whether there was one."""
+        return self.supervisor.recover()
+
+    def enable_fast(self, enabled):
+        """Switch the fast control on or off, in a ramp of `FAST_RAMP`."""
+        self.fast_enabled = bool(enabled)
+
+    def fail(self, reason):
+        """Hard stop: no torque until `recover`; the trajectory is given up."""
+        self.supervisor.fail(reason)
+        self._off()
+
+    def distrust(self, reason):
+        """No torque, for the state can't be trusted: a fault where there was torque, else until a valid one comes."""
+        self.supervisor.doubt(reason)
+        self._off()
+
+    def disable(self, reason):
+        """No torque until a valid state comes, and no fault: the node ends, or waits for its observer."""
+        self.supervisor.wait(reason)
+        self._off()
+
+    def _off(self):
+        self.enabled = self.saturated = self._waiting = False
+        self.torque[:] = 0.0
+
+    # Samples -------------------------------------------------------------------------------------
+
+    def _judge(self, sample, now_ns):
+        """Class of the sample, which is the last one from now on; raises for one that can't be used."""
+        joints, modes = self.model.joint_names, self.model.mode_names
+        order = self._order
+        verdict = order.judge(sample)
+        if verdict == SampleOrder.STALE:
+            return verdict
+        if verdict == SampleOrder.FOREIGN:
+            raise MessageError(
+                f"two sources send states (sessions {order.session} and {sample.session}): stop one of them"
+            )
+        before_ns, missed = order.stamp_ns, sample.sequence - order.sequence - 1
+        if verdict != SampleOrder.REPEAT:
+            order.take(sample)  # a bad one, too: what comes next is judged beside it
+        if verdict == SampleOrder.JUMP:
+            raise MessageError(
+                f"the source's clock went back by {1e-9 * (before_ns - sample.stamp_ns):.3g} s at state"
+                f" {sample.sequence}"
+            )
+        if now_ns is not None and self._max_age is not None:
+            self._check_age(sample, now_ns)
+        if verdict == SampleOrder.NEW:
+            if missed > 0:
+                self.missed += missed
+            if sample.stamp_ns - before_ns > self._max_gap and self.enabled:
+                raise MessageError(
+                    f"the state's stamp jumped ahead by {1e-9 * (sample.stamp_ns - before_ns):.3g} s, max_gap is"
+                    f" {1e-9 * self._max_gap:g} s; {max(missed, 0)} states are missing"
+                )
+        check_finite(sample.position, joints, "joint_position")
+        if not sample.velocity_known:
+            raise MessageError("joint_velocity is empty: the observer is to fill it in")
+        check_finite(sample.velocity, joints, "joint_velocity")
+        if sample.amplitude is not None:
+            check_finite(sample.amplitude, modes, "modal_amplitude")
+        if sample.rate is not None:
+            check_finite(sample.rate, modes, "modal_rate")
+        return verdict
+
+    def _check_age(self, sample, now_ns):
+        age = now_ns - sample.stamp_ns
+        if abs(age) > self._max_age:
+            when = "old" if age > 0 else "from the future"
+            raise MessageError(
+                f"state {sample.sequence} is {1e-9 * abs(age):.3g} s {when}, max_age is {1e-9 * self._max_age:g} s:"
+                " synchronise the clocks, or set synchronised_clocks to false"
+            )
+
+    def _wait(self, sample, verdict):
+        """No torque without deflections; the joints are known, so that trajectories may be offered."""
+        waiting = self._waiting and verdict != SampleOrder.RESTART
+        what = "modal_amplitude" if sample.amplitude is None else "modal_rate"
+        reason = f"{what} is not known yet"
+        if verdict == SampleOrder.RESTART:
+            self.disable(reason)
+        else:
+            self.distrust(reason)
+        if self.state == State.FAULT:
+            return
+        self._waiting = True
+        if not waiting:
+            self.reference.start(sample.position, sample.stamp_ns)
+
+    def _begin(self, sample, verdict):
+        """First torque of a session, or after a time without: from the position that is found."""
+        keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
+        if keeps and (given_up := self._left_behind(sample)):
+            self._trajectory_reason = given_up
+            keeps = False
+        if not keeps:
+            self.reference.start(sample.position, sample.stamp_ns)
+        self._waiting = False
+        self.supervisor.begin()
+        self.torque[:] = 0.0
+        self._last_ns = sample.stamp_ns
+
+    def _left_behind(self, sample):
+        """Why what was offered while waiting can't be followed from here; empty if it can."""
+        if self.reference.overdue(sample.stamp_ns):
+            return "the trajectory was to start before the observer had converged: send it again"
+        moved = np.abs(sample.position - self.reference.position)
+        if moved.max() > self._start_tolerance:
+            name = self.model.joint_names[int(np.argmax(moved))]
+            return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
+        return ""
+
+    def _limited(self, u, dt):
+        """Torque within its size and rate, into `torque`."""
+        if self._rate_limited:
+            self._before[:] = self.torque
+            step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
+            np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
+            np.copyto(self.torque, u)
+            clip(self.torque, self._before - step, self._before + step)
+        else:
+            np.copyto(self.torque, u)
+        # Last: the size holds whatever came before.
+        clip(self.torque, self._least, self._limit)
+        self.saturated = bool((self.torque != u).any())

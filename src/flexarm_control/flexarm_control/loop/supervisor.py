@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Safety supervisor: which state the controller is in, and what it may not let happen.
+
+States and what leads from one to the next:
+
+- INACTIVE: no torque; until a valid state and a converged observer, then READY. Left and entered without help.
+- READY, TRACKING, HOLDING: torque; before, during and after a trajectory.
+- STOPPING: torque; the *reference* is brought to rest from where it is (not from the measurement), while the fast
+  control goes on damping; then HOLDING.
+- FAULT: no torque, so that each joint's safe action acts; stays until `Supervisor.recover`.
+
+A smooth stop follows when a limit is exceeded, `ratio` above 1:
+
+.. math:: |q_r - q|/e_{max},\; |\dot q|/\dot q_{max},\; |\delta|/\delta_{max},\; |\varepsilon|/\varepsilon_{max},\;
+          t_{saturated}/t_{max}
+
+and, for the joints' range with braking distance, :math:`q + \dot q|\dot q|/2D` with D the deceleration that the
+torque limit allows. A fault follows above `FAULT_RATIO`, or when a limit stays exceeded for `limit_patience`, and at
+once where the state can't be trusted.
+"""
+
+from enum import IntEnum
+from itertools import pairwise
+
+import numpy as np
+
+from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.singular_perturbation import slow_subsystem
+
+#: A limit that is exceeded by this factor is a fault at once.
+FAULT_RATIO = 1.5
+#: Deceleration of a joint whose torque has no limit [rad/s^2].
+FREE_DECELERATION = 10.0
+#: Part of the deceleration which the torque limit allows that a smooth stop takes.
+STOP_SHARE = 0.5
+
+PARAMETERS = (
+    Parameter(
+        "tracking_error_limit",
+        "float",
+        0.5,
+        "Largest distance of a joint from its reference; beyond it the arm is stopped. 0.0: none.",
+        unit="rad",
+        low=0.0,
+        high=100.0,
+    ),
+    Parameter(
+        "velocity_margin",
+        "float",
+        1.2,
+        "Largest measured joint velocity, as a multiple of the arm file's limits.velocity; 0.0: none.",
+        low=0.0,
+        high=100.0,
+    ),
+    Parameter(
+        "position_margin",
+        "float",
+        0.05,
+        "How far a joint may come out of the arm file's limits.position, braking distance included; 0.0: not watched.",
+        unit="rad",
+        low=0.0,
+        high=10.0,
+    ),
+    Parameter(
+        "deflection_limit",
+        "float_array",
+        [0.0],
+        "Largest modal amplitude, per mode; 0.0: none.",
+        unit="m, rad",
+        low=0.0,
+        high=1e3,
+        length="modes",
+    ),
+    Parameter(
+        "strain_limit",
+        "float",
+        0.0,
+        "Largest strain that the deflections put on a gauge; 0.0: the gauge's full_scale in the arm file.",
+        low=0.0,
+        high=1.0,
+    ),
+    Parameter(
+        "saturation_time",
+        "float",
+        2.0,
+        "Longest time that a torque may stay at its limit; then the arm is stopped. 0.0: any.",
+        unit="s",
+        low=0.0,
+        high=1e4,
+    ),
+    Parameter(
+        "limit_patience",
+        "float",
+        1.0,
+        "A limit that stays exceeded for so long, in spite of the stop, is a fault.",
+        unit="s",
+        low=0.0,
+        high=1e3,
+    ),
+    Parameter(
+        "max_gap",
+        "float",
+        0.5,
+        "Longest time between the stamps of two states; a fault beyond it.",
+        unit="s",
+        low=1e-3,
+        high=1e4,
+    ),
+    Parameter(
+        "synchronised_clocks",
+        "bool",
+        False,
+        "Whether stamps are of this machine's clock: then a state's age is judged, else its order alone.",
+        read_only=True,
+    ),
+    Parameter(
+        "max_age",
+        "float",
+        0.1,
+        "With synchronised_clocks: an older state, or one so far from the future, is a fault.",
+        unit="s",
+        low=1e-4,
+        high=1e3,
+    ),
+    Parameter(
+        "stop_deceleration",
+        "float_array",
+        [0.0],
+        "Deceleration of the reference in a smooth stop, per joint; 0.0: half of what the torque limit allows.",
+        unit="rad/s^2",
+        low=0.0,
+        high=1e5,
+        length="joints",
+    ),
+)
+
+
+class State(IntEnum):
+    """As in CompositeState."""
+
+    INACTIVE = 0
+    READY = 1
+    TRACKING = 2
+    HOLDING = 3
+    STOPPING = 4
+    FAULT = 5
+
+
+#: With torque.
+RUNNING = frozenset((State.READY, State.TRACKING, State.HOLDING, State.STOPPING))
+
+
+class Supervisor:
+    """State and limits of one controller.
+
+    Parameters
+    ----------
+    model : ArmModel
+        n joints, m modes.
+    settings : mapping
+        Checked values of `PARAMETERS`.
+    torque_limit : ndarray, shape (n,)
+        In force [N m]; infinite where there is none.
+
+    Attributes
+    ----------
+    state : State
+    reason : str
+        Why there is no torque, or why the arm was stopped; empty otherwise.
+    stops, faults : int
+        How many there have been.
+    deceleration : ndarray, shape (n,)
+        Of a smooth stop [rad/s^2].
+
+    Raises
+    ------
+    ParameterError
+        For a strain limit on an arm without gauges.
+    """
+
+    def __init__(self, model, settings, torque_limit):
+        self.model = model
+        self.state, self.reason = State.INACTIVE, ""
+        self.stops = self.faults = 0
+        self._names = [
+            *(f"tracking error of {j}" for j in model.joint_names),
+            *(f"velocity of {j}" for j in model.joint_names),
+            *(f"position of {j}" for j in model.joint_names),
+            *(f"deflection of {name}" for name in model.mode_names),
+            *(f"strain of {g.name}" for g in model.arm.gauges),
+            "time at the torque limit",
+        ]
+        self._units = (
+            ["rad"] * model.n_joints
+            + ["rad/s"] * model.n_joints
+            + ["rad"] * model.n_joints
+            + [""] * (model.n_modes + len(model.arm.gauges))
+            + ["s"]
+        )
+        n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
+        self._ratio = np.zeros(3 * n + m + g + 1)
+        self._value = np.zeros_like(self._ratio)
+        bounds = np.cumsum([0, n, n, n, m, g, 1])
+        self._parts = [slice(a, b) for a, b in pairwise(bounds)]
+        self._low, self._high = np.array([j.limits.position for j in model.arm.joints]).T
+        self._rows = gauge_rows(model, model.arm.gauges) if g else np.zeros((0, m))
+        self._torque_deceleration = None
+        self.forget()
+        self.configure(settings, torque_limit)
+
+    def configure(self, settings, torque_limit):
+        """Take new limits whole, or raise and keep the old ones."""
+        arm = self.model.arm
+
+        def or_none(values):
+            values = np.asarray(values, float)
+            return np.where(values > 0.0, values, np.inf)
+
+        strain = settings["strain_limit"]
+        if strain > 0.0 and not arm.gauges:
+            raise ParameterError(
+                f"strain_limit is {strain:g}, but {arm.name} has no gauges: limit deflection_limit, or write 0.0"
+            )
+        n = self.model.n_joints
+        able = _deceleration(self.model, torque_limit)
+        wanted = np.array(settings["stop_deceleration"])
+        finite = np.where(np.isfinite(able), STOP_SHARE * able, FREE_DECELERATION)
+        fastest = np.array([j.limits.velocity for j in arm.joints])
+        limit = np.concatenate(
+            [
+                np.full(n, or_none(settings["tracking_error_limit"])),
+                fastest * or_none(settings["velocity_margin"]),
+                np.full(n, or_none(settings["position_margin"])),
+                or_none(settings["deflection_limit"]),
+                or_none([strain or g.full_scale for g in arm.gauges]),
+                [or_none(settings["saturation_time"])],
+            ]
+        )
+        self.settings = dict(settings)
+        # Range, braking deceleration and margin of each joint, plain: numbers one by one are faster than short arrays.
+        self._ranges = tuple(
+            zip(
+                self._low.tolist(),
+                self._high.tolist(),
+                np.maximum(able, np.finfo(float).tiny).tolist(),
+                (0.99 * FAULT_RATIO * limit[self._parts[2]]).tolist(),
+                strict=True,
+            )
+        )
+        self._watches_places = limit[self._parts[2]][0] < np.inf
+        self._limit, self._inverse = limit, 1.0 / limit
+        self._watches_strain = bool(np.isfinite(limit[self._parts[4]]).any())
+        self.deceleration = np.where(wanted > 0.0, wanted, finite)
+
+    def forget(self):
+        """No limit has been exceeded so far."""
+        self._exceeded_for = self._saturated_for = 0.0
+
+    # Transitions -----------------------------------------------------------------------------
+
+    @property
+    def running(self):
+        """Whether there is torque."""
+        return self.state in RUNNING
+
+    def wait(self, reason):
+        """No torque, until the next valid state; a fault stays one."""
+        if self.state != State.FAULT:
+            self.state, self.reason = State.INACTIVE, reason
+        self.forget()
+
+    def fail(self, reason):
+        """Hard stop: no torque until `recover`. The first reason stays."""
+        if self.state != State.FAULT:
+            self.state, self.reason = State.FAULT, reason
+            self.faults += 1
+        self.forget()
+
+    def doubt(self, reason):
+        """The state can't be trusted: a fault where there was torque, else none yet."""
+        self.fail(reason) if self.running else self.wait(reason)
+
+    def recover(self):
+        """Leave a fault; whether there was one."""
+        if self.state != State.FAULT:
+            return False
+        self.state, self.reason = State.INACTIVE, ""
+        self.forget()
+        return True
+
+    def begin(self):
+        """The first torque: a valid state and a converged observer."""
+        self.state, self.reason = State.READY, ""
+        self.forget()
+
+    def stop(self, reason):
+        """A smooth stop begins; the caller brakes the reference."""
+        self.state, self.reason = State.STOPPING, reason
+        self.stops += 1
+
+    def follow(self, reference):
+        """The state that the reference is in."""
+        if reference.stopping:
+            self.state = State.STOPPING
+        elif reference.active:
+            if self.state != State.TRACKING:
+                self.reason = ""
+            self.state = State.TRACKING
+        elif self.state != State.READY or reference.finished:
+            self.state = State.HOLDING
+
+    # Limits ----------------------------------------------------------------------------------
+
+    def watch(self, q, qd, amplitude, error, saturated, dt):
+        """Judge one sample; the control path.
+
+        Parameters
+        ----------
+        q, qd : ndarray, shape (n,)
+            Joint positions and velocities [rad], [rad/s].
+        amplitude : ndarray, shape (m,)
+            [m, rad]
+        error : ndarray, shape (n,) or None
+            Reference minus position [rad]; None where no law holds the joints to it.
+        saturated : bool
+            Whether a torque was at its limit.
+        dt : float
+            Time since the last sample [s].
+
+        Returns
+        -------
+        verdict : State or None
+            STOPPING: bring the arm to rest; FAULT: no torque; None: go on.
+        reason : str
+        """
+        value, (errors, speeds, places, bends, strains, _) = self._value, self._parts
+        self._saturated_for = self._saturated_for + dt if saturated else 0.0
+        if error is None:
+            value[errors] = 0.0
+        else:
+            np.abs(error, out=value[errors])
+        np.abs(qd, out=value[speeds])
+        if self._watches_places:
+            value[places] = self._outside(q, qd)
+        np.abs(amplitude, out=value[bends])
+        if self._watches_strain:
+            np.abs(self._rows @ amplitude, out=value[strains])
+        value[-1] = self._saturated_for
+        np.multiply(value, self._inverse, out=self._ratio)
+        if self._ratio.max() <= 1.0:
+            self._exceeded_for = 0.0
+            return None, ""
+        self._exceeded_for += dt
+        worst = int(np.argmax(self._ratio))
+        text = self._text(worst)
+        if self._ratio[worst] > FAULT_RATIO:
+            return State.FAULT, f"{text}, by more than {FAULT_RATIO:g} times"
+        if self._exceeded_for > self.settings["limit_patience"]:
+            return State.FAULT, f"{text}, for {self._exceeded_for:.3g} s in spite of the stop"
+        return State.STOPPING, text
+
+    def _outside(self, q, qd):
+        """How far each joint is out of its range, or will be with all brakes on, [rad]."""
+        out = []
+        for position, speed, (low, high, able, most) in zip(
+            q.tolist(), qd.tolist(), self._ranges, strict=True
+        ):
+            reach = position + speed * abs(speed) / (2.0 * able)
+            # What only will be is reason to stop, not yet a fault.
+            will_be = min(max(low - reach, reach - high), most)
+            out.append(max(0.0, low - position, position - high, will_be))
+        return out
+
+    def _text(self, i):
+        """What limit was exceeded."""
+        name, unit = self._names[i], f" {self._units[i]}".rstrip()
+        value, limit = self._value[i], self._limit[i]
+        if name.startswith("position"):
+            return (
+                f"{name} is {value:.3g} rad out of its range, or will be, {limit:g} rad are allowed"
+            )
+        return f"{name} is {value:.6g}{unit}, beyond its limit of {limit:.6g}{unit}"
+
+
+def _deceleration(model, torque_limit):
+    """What the torque limits can brake a straight arm with, (n,) [rad/s^2]; infinite where there is no limit."""
+    n = model.n_joints
+    a, B = slow_subsystem(model.terms(np.zeros(n), np.zeros(n)))
+    most = np.diag(B) * torque_limit
+    # What gravity takes of it; a fifth is left in any case.
+    return np.maximum(most - np.abs(a), 0.2 * most)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shakes an arm sample by sample: waits for rest, applies an `ExcitationTorque`, stops at a limit. No ROS."""
+
+from enum import Enum
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.parameters import Parameter
+
+from ..loop.samples import SampleOrder
+from . import excitation_torque
+from .excitation_torque import ExcitationTorque
+
+LIMITS = (
+    Parameter(
+        "travel",
+        "float",
+        1.0,
+        "The excitation stops when a joint is further from where it started; the arm file's limits hold too.",
+        unit="rad",
+        low=0.001,
+        high=100.0,
+    ),
+    Parameter(
+        "strain_limit",
+        "float",
+        0.0,
+        "The excitation stops when a gauge reads more, its bias aside; 0: four fifths of its full scale.",
+        low=0.0,
+        high=0.1,
+    ),
+    Parameter(
+        "hold_frequency",
+        "float",
+        0.2,
+        "Frequency of the soft, damped spring that keeps the joints about where they started; 0: none. Keep it well"
+        " below the first bending frequency.",
+        unit="Hz",
+        low=0.0,
+        high=10.0,
+    ),
+    Parameter(
+        "settle",
+        "float",
+        0.2,
+        "The arm must have been at rest for so long before it is shaken.",
+        unit="s",
+        low=0.0,
+        high=60.0,
+    ),
+)
+PARAMETERS = (*excitation_torque.PARAMETERS, *LIMITS)
+#: At rest a joint stays within this [rad], and two encoder counts.
+REST = 0.005
+#: Share of full scale that a gauge may read where no limit is given [-].
+SHARE = 0.8
+#: The difference of joint angles is filtered with this share of the spring's 1/omega [-].
+FILTER = 0.1
+#: Damping ratio of the spring.
+DAMPING = 0.7
+
+
+class Stage(Enum):
+    """How far an excitation has come."""
+
+    SETTLING = "waiting for rest"
+    SHAKING = "shaking"
+    DONE = "complete"
+    STOPPED = "stopped"
+
+
+class ExcitationRun:
+    """One excitation; `step` for each sample.
+
+    Parameters
+    ----------
+    model : ArmModel
+    settings : mapping
+        Values of `PARAMETERS`.
+
+    Attributes
+    ----------
+    stage : Stage
+    reason : str
+        Why it was stopped; empty otherwise.
+    torque : ndarray, shape (n,)
+        Of the last sample [N m]; zero when not enabled.
+    """
+
+    def __init__(self, model, settings):
+        self.model, arm = model, model.arm
+        self.settings = dict(settings)
+        names = {p.name for p in excitation_torque.PARAMETERS}
+        self._shape = {k: v for k, v in self.settings.items() if k in names}
+        # What can't be done is said before the arm moves.
+        ExcitationTorque(model, self._shape)
+        self.stage, self.reason = Stage.SETTLING, ""
+        self.torque = np.zeros(model.n_joints)
+        self._order, self._enabled = SampleOrder(), False
+        self._limits = np.array([j.limits.position for j in arm.joints]).T
+        self._most = np.array([j.limits.torque for j in arm.joints])
+        self._bias = np.array([g.bias for g in arm.gauges])
+        limit = self.settings["strain_limit"]
+        self._strain = np.array([limit or SHARE * g.full_scale for g in arm.gauges])
+        counts = np.array([j.encoder_counts or np.inf for j in arm.joints])
+        self._rest = REST + 4.0 * np.pi / counts
+        self._first = self._begin = self._before = None
+        self._speed = np.zeros(model.n_joints)
+
+    @property
+    def duration(self):
+        """Of the shaking [s]; as planned at the straight arm before it begins."""
+        if self._begin is None:
+            return ExcitationTorque(self.model, self._shape).duration
+        return self._push.duration
+
+    def step(self, sample):
+        """Take a sample; whether its answer is `torque`, enabled.
+
+        Parameters
+        ----------
+        sample : ArmSample
+        """
+        judged = self._order.judge(sample)
+        if judged == SampleOrder.REPEAT:
+            return self._enabled
+        if judged == SampleOrder.STALE:
+            return False
+        if judged == SampleOrder.RESTART and self._order.session is not None:
+            self.stop("the source of arm_state was restarted")
+        elif judged == SampleOrder.JUMP:
+            self.stop("the clock of arm_state went back")
+        elif judged == SampleOrder.FOREIGN:
+            self.stop("two sources send arm_state: stop one of them")
+        self._order.take(sample)
+        if self.stage is Stage.SETTLING:
+            self._settle(sample)
+        self._enabled = self.stage is Stage.SHAKING and self._shake(sample)
+        if not self._enabled:
+            self.torque[:] = 0.0
+        return self._enabled
+
+    def stop(self, reason):
+        """End it; nothing after it has ended."""
+        if self.stage in (Stage.SETTLING, Stage.SHAKING):
+            self.stage, self.reason = Stage.STOPPED, reason
+            self._enabled = False
+
+    def _settle(self, sample):
+        """Until the arm has been at rest for long enough; then the torque is planned about where it is."""
+        if self._first is None:
+            self._first = (sample.stamp_ns, sample.position.copy())
+        moved = np.abs(sample.position - self._first[1])
+        if self._beyond(sample, self._first[1]):
+            return
+        if (moved > self._rest).any():
+            j = int(np.argmax(moved - self._rest))
+            self.stop(
+                f"{self.model.joint_names[j]} moved by {moved[j]:.3g} rad before the excitation: bring the arm to"
+                " rest first"
+            )
+        elif sample.stamp_ns - self._first[0] >= 1e9 * self.settings["settle"]:
+            try:
+                self._push = ExcitationTorque(self.model, self._shape, sample.position)
+            except FlexarmError as error:
+                self.stop(str(error))
+                return
+            self._begin, self._start = sample.stamp_ns, sample.position.copy()
+            self._before = (sample.stamp_ns, sample.position.copy())
+            self.stage = Stage.SHAKING
+
+    def _shake(self, sample):
+        """The torque of this sample, unless the end or a limit has come."""
+        time = 1e-9 * (sample.stamp_ns - self._begin)
+        if time >= self._push.duration:
+            self.stage = Stage.DONE
+            return False
+        if self._beyond(sample, self._start):
+            return False
+        self.torque[:] = self._push.torque(time)
+        self._hold(sample)
+        np.clip(self.torque, -self._most, self._most, out=self.torque)
+        return True
+
+    def _hold(self, sample):
+        """Add the soft spring's torque."""
+        omega = 2.0 * np.pi * self.settings["hold_frequency"]
+        if omega == 0.0:
+            return
+        step = 1e-9 * (sample.stamp_ns - self._before[0])
+        if sample.velocity_known:
+            self._speed[:] = sample.velocity
+        elif step > 0.0:
+            share = step / (step + FILTER / omega)
+            self._speed += share * ((sample.position - self._before[1]) / step - self._speed)
+        self._before = (sample.stamp_ns, sample.position.copy())
+        pull = omega**2 * (sample.position - self._start) + 2.0 * DAMPING * omega * self._speed
+        self.torque -= self._push.inertia * pull
+
+    def _beyond(self, sample, start):
+        """Stop at a limit; whether it did."""
+        names, q = self.model.joint_names, sample.position
+        if not np.isfinite(q).all():
+            self.stop(f"the position of {names[int(np.argmin(np.isfinite(q)))]} is not finite")
+            return True
+        low, high = self._limits
+        outside = np.maximum(
+            np.maximum(low - q, q - high), np.abs(q - start) - self.settings["travel"]
+        )
+        if (outside > 0.0).any():
+            j = int(np.argmax(outside))
+            self.stop(
+                f"{names[j]} came to {q[j]:.4g} rad, from {start[j]:.4g} rad: beyond travel"
+                f" {self.settings['travel']:g} rad or the limits {low[j]:g} to {high[j]:g} rad; take less amplitude"
+            )
+            return True
+        if sample.strain is None:
+            return False
+        strained = np.abs(sample.strain - self._bias)
+        over = strained > self._strain
+        if over.any():
+            g = int(np.argmax(over))
+            self.stop(
+                f"strain of {self.model.arm.gauge_names[g]} came to {strained[g]:.3g}, beyond its limit"
+                f" {self._strain[g]:.3g}; take a smaller amplitude"
+            )
+        return bool(over.any())

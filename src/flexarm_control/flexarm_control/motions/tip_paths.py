@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Paths of the tip in space, a straight line or a circular arc, as motions of the joints.
+
+The path :math:`x(s)`, s from 0 to 1, is turned into joint angles Q(s) by the inverse kinematics of the arm at rest
+(`flexarm_dynamics.models.inverse_kinematics`): bent by its weight, so that the *bent* arm's tip is on the path. Each
+solution begins at the one before, so that Q has no jumps; Q is the spline of degree five through them, with as
+many points as it takes for its tip to be within `TOLERANCE` of the path everywhere. With a time law
+:math:`\sigma(t)`,
+
+.. math:: q = Q(\sigma),\quad \dot q = Q'\dot\sigma,\quad
+    \ddot q = Q''\dot\sigma^2 + Q'\ddot\sigma.
+
+What the motion itself bends is not compensated: it is the slower the less.
+"""
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.models.inverse_kinematics import TOLERANCE as ARRIVED
+from flexarm_dynamics.models.inverse_kinematics import TipKinematics, checked, nearest, show
+
+#: How far the resting tip may be from the path [m].
+TOLERANCE = 1e-7
+_FEWEST, _MOST = 32, 512
+
+
+class TipPath:
+    """A motion that leads the tip along a path; it has the methods of a `Profile`.
+
+    Attributes
+    ----------
+    start, angle : (n,) array
+        Joint angles at the start, and how far each joint goes [rad].
+    duration : float
+        [s]
+    """
+
+    def __init__(self, curve, joints, law):
+        self._curve, self._joints, self._law = curve, joints, law
+        self._slope, self._curvature = joints.derivative(), joints.derivative(2)
+        self.duration = law.duration
+        self.start = joints(0.0)
+        self.angle = joints(1.0) - self.start
+
+    def with_law(self, law):
+        """Return the same path with another time law: a motion of one joint from 0 to 1."""
+        return TipPath(self._curve, self._joints, law)
+
+    def tip(self, t) -> np.ndarray:
+        """Return where on the path the tip is meant to be at t [s], scalar or (k,): (3,) or (k, 3) [m]."""
+        return self._curve(self._law.position(t))
+
+    def position(self, t) -> np.ndarray:
+        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
+        return self._joints(self._law.position(t)[..., 0])
+
+    def velocity(self, t) -> np.ndarray:
+        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
+        return self._slope(self._law.position(t)[..., 0]) * self._law.velocity(t)
+
+    def acceleration(self, t) -> np.ndarray:
+        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
+        s, rate = self._law.position(t)[..., 0], self._law.velocity(t)
+        return self._curvature(s) * rate**2 + self._slope(s) * self._law.acceleration(t)
+
+
+def line(model, start, end, law, bent=True) -> TipPath:
+    """Lead the tip along a straight line.
+
+    Parameters
+    ----------
+    model : ArmModel
+    start : (n,) array_like
+        Joint angles at the start; the line begins at the tip there [rad].
+    end : (3,) array_like
+        Where it ends, in the base frame [m].
+    law : Profile
+        Of one joint, from 0 to 1: how much of the path is done.
+    bent : bool
+        Whether the weight's deflections are compensated.
+
+    Returns
+    -------
+    TipPath
+
+    Raises
+    ------
+    TrajectoryError
+        If the path can't be followed to its end; names how far along, and how near the tip comes.
+    """
+    end, start = checked(model, end, start)
+    kinematics = TipKinematics(model, bent)
+    begin = kinematics.tip(start)
+    way = end - begin
+    if np.linalg.norm(way) < 1e-9:
+        raise TrajectoryError(f"the tip is already at {show(end)} m: give another point")
+    return _follow(kinematics, start, lambda s: begin + np.multiply.outer(_scalar(s), way), law)
+
+
+def arc(model, start, via, end, law, bent=True) -> TipPath:
+    """Lead the tip along the circle from where it is, through `via`, to `end`.
+
+    Parameters
+    ----------
+    via, end : (3,) array_like
+        Two more points of the circle, in the base frame [m].
+    model, start, law, bent
+        As for `line`.
+
+    Raises
+    ------
+    TrajectoryError
+        If the points are on a line, and as for `line`.
+    """
+    via, _ = checked(model, via, start)
+    end, start = checked(model, end, start)
+    kinematics = TipKinematics(model, bent)
+    curve = circle(kinematics.tip(start), via, end)
+    return _follow(kinematics, start, curve, law)
+
+
+def circle(begin, via, end):
+    """Return the circle through three points as a function of s: `begin` at 0, `end` at 1.
+
+    The centre c is where ``|c - begin| = |c - via| = |c - end|`` in the plane of the three.
+    """
+    a, b = via - begin, end - begin
+    normal = np.cross(a, b)
+    square = normal @ normal
+    if square < 1e-12 * (a @ a) * (b @ b) or not square:
+        raise TrajectoryError(
+            f"arc: {show(begin)}, {show(via)} and {show(end)} m are on a line: they make no circle"
+        )
+    to_centre = np.cross((a @ a) * b - (b @ b) * a, normal) / (2.0 * square)
+    centre, first = begin + to_centre, -to_centre
+    second = np.cross(normal / np.sqrt(square), first)
+
+    def angle(point):
+        return np.arctan2((point - centre) @ second, (point - centre) @ first) % (2.0 * np.pi)
+
+    # The normal turns begin into via into end, so that both angles are ahead and via's is less.
+    total = angle(end)
+
+    def curve(s):
+        turn = total * _scalar(s)
+        return (
+            centre
+            + np.multiply.outer(np.cos(turn), first)
+            + np.multiply.outer(np.sin(turn), second)
+        )
+
+    return curve
+
+
+def _scalar(s):
+    """The path's parameter as laws of one joint give it, (k, 1), or plain, (k,)."""
+    s = np.asarray(s, float)
+    return s[..., 0] if s.ndim and s.shape[-1] == 1 else s
+
+
+def _follow(kinematics, start, curve, law):
+    """Return the `TipPath` along a curve that begins at the tip at `start`."""
+    low, high = kinematics.low, kinematics.high
+    outside = np.flatnonzero((start < low) | (start > high))
+    if outside.size:
+        i = int(outside[0])
+        raise TrajectoryError(
+            f"joint {kinematics.model.joint_names[i]} starts at {start[i]:.6g} rad, beyond its limits"
+            f" {low[i]:g} to {high[i]:g} rad: start within"
+        )
+    count = _FEWEST
+    while True:
+        knots = np.linspace(0.0, 1.0, count + 1)
+        # The path is stepped through anew: points in between would end on another way through
+        # the joints of an arm with more of them than it needs.
+        angles = _solve_along(kinematics, knots, curve, start)
+        joints = make_interp_spline(knots, angles, k=5)
+        between = 0.5 * (knots[1:] + knots[:-1])
+        off = [np.linalg.norm(kinematics.tip(joints(s)) - curve(s)) for s in between]
+        if max(off) <= TOLERANCE:
+            return TipPath(curve, joints, law)
+        if count >= _MOST:
+            worst = int(np.argmax(off))
+            raise TrajectoryError(
+                f"the joints can't follow the tip's path smoothly at {100 * between[worst]:.0f} % of it, near q ="
+                f" {show(joints(between[worst]))} rad ({max(off):.2g} m off): the arm is nearly singular there, or"
+                " a joint meets its limit; take another path or start"
+            )
+        count *= 2
+
+
+def _solve_along(kinematics, knots, curve, start):
+    angles = np.empty((knots.size, start.size))
+    angles[0] = start
+    for k in range(1, knots.size):
+        found = kinematics.search(curve(knots[k]), angles[k - 1])
+        if found.distance > 10.0 * ARRIVED:
+            raise TrajectoryError(
+                f"{kinematics.model.arm.name}: the tip can't follow its path beyond {100 * knots[k - 1]:.0f} %:"
+                f" {show(curve(knots[k]))} m is out of reach from there; {nearest(found)}"
+            )
+        angles[k] = found.q
+    return angles

@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observer of an arm: strains to amplitudes, order of samples, and the chosen observer."""
+
+import numpy as np
+
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm.strain_map import StrainMap
+from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.parameters import Parameter, check_all
+
+from ..composite.law import sizes
+from ..loop.samples import ArmSample, SampleOrder
+from . import gauge_health
+from .motion import Motion
+
+OBSERVERS = "flexarm.observers"
+
+#: Parameters of the observer that belong to no single law.
+PARAMETERS = (
+    Parameter(
+        "joint_velocity_bandwidth",
+        "float",
+        500.0,
+        "Corner of the filtered derivative of the joint positions, for a source without joint velocities.",
+        unit="rad/s",
+        low=1.0,
+        high=1e6,
+    ),
+    Parameter(
+        "delay",
+        "float",
+        0.0,
+        "From a sample's stamp to when the torque that answers it acts: the estimate is predicted ahead by it.",
+        unit="s",
+        low=0.0,
+        high=0.1,
+    ),
+    Parameter(
+        "smooth_position",
+        "bool",
+        True,
+        "Pass on the observer's joint positions, where it estimates them, in place of the encoders'.",
+    ),
+    *gauge_health.PARAMETERS,
+)
+
+
+def design_observer(name, model, values):
+    """Find an observer by name, check its parameters and design it.
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError
+    """
+    law = registry.find(OBSERVERS, name)
+    return law(model, check_all(law.PARAMETERS, values, sizes(model), "observer."))
+
+
+def observe(model, name, values):
+    """An `ArmObserver` from an observer's name and its parameters, those of `PARAMETERS` among them.
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError, ModelError
+    """
+    common = {p.name for p in PARAMETERS}
+    options = {k: v for k, v in values.items() if k in common}
+    law = design_observer(name, model, {k: v for k, v in values.items() if k not in common})
+    return ArmObserver(model, law, **check_all(PARAMETERS, options, prefix="observer."))
+
+
+class ArmObserver:
+    r"""Turns a sample of the arm into one with modal amplitudes and rates filled in.
+
+    Where the source gives no joint velocity it is the observer's, if that estimates one, else the filtered
+    derivative of the positions.
+
+    With a `delay`, what is passed on is the state at the stamp plus the delay: the model's motion (`motion`) under
+    the torque that the sample reports, held. Torques that were sent since are not known here.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm as the arm file has it.
+    observer : Observer
+    joint_velocity_bandwidth : float
+        [rad/s]
+    delay : float
+        [s]
+    smooth_position : bool
+        Whether `position` is the observer's where it has one.
+    calibration_samples, stuck_samples : int
+        See `gauge_health.PARAMETERS`.
+
+    Attributes
+    ----------
+    observer : Observer
+        May be replaced whole between two samples.
+    gauges : GaugeHealth or None
+        What is known of each gauge; None for an arm without.
+    calibration : BiasCalibration or None
+        The last samples, for `calibrate`.
+    calibrated : bool
+        Whether strains are mapped with a bias found here; the source's amplitudes, made with the arm file's bias,
+        are no longer used then.
+    position, velocity : ndarray, shape (n,)
+        Of the joints, measured or estimated, predicted ahead by the delay [rad], [rad/s].
+    amplitude, rate : ndarray, shape (m,)
+        The observer's, predicted ahead by the delay.
+    """
+
+    def __init__(
+        self,
+        model,
+        observer,
+        joint_velocity_bandwidth=500.0,
+        delay=0.0,
+        smooth_position=True,
+        calibration_samples=200,
+        stuck_samples=50,
+    ):
+        self.model, self.observer = model, observer
+        self.strain_map = self.gauges = self.calibration = None
+        if model.arm.gauges:
+            self.strain_map = StrainMap(model)
+            self.gauges = gauge_health.GaugeHealth(model, self.strain_map, stuck_samples)
+            self.calibration = gauge_health.BiasCalibration(
+                model, self.strain_map, calibration_samples
+            )
+        self.calibrated = False
+        observed = model.arm.observed_modes
+        if tuple(observed) != tuple(model.mode_names):
+            missing = [n for n in model.mode_names if n not in observed]
+            raise ModelError(
+                f"{model.arm.name}: {', '.join(missing)} in links[].flexible but not in observed_modes: the"
+                " controller's arm has just the modes that it observes; lower `modes`"
+            )
+        self.bandwidth, self.delay = joint_velocity_bandwidth, delay
+        self.smooth_position = smooth_position
+        n, m = model.n_joints, model.n_modes
+        self.position, self.velocity = np.zeros(n), np.zeros(n)
+        self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        self._measured, self._derivative = np.zeros(n), np.zeros(n)
+        self._mapped, self._used = np.zeros(m), np.zeros(m)
+        self._nothing = np.zeros(0)
+        self._motion = Motion(model)
+        self._order = SampleOrder()
+        self.reason = ""
+
+    def step(self, sample):
+        """Take one sample; the control path.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            Its `amplitude` is filled in from the strains when it is None; for an arm without modes there is none.
+
+        Returns
+        -------
+        bool or None
+            Whether `velocity`, `amplitude` and `rate` are a converged estimate. A repeated (session, sequence)
+            leaves everything as it was; so does one that comes after a later one, which is None.
+
+        Raises
+        ------
+        MessageError
+            When the sample can't be used; the estimate stays as it was.
+        """
+        last_stamp = self._order.stamp_ns
+        if sample.amplitude is None and not self.model.n_modes:
+            sample.amplitude = self._nothing  # on a topic no amplitudes and unknown ones look alike
+        self._check(sample)
+        verdict = self._order.judge(sample)
+        if verdict == SampleOrder.REPEAT:
+            return self.observer.converged
+        if verdict == SampleOrder.STALE:
+            return None
+        if verdict == SampleOrder.FOREIGN:
+            raise MessageError(
+                f"two sources send states (sessions {self._order.session} and {sample.session}): stop one of them"
+            )
+        # After a clock that jumped, or a long silence, there is nothing to go on from.
+        gap = sample.stamp_ns - last_stamp > LONGEST_GAP
+        restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
+        self._map_strain(sample, restart)
+        if restart:
+            self.observer.reset()
+        dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
+        if self.delay and not restart and not np.isfinite(sample.torque).all():
+            raise MessageError(
+                "joint_torque is unknown (NaN), and observer.delay predicts with it: have the driver report the"
+                " applied torque, or set observer.delay to 0.0"
+            )
+        if not sample.velocity_known:
+            sample.velocity[:] = self._joint_velocity(sample, dt)
+        self._update(sample, dt)
+        self._pass_on(sample)
+        # Only now: a sample that the observer refused has left nothing behind, its time step included.
+        self._order.take(sample)
+        self._derivative[:], self._measured[:] = sample.velocity, sample.position
+        self._used[:] = sample.amplitude
+        if sample.strain is not None and self.calibration is not None:
+            self.calibration.push(sample)
+        return self.observer.converged
+
+    def rehearse(self):
+        """Take three samples of an arm at rest, so that compiled code is loaded before it counts; for a fresh one."""
+        arm = self.model.arm
+        sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
+        sample.velocity_known, sample.rate = False, np.zeros(self.model.n_modes)
+        sample.torque[:] = 0.0
+        for k in range(3):
+            sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+            self.step(sample)
+
+    def _map_strain(self, sample, restart):
+        """Judge the gauges, and fill in the amplitudes where they are this observer's to make."""
+        if sample.strain is None or self.gauges is None:
+            return
+        if restart:
+            self.gauges.reset()
+            self.calibration.reset()
+        self.gauges.update(sample.strain)
+        if sample.amplitude is None or self.calibrated:
+            sample.amplitude = self.gauges.amplitudes(sample.strain, out=self._mapped)
+            if self.gauges.lost != self.observer.gauges_lost:
+                self.observer.leave_out(self.gauges.lost)
+
+    def calibrate(self):
+        """Take the gauges' bias from the last samples, on an arm at rest; not on the control path.
+
+        The estimate moves with it, so that its rates don't jump.
+
+        Returns
+        -------
+        old, new : ndarray, shape (gauges,)
+            The bias before and now [strain].
+
+        Raises
+        ------
+        MessageError, ModelError
+            When there is nothing to calibrate or the arm is not at rest; nothing has changed then.
+        """
+        if self.calibration is None:
+            raise MessageError(f"the arm file of {self.model.arm.name} has no gauges")
+        old, new = self.strain_map.bias, self.calibration.bias()
+        self.strain_map.bias = new
+        self.calibrated = True
+        now = self.strain_map.amplitudes(self.calibration.last)
+        self.observer.rest_at(now)
+        self._used[:] = now
+        return old, new
+
+    def _pass_on(self, sample):
+        """Fill in what is passed on: the observer's estimate, or the sample's own, ahead by the delay; or refuse."""
+        observer = self.observer
+        smooth = self.smooth_position and observer.joint_position is not None
+        estimated = not sample.velocity_known and observer.joint_velocity is not None
+        x = np.concatenate(
+            [
+                observer.joint_position if smooth else sample.position,
+                observer.amplitude,
+                observer.joint_velocity if estimated else sample.velocity,
+                observer.rate,
+            ]
+        )
+        if self.delay and observer.converged:
+            x = self._predicted(x, sample.torque)
+        if not np.isfinite(x).all():
+            # From what is no number it would never come back.
+            observer.reset()
+            raise MessageError(
+                f"observer {type(observer).__name__} has lost the arm: its estimate is not finite; it begins anew"
+            )
+        start = 0
+        for group in (self.position, self.amplitude, self.velocity, self.rate):
+            group[:] = x[start : start + group.size]
+            start += group.size
+
+    def _predicted(self, x, torque):
+        """A state ahead by the delay."""
+        count = int(np.ceil(self.delay / LONGEST_PREDICTION))
+        part = self.delay / count
+        for _ in range(count):
+            x = self._motion.advance(x, torque, part, self._motion.step_for(part, x[: torque.size]))
+        return x
+
+    def _update(self, sample, dt):
+        try:
+            self.observer.update(sample, dt)
+        except MessageError:
+            raise
+        except Exception as error:  # anybody's observer: it costs this sample, not the node
+            name = type(self.observer).__name__
+            raise MessageError(
+                f"observer {name} failed: {type(error).__name__}: {error}"
+            ) from error
+
+    def _check(self, sample):
+        arm = self.model.arm
+        check_finite(sample.position, self.model.joint_names, "joint_position")
+        if sample.velocity_known:
+            check_finite(sample.velocity, self.model.joint_names, "joint_velocity")
+        if sample.amplitude is not None:
+            check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
+        elif sample.strain is None:
+            raise MessageError("neither strain nor modal_amplitude is given: one of them is needed")
+        else:
+            if self.strain_map is None:
+                raise MessageError(
+                    f"strain is given, but the arm file of {arm.name} has no gauges to map it"
+                )
+        if sample.rate is not None:
+            check_finite(sample.rate, self.model.mode_names, "modal_rate")
+        wild = np.abs(sample.torque) >= HUGE_TORQUE  # false for NaN, which means unknown
+        if wild.any():
+            i = int(np.argmax(wild))
+            raise MessageError(
+                f"joint_torque of {self.model.joint_names[i]} is {sample.torque[i]}: no torque of an arm"
+            )
+
+    def _joint_velocity(self, sample, dt):
+        """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""
+        if dt == 0.0:
+            return np.zeros_like(self._derivative)
+        slope = (sample.position - self._measured) / dt
+        return slope + (self._derivative - slope) * np.exp(-self.bandwidth * dt)
+
+
+#: After a longer silence an observer starts afresh [ns].
+LONGEST_GAP = 500_000_000
+#: A longer delay is predicted in parts, each with the forces at its start [s].
+LONGEST_PREDICTION = 0.01
+#: Values beyond this are no measurement of an arm (rad, m, and their rates).
+HUGE = 1e6
+#: Torques beyond this are none [N m].
+HUGE_TORQUE = 1e9
+
+
+def check_finite(values, names, field):
+    """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
+    # So is every usable sample; one product costs a third of what follows.
+    if values.dot(values) < HUGE:
+        return
+    if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
+        i = int(np.argmin(np.abs(values) < HUGE))
+        raise MessageError(f"{field} of {names[i]} is {values[i]}: not a usable measurement")

@@ -1,0 +1,610 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arm files: YAML, validated; every error starts with the field's path, as ``links[0].length``.
+
+Nothing is half read: a file gives an `Arm` or an `ArmFileError`.
+"""
+
+import difflib
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from ..errors import ArmFileError
+from ..shown import number, show
+from .description import (
+    DIRECTIONS,
+    MOST_MODES,
+    SAFE_ACTIONS,
+    SHAPES,
+    Arm,
+    Flexibility,
+    Friction,
+    Gauge,
+    Joint,
+    Limits,
+    Link,
+    Payload,
+)
+from .units import SI_UNIT, to_si
+
+#: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
+LARGEST = 1e30
+#: No bridge converts to more.
+MOST_BITS = 32
+#: No arm strains by more [-].
+MOST_STRAIN = 0.1
+
+
+def _read_yaml(text, where):
+    """The file as dicts, lists and scalars; refuses a key that is given twice."""
+    try:
+        loader = yaml.SafeLoader(text)
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _check_keys(root, "", set())
+        return loader.construct_document(root)
+    except ArmFileError:
+        raise
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        reason = getattr(error, "problem", None) or error
+        raise ArmFileError(where + line, f"not YAML: {reason}") from None
+    except Exception as error:
+        # What PyYAML lets through on a scalar that is not what its tag says, or on endless nesting.
+        raise ArmFileError(where, f"not YAML: {type(error).__name__}: {error}") from None
+
+
+def _check_keys(node, path, visited):
+    if id(node) in visited:  # an alias
+        return
+    visited.add(id(node))
+    if isinstance(node, yaml.SequenceNode):
+        for i, child in enumerate(node.value):
+            _check_keys(child, f"{path}[{i}]", visited)
+    elif isinstance(node, yaml.MappingNode):
+        seen = set()
+        for key, child in node.value:
+            line = f"line {key.start_mark.line + 1}"
+            if key.tag != "tag:yaml.org,2002:str" or not key.value:
+                what = repr(key.value) if isinstance(key, yaml.ScalarNode) else "a collection"
+                raise ArmFileError(path or line, f"the key {what} ({line}) is not a name")
+            at = f"{path}.{key.value}" if path else key.value
+            if key.value in seen:
+                raise ArmFileError(at, f"given twice ({line})")
+            seen.add(key.value)
+            _check_keys(child, at, visited)
+
+
+class _Section:
+    """A mapping of the file, which knows its path and which of its keys were read."""
+
+    def __init__(self, data, path, system):
+        if not isinstance(data, dict):
+            raise ArmFileError(path or "file", f"a mapping is wanted, not {_kind(data)}")
+        self.data, self.path, self.system = data, path, system
+        self.read = set()
+
+    def at(self, key):
+        name = number(key) if isinstance(key, str) else show(key)
+        return f"{self.path}.{name}" if self.path else name
+
+    def has(self, key):
+        self.read.add(key)
+        return self.data.get(key) is not None
+
+    def raw(self, key, default=None, required=False):
+        if not self.has(key):
+            if required:
+                raise ArmFileError(self.at(key), "missing" + self._near(key))
+            return default
+        return self.data[key]
+
+    def _near(self, key):
+        """A hint when a key not yet read looks like the missing one."""
+        close = difflib.get_close_matches(key, [k for k in self.data if k not in self.read], 1)
+        return f" (is {close[0]!r} meant to be it?)" if close else ""
+
+    def number(self, key, dimension="none", default=None, low=None, positive=False):
+        """A finite number in SI; `default` None makes it required."""
+        value = self.raw(key, default, required=default is None)
+        if not self.has(key):
+            return value
+        value = _number(value, self.at(key))
+        if positive and not value > 0.0:
+            raise ArmFileError(
+                self.at(key), f"{value} must be greater than 0 [{SI_UNIT[dimension]}]"
+            )
+        if low is not None and value < low:
+            raise ArmFileError(self.at(key), f"{value} must not be below {low}")
+        if positive and value < 1.0 / LARGEST:
+            raise ArmFileError(self.at(key), f"{value} is too small")
+        return value * to_si(self.system, dimension)
+
+    def vector(self, key, length, dimension="none", default=None):
+        """A tuple of `length` finite numbers in SI."""
+        value = self.raw(key, default, required=default is None)
+        if not self.has(key):
+            return value
+        if not isinstance(value, list) or len(value) != length:
+            what = f"{len(value)} values" if isinstance(value, list) else _kind(value)
+            raise ArmFileError(self.at(key), f"a list of {length} numbers is wanted, not {what}")
+        factor = to_si(self.system, dimension)
+        return tuple(_number(v, f"{self.at(key)}[{i}]") * factor for i, v in enumerate(value))
+
+    def integer(self, key, default=None, low=None, high=None):
+        value = self.raw(key, default, required=default is None)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ArmFileError(self.at(key), f"{_kind(value)} is not an integer")
+        if (low is not None and value < low) or (high is not None and value > high):
+            raise ArmFileError(self.at(key), f"{_kind(value)} must be from {low} to {high}")
+        return value
+
+    def text(self, key, default=None, choices=None):
+        value = self.raw(key, default, required=default is None)
+        if not isinstance(value, str):
+            raise ArmFileError(self.at(key), f"{_kind(value)} is not text")
+        if choices and value not in choices:
+            close = difflib.get_close_matches(value, choices, 1)
+            hint = f"; {close[0]!r}?" if close else ""
+            raise ArmFileError(
+                self.at(key), f"{show(value)} is not one of {', '.join(choices)}{hint}"
+            )
+        return value
+
+    def flag(self, key):
+        value = self.raw(key, False)
+        if not isinstance(value, bool):
+            raise ArmFileError(self.at(key), f"{_kind(value)} is neither true nor false")
+        return value
+
+    def name(self):
+        value = self.text("name")
+        if not value.strip():
+            raise ArmFileError(self.at("name"), "empty")
+        return value
+
+    def section(self, key):
+        return _Section(self.raw(key, required=True), self.at(key), self.system)
+
+    def sections(self, key, required=False):
+        value = self.raw(key, [], required)
+        if not isinstance(value, list):
+            raise ArmFileError(self.at(key), f"a list is wanted, not {_kind(value)}")
+        return [_Section(v, f"{self.at(key)}[{i}]", self.system) for i, v in enumerate(value)]
+
+    def done(self):
+        """Refuse what nobody read: a misspelt field is an error, not a default."""
+        for key in self.data:
+            if key not in self.read:
+                close = difflib.get_close_matches(str(key), sorted(self.read), 1)
+                hint = f"; did you mean {close[0]!r}?" if close else ""
+                known = ", ".join(sorted(self.read))
+                raise ArmFileError(self.at(key), f"no such field{hint} (known here: {known})")
+
+
+def _kind(value):
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, int) and value.bit_length() > 64:
+        return "an integer of more than 64 bits"
+    return "a list" if isinstance(value, list) else show(value)
+
+
+def _number(value, path):
+    if isinstance(value, str):
+        # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
+        try:
+            value = float(value)
+        except ValueError:
+            raise ArmFileError(path, f"{show(value)} is not a number") from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ArmFileError(path, f"{_kind(value)} is not a number")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ArmFileError(path, f"{value} is not finite")
+    if abs(value) > LARGEST:
+        raise ArmFileError(path, f"{_kind(value)} is too large")
+    return float(value)
+
+
+def _friction(joint):
+    if not joint.has("friction"):
+        return Friction()
+    s = joint.section("friction")
+    out = Friction(
+        viscous=s.number("viscous", "viscous", 0.0, low=0.0),
+        coulomb=s.number("coulomb", "torque", 0.0, low=0.0),
+        smoothing=s.number("smoothing", "none", 0.01, positive=True),
+    )
+    s.done()
+    return out
+
+
+def _limits(joint):
+    if not joint.has("limits"):
+        return Limits()
+    s = joint.section("limits")
+    out = Limits(
+        position=s.vector("position", 2, "angle", (-np.inf, np.inf)),
+        velocity=s.number("velocity", "none", np.inf, positive=True),
+        torque=s.number("torque", "torque", np.inf, positive=True),
+    )
+    s.done()
+    if not out.position[0] < out.position[1]:
+        raise ArmFileError(s.at("position"), f"{list(out.position)}: low must be below high")
+    return out
+
+
+def _joint(s):
+    axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
+    norm = math.hypot(*axis)
+    if norm == 0.0:
+        raise ArmFileError(s.at("axis"), "its length is zero")
+    origin = {"xyz": (0.0,) * 3, "rpy": (0.0,) * 3}
+    if s.has("origin"):
+        o = s.section("origin")
+        origin = {
+            "xyz": o.vector("xyz", 3, "length", (0.0,) * 3),
+            "rpy": o.vector("rpy", 3, "angle", (0.0,) * 3),
+        }
+        o.done()
+    optional = {
+        key: s.number(key, dimension, low=0.0)
+        for key, dimension in (("brake_torque", "torque"), ("damp_coefficient", "viscous"))
+        if s.has(key)
+    }
+    joint = Joint(
+        name=s.name(),
+        axis=tuple(a / norm for a in axis),
+        origin_xyz=origin["xyz"],
+        origin_rpy=origin["rpy"],
+        hub_inertia=s.number("hub_inertia", "inertia", 0.0, low=0.0),
+        motor_mass=s.number("motor_mass", "mass", 0.0, low=0.0),
+        rotor_inertia=s.number("rotor_inertia", "inertia", 0.0, low=0.0),
+        gear_ratio=s.number("gear_ratio", "none", 1.0, positive=True),
+        friction=_friction(s),
+        limits=_limits(s),
+        safe_action=s.text("safe_action", "damp", SAFE_ACTIONS),
+        encoder_counts=s.integer("encoder_counts", 0, low=0, high=2**31),
+        **optional,
+    )
+    s.done()
+    return joint
+
+
+def _flexibility(s):
+    shape = s.text("shape", "clamped_free", SHAPES)
+    modes = s.integer("modes", low=1, high=MOST_MODES)
+    frequencies = ()
+    if s.has("frequencies"):
+        given = s.raw("frequencies")
+        count = len(given) if isinstance(given, list) else modes
+        frequencies = s.vector("frequencies", count, "frequency")
+    if shape == "from_frequencies" and len(frequencies) < modes:
+        raise ArmFileError(
+            s.at("frequencies"), f"{len(frequencies)} frequencies for {modes} modes: give one each"
+        )
+    if any(f <= 0.0 for f in frequencies) or list(frequencies) != sorted(set(frequencies)):
+        raise ArmFileError(
+            s.at("frequencies"), f"{list(frequencies)} must be positive and ascending"
+        )
+    damping = ()
+    if s.has("damping"):
+        given = s.raw("damping")
+        damping = (
+            s.vector("damping", len(given))
+            if isinstance(given, list)
+            else (s.number("damping", low=0.0),)
+        )
+    if any(not 0.0 <= z < 1.0 for z in damping):
+        raise ArmFileError(s.at("damping"), f"{list(damping)}: damping ratios are from 0 to 1")
+    s.done()
+    return Flexibility(modes, shape, frequencies, damping)
+
+
+def _section_properties(s):
+    """Stiffnesses and mass of a rectangular or tubular section."""
+    shape = s.text("shape", choices=("rectangle", "tube"))
+    density = s.number("density", "density", positive=True)
+    young = s.number("youngs_modulus", "stress", positive=True)
+    shear = s.number("shear_modulus", "stress", default=young / 2.6, positive=True)
+    if shape == "rectangle":
+        b = s.number("size_y", "length", positive=True)
+        h = s.number("size_z", "length", positive=True)
+        area, inertia_y, inertia_z = b * h, h * b**3 / 12.0, b * h**3 / 12.0
+        wide, thin = max(b, h), min(b, h)
+        # Roark, torsion constant of a rectangle, within 0.5 %.
+        ratio = thin / wide
+        torsion = wide * thin**3 * (1.0 / 3.0 - 0.21 * ratio * (1.0 - ratio**4 / 12.0))
+    else:
+        outer = s.number("outer_diameter", "length", positive=True)
+        wall = s.number("wall", "length", positive=True)
+        if 2.0 * wall > outer:
+            raise ArmFileError(s.at("wall"), f"{wall} m is more than the radius {outer / 2} m")
+        inner = outer - 2.0 * wall
+        area = math.pi * (outer**2 - inner**2) / 4.0
+        inertia_y = inertia_z = math.pi * (outer**4 - inner**4) / 64.0
+        torsion = 2.0 * inertia_y
+    s.done()
+    stiffness = {"y": young * inertia_y, "z": young * inertia_z, "twist": shear * torsion}
+    return density * area, stiffness, density * (inertia_y + inertia_z)
+
+
+def _link(s):
+    name = s.name()
+    length = s.number("length", "length", positive=True)
+    if s.has("section"):
+        for key in ("EI_y", "EI_z", "GJ", "mass_per_length"):
+            if s.has(key):
+                raise ArmFileError(s.at(key), "give either a section or the stiffnesses, not both")
+        per_length, stiffness, polar = _section_properties(s.section("section"))
+    else:
+        per_length = s.number("mass_per_length", "mass_per_length", positive=True)
+        polar = s.number("polar_inertia_per_length", "mass", 0.0, low=0.0)
+        stiffness = {
+            direction: s.number(key, "stiffness", positive=True)
+            for direction, key in zip(DIRECTIONS, ("EI_y", "EI_z", "GJ"), strict=True)
+            if s.has(key)
+        }
+    flexible = {}
+    if s.has("flexible"):
+        f = s.section("flexible")
+        for direction, key in zip(DIRECTIONS, ("EI_y", "EI_z", "GJ"), strict=True):
+            if f.has(direction):
+                flexible[direction] = _flexibility(f.section(direction))
+                if direction not in stiffness:
+                    raise ArmFileError(s.at(key), f"missing: the link is flexible in {direction}")
+        f.done()
+    if "twist" in flexible and not polar > 0.0:
+        raise ArmFileError(
+            s.at("polar_inertia_per_length"),
+            "missing: a link that twists needs the polar inertia of its sections (rho I_p), or a section",
+        )
+    s.done()
+    return Link(name, length, per_length, stiffness, flexible, polar)
+
+
+def _payload(s):
+    mass = s.number("mass", "mass", 0.0, low=0.0)
+    inertia = np.zeros((3, 3))
+    if s.has("inertia"):
+        given = s.raw("inertia")
+        if isinstance(given, list):
+            v = s.vector("inertia", 6, "inertia")  # xx, yy, zz, xy, xz, yz
+            inertia = np.array([[v[0], v[3], v[4]], [v[3], v[1], v[5]], [v[4], v[5], v[2]]])
+        else:
+            inertia = s.number("inertia", "inertia") * np.eye(3)
+    if np.linalg.eigvalsh(inertia).min() < -1e-12 * np.abs(inertia).max():
+        raise ArmFileError(s.at("inertia"), "not positive semi-definite")
+    offset = s.vector("offset", 3, "length", (0.0,) * 3)
+    s.done()
+    return Payload(mass, tuple(map(tuple, inertia.tolist())), offset)
+
+
+def _gauge(s, links):
+    name = s.name()
+    link = s.text("link", choices=tuple(links))
+    position = s.number("position", "length")
+    if not 0.0 <= position <= links[link].length:
+        raise ArmFileError(
+            s.at("position"),
+            f"{position:.6g} m is outside {link}, which is {links[link].length:.6g} m long",
+        )
+    distance = s.number("surface_distance", "length")
+    if distance == 0.0:
+        raise ArmFileError(s.at("surface_distance"), "0: a gauge on the neutral axis sees nothing")
+    if abs(distance) > 0.5 * links[link].length:
+        raise ArmFileError(
+            s.at("surface_distance"),
+            f"{distance:.6g} m from the neutral axis of a link {links[link].length:.6g} m long: in mm?",
+        )
+    gauge = Gauge(
+        name=name,
+        link=link,
+        position=position,
+        direction=s.text("direction", "y", DIRECTIONS),
+        surface_distance=distance,
+        gain=s.number("gain", "none", 1.0),
+        bias=s.number("bias", "none", 0.0),
+        noise=s.number("noise", "none", 0.0, low=0.0),
+        bits=s.integer("bits", 0, low=0, high=MOST_BITS),
+        full_scale=s.number("full_scale", "none", Gauge.full_scale, positive=True),
+        drift=s.number("drift", "none", 0.0, low=0.0),
+    )
+    if gauge.gain == 0.0:
+        raise ArmFileError(s.at("gain"), "0: such a gauge sees nothing")
+    if gauge.full_scale > MOST_STRAIN:
+        raise ArmFileError(
+            s.at("full_scale"),
+            f"{gauge.full_scale:g} strain is more than {MOST_STRAIN}: in microstrain?",
+        )
+    for key in ("bias", "noise"):
+        if not abs(getattr(gauge, key)) < gauge.full_scale:
+            raise ArmFileError(
+                s.at(key),
+                f"{getattr(gauge, key):g} is not within full_scale, {gauge.full_scale:g} strain: in microstrain?",
+            )
+    s.done()
+    return gauge
+
+
+def _unique(things, path):
+    seen = {}
+    for i, thing in enumerate(things):
+        if thing.name in seen:
+            raise ArmFileError(
+                f"{path}[{i}].name", f"{thing.name!r} is {path}[{seen[thing.name]}]'s"
+            )
+        seen[thing.name] = i
+
+
+def _observed(s, modes, gauges):
+    names = s.raw("observed_modes", [m.name for m in modes])
+    if not isinstance(names, list):
+        raise ArmFileError("observed_modes", f"a list of mode names is wanted, not {_kind(names)}")
+    known = {m.name: m for m in modes}
+    for i, name in enumerate(names):
+        if not isinstance(name, str) or name not in known:
+            raise ArmFileError(
+                f"observed_modes[{i}]",
+                f"{_kind(name)} is not a mode of this arm: {', '.join(known)}",
+            )
+        if name in names[:i]:
+            raise ArmFileError(f"observed_modes[{i}]", f"{name!r} given twice")
+    for key in {(known[n].link, known[n].direction) for n in names}:
+        seen_by = sum((g.link, g.direction) == key for g in gauges)
+        wanted = sum((known[n].link, known[n].direction) == key for n in names)
+        if gauges and seen_by < wanted:
+            raise ArmFileError(
+                "gauges",
+                f"{seen_by} on {key[0]} in direction {key[1]} for {wanted} observed modes: add gauges"
+                " or list fewer observed_modes",
+            )
+    # The order of the modal coordinates is the arm's, whatever the file's.
+    return tuple(m.name for m in modes if m.name in names)
+
+
+def parse(text, where="arm"):
+    """Read an arm from YAML text.
+
+    Parameters
+    ----------
+    text : str
+        The file's content.
+    where : str
+        What to call it in messages about the YAML itself.
+
+    Returns
+    -------
+    Arm
+
+    Raises
+    ------
+    ArmFileError
+        Naming the field by its path, the value, and what is wanted.
+    """
+    top = _Section(_read_yaml(text, where), "", "si")
+    top.system = top.text("units", "si", ("si", "imperial"))
+    joints = tuple(_joint(s) for s in top.sections("joints", required=True))
+    links = tuple(_link(s) for s in top.sections("links", required=True))
+    if not links:
+        raise ArmFileError("links", "empty: an arm has at least one link")
+    if len(joints) != len(links):
+        raise ArmFileError(
+            "joints",
+            f"{len(joints)} joints for {len(links)} links: a serial arm has one joint each",
+        )
+    _unique(joints, "joints")
+    _unique(links, "links")
+    by_name = {link.name: link for link in links}
+    gauges = tuple(_gauge(s, by_name) for s in top.sections("gauges"))
+    _unique(gauges, "gauges")
+    model, options = _model(top)
+    arm = Arm(
+        name=top.name(),
+        joints=joints,
+        links=links,
+        payload=_payload(top.section("payload")) if top.has("payload") else Payload(),
+        gauges=gauges,
+        gravity=top.vector("gravity", 3, "acceleration", (0.0, 0.0, 0.0)),
+        foreshortening=top.flag("foreshortening"),
+        finite_slope=top.flag("finite_slope"),
+        model=model,
+        model_options=options,
+        description=top.text("description", ""),
+        source=top.text("source", ""),
+    )
+    # Misspelt fields first: a misspelt observed_modes would be taken for too few gauges.
+    top.has("observed_modes")
+    top.done()
+    return replace(arm, observed_modes=_observed(top, arm.modes, gauges))
+
+
+def _model(top):
+    """Name of the model class, and the section that belongs to `paper_appendix` alone."""
+    model = top.text("model", "chain")
+    options = {}
+    if top.has("paper_appendix"):
+        if model != "paper_appendix":
+            raise ArmFileError("paper_appendix", f"belongs to model paper_appendix, not {model}")
+        s = top.section("paper_appendix")
+        options = {
+            "beam_mass": s.number("beam_mass", "mass", positive=True),
+            "beam_inertia": s.number("beam_inertia", "inertia", positive=True),
+            "m23_fit": s.number("m23_fit", "mass", 0.0),
+        }
+        s.done()
+    elif model == "paper_appendix":
+        raise ArmFileError("paper_appendix", "missing: model paper_appendix needs this section")
+    return model, options
+
+
+def arms_directories():
+    """Where shipped arms are looked for: the source tree first, then what colcon installed."""
+    here = Path(__file__).resolve()
+    places = [parent / "config" / "arms" for parent in here.parents]
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if prefix:
+            places.append(Path(prefix) / "share" / "flexarm_bringup" / "config" / "arms")
+    return [p for p in places if p.is_dir()]
+
+
+def find(name):
+    """Path of an arm given as a path or as a shipped name.
+
+    Raises
+    ------
+    ArmFileError
+        When there is no such file; lists the shipped names.
+    """
+    try:
+        path = Path(name).expanduser()
+        if path.is_file():
+            return path
+    except (OSError, RuntimeError) as error:  # a name too long; no such user's home
+        raise ArmFileError("arm", f"{str(name)[:80]!r} is no path: {error}") from None
+    for directory in arms_directories():
+        candidate = directory / f"{name}.yaml"
+        if candidate.is_file():
+            return candidate
+    shipped = sorted({p.stem for d in arms_directories() for p in d.glob("*.yaml")})
+    raise ArmFileError(
+        "arm", f"{str(name)!r} is neither a file nor a shipped arm ({', '.join(shipped) or 'none'})"
+    )
+
+
+def load(name):
+    """Read an arm by path or shipped name.
+
+    Parameters
+    ----------
+    name : str or Path
+        ``R``, ``two_link`` or another of ``config/arms``, or a path to a YAML file.
+
+    Returns
+    -------
+    Arm
+
+    Raises
+    ------
+    ArmFileError
+        Naming the file and the field.
+    """
+    if not str(name):
+        raise ArmFileError("arm", "no arm given: write a shipped name (R) or a path")
+    path = find(name)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArmFileError(str(path), f"can't be read: {error}") from None
+    try:
+        return parse(text, path.name)
+    except ArmFileError as error:
+        raise ArmFileError(f"{path.name}: {error.path}", error.reason) from None

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an arm is: plain data in SI, as `arm_file.load` reads it.
+
+Frames: each joint's frame is the tip frame of the previous link (the base frame for the first joint) moved by
+the joint's fixed `origin` and turned by the joint angle about `axis`. A link extends along the x axis of its
+joint's frame; it bends along y and z and twists about x.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..errors import ModelError
+
+DIRECTIONS = ("y", "z", "twist")
+SAFE_ACTIONS = ("brake", "damp", "zero")
+#: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
+MOST_MODES = 20
+SHAPES = ("clamped_free", "loaded", "from_frequencies")
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Joint friction ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
+
+    viscous: float = 0.0  # [N m s/rad]
+    coulomb: float = 0.0  # [N m]
+    smoothing: float = 0.01  # [rad/s] speed at which Coulomb friction reaches 76 %
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a joint may do; infinite where the file says nothing."""
+
+    position: tuple = (-np.inf, np.inf)  # [rad] low, high
+    velocity: float = np.inf  # [rad/s]
+    torque: float = np.inf  # [N m]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A revolute joint."""
+
+    name: str
+    axis: tuple = (0.0, 0.0, 1.0)  # unit vector in the joint's frame
+    origin_xyz: tuple = (0.0, 0.0, 0.0)  # [m] from the previous link's tip
+    origin_rpy: tuple = (0.0, 0.0, 0.0)  # [rad] roll, pitch, yaw, as in URDF
+    hub_inertia: float = 0.0  # [kg m^2] about the axis, turns with the link
+    motor_mass: float = 0.0  # [kg] at the joint, hangs on the previous link
+    rotor_inertia: float = 0.0  # [kg m^2] motor side
+    gear_ratio: float = 1.0  # [-] motor turns per joint turn
+    friction: Friction = Friction()
+    limits: Limits = Limits()
+    safe_action: str = "damp"
+    brake_torque: float | None = None  # [N m] holding capacity; None: the torque limit
+    damp_coefficient: float | None = None  # [N m s/rad]; None: chosen by the plant
+    encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
+
+    @property
+    def inertia(self):
+        """Hub inertia with the rotor's seen through the gear [kg m^2]."""
+        return self.hub_inertia + self.rotor_inertia * self.gear_ratio**2
+
+
+@dataclass(frozen=True)
+class Flexibility:
+    """Bending or twist of a link in one direction."""
+
+    modes: int
+    shape: str = "clamped_free"
+    frequencies: tuple = ()  # [Hz], for from_frequencies
+    damping: tuple = ()  # [-] modal damping ratio, per mode; shorter: the last one repeats
+
+
+@dataclass(frozen=True)
+class Link:
+    """A uniform link along x; rigid where `flexible` says nothing."""
+
+    name: str
+    length: float  # [m]
+    mass_per_length: float  # [kg/m]
+    stiffness: dict = field(default_factory=dict)  # direction -> EI [N m^2], twist: GJ [N m^2]
+    flexible: dict = field(default_factory=dict)  # direction -> Flexibility
+    polar_inertia_per_length: float = 0.0  # [kg m] rho I_p, for twist
+
+    @property
+    def mass(self):
+        """Mass of the beam [kg]."""
+        return self.mass_per_length * self.length
+
+
+@dataclass(frozen=True)
+class Payload:
+    """Rigid body at the last link's tip."""
+
+    mass: float = 0.0  # [kg]
+    inertia: tuple = ((0.0,) * 3,) * 3  # [kg m^2] about its centre of mass, tip frame
+    offset: tuple = (0.0, 0.0, 0.0)  # [m] centre of mass from the tip
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """A strain gauge, or the bridge it stands for.
+
+    The strain read is ``gain * (-c y''(eta)) + bias + drift + noise`` for bending along y or z, with the
+    curvature ``y''`` at `position` and `surface_distance` c, and ``gain * c theta'(eta) + ...`` for twist; it is
+    rounded to the bridge's steps and ends at the ends of its range.
+    """
+
+    name: str
+    link: str
+    position: float  # [m] from the link's base
+    direction: str
+    surface_distance: float  # [m] from the neutral axis; its sign is the face's
+    gain: float = 1.0  # [-]
+    bias: float = 0.0  # [-] strain
+    noise: float = 0.0  # [-] rms strain
+    bits: int = 0  # [-] of the bridge's converter over full scale; 0: not quantised
+    full_scale: float = 1000e-6  # [-] strain, the range's end on either side
+    drift: float = 0.0  # [1/sqrt(s)] strain: rms change of the bias over a second, a random walk
+
+    @property
+    def step(self):
+        """Strain of one count of the converter [-]; 0 without one."""
+        return 2.0 * self.full_scale / 2**self.bits if self.bits else 0.0
+
+    @property
+    def range(self):
+        """Least and greatest reading [-]; a converter's counts end one short of +full_scale."""
+        return -self.full_scale, self.full_scale - self.step
+
+    @property
+    def uncertainty(self):
+        """Rms error of one reading [-]: its noise, and rounding's step / sqrt(12)."""
+        return float(np.hypot(self.noise, self.step / np.sqrt(12.0)))
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Where a modal coordinate stands: which link, direction and number (from 1)."""
+
+    link: str
+    direction: str
+    number: int
+
+    @property
+    def name(self):
+        """Name on every topic: ``link1_y_mode1``."""
+        return f"{self.link}_{self.direction}_mode{self.number}"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A serial arm; the result of reading an arm file."""
+
+    name: str
+    joints: tuple
+    links: tuple
+    payload: Payload = Payload()
+    gauges: tuple = ()
+    observed_modes: tuple = ()  # names; all of the arm's modes unless the file says otherwise
+    gravity: tuple = (0.0, 0.0, 0.0)  # [m/s^2] in the base frame
+    foreshortening: bool = False  # links keep their length: stiffer when spun
+    finite_slope: bool = False  # and their curvature and tips' angles hold for large slopes
+    model: str = "chain"  # name of the model class, found through entry points
+    model_options: dict = field(default_factory=dict)  # what that class alone understands, SI
+    description: str = ""
+    source: str = ""
+
+    @property
+    def joint_names(self):
+        """Joint names, base to tip."""
+        return tuple(j.name for j in self.joints)
+
+    @property
+    def modes(self):
+        """All modal coordinates, link by link, direction by direction, mode by mode."""
+        return tuple(
+            Mode(link.name, direction, i + 1)
+            for link in self.links
+            for direction in DIRECTIONS
+            if direction in link.flexible
+            for i in range(link.flexible[direction].modes)
+        )
+
+    @property
+    def mode_names(self):
+        """Names of all modal coordinates in order."""
+        return tuple(m.name for m in self.modes)
+
+    @property
+    def gauge_names(self):
+        """Gauge names in the file's order."""
+        return tuple(g.name for g in self.gauges)
+
+    def link(self, name):
+        """The link called `name`."""
+        return next(link for link in self.links if link.name == name)
+
+    def with_modes(self, count):
+        """The same arm with `count` modes in every flexible direction of every link.
+
+        Gauges and observed modes stay as they are: what a plant with more modes than its controller knows
+        does to the gauges is spill-over.
+        """
+        if not 1 <= count <= MOST_MODES:
+            raise ModelError(f"{self.name}: {count} modes; from 1 to {MOST_MODES} are possible")
+        for link in self.links:
+            for direction, f in link.flexible.items():
+                if f.shape == "from_frequencies" and len(f.frequencies) < count:
+                    raise ModelError(
+                        f"{self.name}: {link.name} has {len(f.frequencies)} measured frequencies in"
+                        f" {direction}, so at most that many modes, not {count}"
+                    )
+        links = tuple(
+            replace(
+                link,
+                flexible={
+                    d: replace(f, modes=count, frequencies=f.frequencies[:count])
+                    for d, f in link.flexible.items()
+                },
+            )
+            for link in self.links
+        )
+        arm = replace(self, links=links)
+        kept = tuple(n for n in self.observed_modes if n in arm.mode_names)
+        return replace(arm, observed_modes=kept)
+
+
+def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
+    """The same arm with another payload, stiffness or damping: what a controller that has not been told meets.
+
+    Gauges, observed modes and everything else stay. Where mode shapes depend on the payload (`loaded`), they
+    change with it.
+
+    Parameters
+    ----------
+    arm : Arm
+    payload : float
+        Factor of the payload's mass and inertia; its offset stays [-].
+    stiffness : float
+        Factor of every link's EI and GJ. Measured frequencies (`from_frequencies`) go with its root, so that
+        their shapes stay as they are [-].
+    damping : float
+        Factor of every modal damping ratio [-].
+
+    Returns
+    -------
+    Arm
+
+    Raises
+    ------
+    ModelError
+        For a factor that is negative or not finite, or for a stiffness of 0.
+    """
+    for name, value in (("payload", payload), ("stiffness", stiffness), ("damping", damping)):
+        low = value > 0.0 if name == "stiffness" else value >= 0.0
+        if not (low and np.isfinite(value)):
+            wanted = "above 0" if name == "stiffness" else "not below 0"
+            raise ModelError(
+                f"{arm.name}: {name} times {value}: a finite factor {wanted} is wanted"
+            )
+    body = replace(
+        arm.payload,
+        mass=payload * arm.payload.mass,
+        inertia=tuple(tuple(payload * i for i in row) for row in arm.payload.inertia),
+    )
+    return replace(
+        arm, payload=body, links=tuple(_scaled_link(i, stiffness, damping) for i in arm.links)
+    )
+
+
+def _scaled_link(link, stiffness, damping):
+    root = np.sqrt(stiffness)
+    flexible = {
+        d: replace(
+            f,
+            frequencies=tuple(float(root * v) for v in f.frequencies),
+            damping=tuple(damping * v for v in f.damping),
+        )
+        for d, f in link.flexible.items()
+    }
+    rigidity = {d: stiffness * v for d, v in link.stiffness.items()}
+    return replace(link, stiffness=rigidity, flexible=flexible)

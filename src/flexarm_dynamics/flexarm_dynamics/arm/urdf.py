@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""An arm as a URDF: each flexible link a chain of short rigid pieces that small joints bend and twist.
+
+A link of length L becomes N pieces of length h = L/N. Piece k points as the link's tangent does at its middle,
+:math:`x = (k + 1/2)h`, and the frame after the last one as the tip. So the chain's tip is off by
+
+.. math:: \sum_k h\,t(x_k) - \int_0^L t\,dx = O(h^2)
+
+from that of a beam of constant length with the tangent t. An arm whose level is the first order lets its links get
+longer as they bend, by :math:`\tfrac12\int y'^2 dx`; rigid pieces do not, and that much stays.
+
+Where two pieces meet there is one revolute joint for each way in which the link is flexible: about z for bending along
+y, about y for bending along z, about x for twist, in this order. Angles are of what is left of the turn from the
+chain as it is to the section as it should be, so that nothing adds up along the link.
+
+It is for showing (RViz, robot_state_publisher, Foxglove). The small joints have no springs: a simulation of this URDF
+is none of the arm. Rotors behind gears and the first motor, which stands, are left out.
+"""
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError
+from ..models.model import about_axis
+from .sections import Sections
+
+#: Axis of the small joint for each direction, in the order of the turns Rz Ry Rx.
+AXES = {"y": (0.0, 0.0, 1.0), "z": (0.0, 1.0, 0.0), "twist": (1.0, 0.0, 0.0)}
+#: Radius of a link as it is drawn, of the length of all links [-].
+THICKNESS = 0.01
+#: What a small joint may turn by [rad]; URDF wants a number.
+BEND = 1.5
+
+
+@dataclass(frozen=True)
+class Junction:
+    """Where a piece begins: its small joints' names by direction."""
+
+    link: str
+    joints: dict
+
+
+class PieceChain:
+    """An arm's URDF and the joint values that put it where the arm is.
+
+    Parameters
+    ----------
+    model : ArmModel
+    pieces : int
+        Of each flexible link.
+
+    Attributes
+    ----------
+    joint_names : tuple of str
+        The arm's joints, then the small ones, link by link, from base to tip.
+
+    Raises
+    ------
+    ModelError
+        For no piece at all, or two parts of the same name.
+    """
+
+    def __init__(self, model, pieces=8):
+        if pieces < 1:
+            raise ModelError(f"{model.arm.name}: {pieces} pieces a link; at least 1 is needed")
+        self.arm, self.pieces = model.arm, int(pieces)
+        self._sections = Sections(model, 2 * self.pieces)
+        self._junctions = [self._of(link) for link in self.arm.links]
+        small = [n for link in self._junctions for j in link for n in j.joints.values()]
+        self.joint_names = (*self.arm.joint_names, *small)
+        self._values = np.zeros(len(self.joint_names))
+        _check_unique(self.arm.name, self.joint_names)
+
+    def _of(self, link):
+        """Junctions of a flexible link; none of a rigid one."""
+        directions = [d for d in AXES if d in link.flexible]
+        count = self.pieces + 1 if directions else 0
+        return [
+            Junction(link.name, {d: f"{link.name}_{d}_joint{k + 1}" for d in directions})
+            for k in range(count)
+        ]
+
+    def joint_values(self, q, delta=None):
+        """Angles of all joints.
+
+        Parameters
+        ----------
+        q : (n,) array_like
+            [rad]
+        delta : (m,) array_like, optional
+            Modal amplitudes [m, rad]; none: the straight arm.
+
+        Returns
+        -------
+        ndarray, shape (len(joint_names),)
+            [rad], in the order of `joint_names`; the same array at each call.
+
+        Raises
+        ------
+        ShapeError
+        """
+        n = len(self.arm.joints)
+        self._values[:n] = q
+        at = n
+        for junctions, (R, _) in zip(self._junctions, self._sections.frames(q, delta), strict=True):
+            now = R[0]
+            for junction, wanted in zip(junctions, (*R[1::2], R[-1]), strict=False):
+                for direction, angle in angles(now.T @ wanted, junction.joints):
+                    self._values[at] = angle
+                    now = now @ about_axis(AXES[direction], angle)
+                    at += 1
+        return self._values
+
+    def urdf(self):
+        """The URDF, a string of XML."""
+        return _Writer(self).text()
+
+
+def angles(turn, directions):
+    """Turns about z, y and x, as far as there are joints for them, that make up a rotation.
+
+    Parameters
+    ----------
+    turn : ndarray, shape (3, 3)
+    directions : container of str
+        Of "y" (about z), "z" (about y) and "twist" (about x).
+
+    Yields
+    ------
+    direction : str
+    angle : float
+        [rad]
+    """
+    if "y" in directions:
+        yield "y", float(np.arctan2(turn[1, 0], turn[0, 0]))
+        forward = np.hypot(turn[0, 0], turn[1, 0])
+    else:
+        forward = turn[0, 0]
+    if "z" in directions:
+        yield "z", float(np.arctan2(-turn[2, 0], forward))
+    if "twist" in directions:
+        yield "twist", float(np.arctan2(turn[2, 1], turn[2, 2]))
+
+
+def _check_unique(arm, names):
+    seen = set()
+    for name in names:
+        if name in seen:
+            raise ModelError(
+                f"{arm}: two parts of the URDF are called {name}; give that joint or link another name"
+            )
+        seen.add(name)
+
+
+class _Writer:
+    """Writes the URDF of a `PieceChain`, from base to tip."""
+
+    def __init__(self, chain):
+        self.chain, self.arm = chain, chain.arm
+        self.radius = THICKNESS * sum(link.length for link in self.arm.links)
+        self.root = ET.Element("robot", name=self.arm.name)
+        for name, colour in (("beam", "0.16 0.44 0.70 1"), ("hub", "0.25 0.25 0.28 1")):
+            ET.SubElement(ET.SubElement(self.root, "material", name=name), "color", rgba=colour)
+
+    def text(self):
+        self._link("base_link")
+        parent = "base_link"
+        for i, link in enumerate(self.arm.links):
+            parent = self._arm_link(i, link, parent)
+        self._payload(parent)
+        for kind in ("link", "joint"):
+            _check_unique(self.arm.name, [e.get("name") for e in self.root.iter(kind)])
+        ET.indent(self.root)
+        return '<?xml version="1.0"?>\n' + ET.tostring(self.root, encoding="unicode") + "\n"
+
+    def _arm_link(self, i, link, parent):
+        """A joint of the arm and the link behind it; the name of its tip's frame."""
+        joint = self.arm.joints[i]
+        self._joint(joint.name, parent, link.name, joint.axis, joint.origin_xyz, joint.origin_rpy)
+        self._limits(joint)
+        body = self._link(link.name)
+        self._visual(body, 3.0 * self.radius, 2.0 * self.radius, joint.axis, (0.0,) * 3, "hub")
+        junctions = self.chain._junctions[i]
+        tip = f"{link.name}_tip"
+        if junctions:
+            if joint.hub_inertia:
+                self._inertial(body, 0.0, _about(joint))
+            self._pieces(link, junctions, tip)
+        else:
+            self._beam(body, link, link.length, _about(joint))
+            self._fixed(f"{tip}_joint", link.name, tip, (link.length, 0.0, 0.0))
+        after = self.arm.joints[i + 1 : i + 2]
+        end = self._link(tip)
+        if after and after[0].motor_mass:
+            at = after[0].origin_xyz
+            self._inertial(end, after[0].motor_mass, np.zeros((3, 3)), at)
+        return tip
+
+    def _pieces(self, link, junctions, tip):
+        length = link.length / self.chain.pieces
+        parent, step = link.name, 0.0
+        for k, junction in enumerate(junctions):
+            last = len(junction.joints) - 1
+            for j, (direction, name) in enumerate(junction.joints.items()):
+                whole = tip if k == self.chain.pieces else f"{link.name}_piece{k + 1}"
+                child = whole if j == last else f"{link.name}_{direction}_{k + 1}"
+                joint = self._joint(name, parent, child, AXES[direction], (step, 0.0, 0.0))
+                ET.SubElement(
+                    joint, "limit", lower=_text(-BEND), upper=_text(BEND), effort="0", velocity="0"
+                )
+                if j != last:
+                    self._link(child)
+                parent, step = child, 0.0
+            if k < self.chain.pieces:
+                self._beam(self._link(parent), link, length)
+            step = length
+
+    def _beam(self, body, link, length, more=0.0):
+        """A rigid piece of a link from its frame's origin along x; `more` inertia (3, 3) at the origin [kg m^2]."""
+        mass = link.mass_per_length * length
+        across = mass * length**2 / 12.0
+        # Sections have no inertia of their own in the model but for twist: a rod as it is drawn.
+        along = link.polar_inertia_per_length * length or 0.5 * mass * self.radius**2
+        middle = (0.5 * length, 0.0, 0.0)
+        self._inertial(body, mass, np.diag([along, across, across]) + more, middle)
+        self._visual(body, length, self.radius, (1.0, 0.0, 0.0), middle, "beam")
+
+    def _payload(self, parent):
+        payload = self.arm.payload
+        if not payload.mass:
+            return
+        self._fixed("payload_joint", parent, "payload", (0.0, 0.0, 0.0))
+        body = self._link("payload")
+        self._inertial(body, payload.mass, np.asarray(payload.inertia), payload.offset)
+        visual = ET.SubElement(body, "visual")
+        ET.SubElement(visual, "origin", xyz=_text(*payload.offset))
+        ball = ET.SubElement(visual, "geometry")
+        ET.SubElement(ball, "sphere", radius=_text(2.0 * self.radius))
+        ET.SubElement(visual, "material", name="hub")
+
+    # Elements ----------------------------------------------------------------------------------
+
+    def _link(self, name):
+        return ET.SubElement(self.root, "link", name=name)
+
+    def _joint(self, name, parent, child, axis, xyz, rpy=(0.0, 0.0, 0.0)):
+        self.last = joint = ET.SubElement(self.root, "joint", name=name, type="revolute")
+        ET.SubElement(joint, "parent", link=parent)
+        ET.SubElement(joint, "child", link=child)
+        ET.SubElement(joint, "origin", xyz=_text(*xyz), rpy=_text(*rpy))
+        ET.SubElement(joint, "axis", xyz=_text(*axis))
+        return joint
+
+    def _fixed(self, name, parent, child, xyz):
+        joint = ET.SubElement(self.root, "joint", name=name, type="fixed")
+        ET.SubElement(joint, "parent", link=parent)
+        ET.SubElement(joint, "child", link=child)
+        ET.SubElement(joint, "origin", xyz=_text(*xyz))
+
+    def _limits(self, joint):
+        """What the arm file says; a joint without ends is continuous, without the others it has room."""
+        limits, element = joint.limits, self.last
+        low, high = limits.position
+        given = {
+            "effort": _text(min(limits.torque, 1e6)),
+            "velocity": _text(min(limits.velocity, 1e3)),
+        }
+        if np.isfinite(low) and np.isfinite(high):
+            given |= {"lower": _text(low), "upper": _text(high)}
+        else:
+            element.set("type", "continuous")
+        ET.SubElement(element, "limit", given)
+        ET.SubElement(
+            element,
+            "dynamics",
+            damping=_text(joint.friction.viscous),
+            friction=_text(joint.friction.coulomb),
+        )
+
+    @staticmethod
+    def _inertial(body, mass, inertia, xyz=(0.0, 0.0, 0.0)):
+        inertial = ET.SubElement(body, "inertial")
+        ET.SubElement(inertial, "origin", xyz=_text(*xyz))
+        ET.SubElement(inertial, "mass", value=_text(mass))
+        names = {f"i{'xyz'[a]}{'xyz'[b]}": inertia[a, b] for a in range(3) for b in range(a, 3)}
+        ET.SubElement(inertial, "inertia", {name: _text(value) for name, value in names.items()})
+
+    @staticmethod
+    def _visual(body, length, radius, axis, middle, material):
+        """A cylinder about an axis; URDF's own is about z."""
+        x, y, z = axis
+        rpy = (0.0, np.arccos(np.clip(z, -1.0, 1.0)), np.arctan2(y, x))
+        visual = ET.SubElement(body, "visual")
+        ET.SubElement(visual, "origin", xyz=_text(*middle), rpy=_text(*rpy))
+        geometry = ET.SubElement(visual, "geometry")
+        ET.SubElement(geometry, "cylinder", length=_text(length), radius=_text(radius))
+        ET.SubElement(visual, "material", name=material)
+
+
+def _about(joint):
+    """Inertia of a hub, known about its joint's axis alone, shape (3, 3) [kg m^2]."""
+    return joint.hub_inertia * np.outer(joint.axis, joint.axis)
+
+
+def _text(*values):
+    return " ".join(f"{float(v) + 0.0:.12g}" for v in values)

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an arm to the constants of `kernels.chain`: mode shapes, loads, modal integrals, work space."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from ..arm.description import DIRECTIONS
+from ..kernels import chain as kernel
+from . import beam
+from .model import damping_matrix, rotation
+
+_KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST}
+
+
+def _shape(spec, sizes):
+    return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
+
+
+def _sizes(links, modes, nodes):
+    return {"N": links, "K": modes, "G": nodes, "N+1": links + 1, "G+1": nodes + 1}
+
+
+def _capacity(value, steps):
+    return next(step for step in (*steps, value) if step >= value)
+
+
+def roomy(data):
+    """Sizes that many arms share, so that one compilation serves them all."""
+    return _sizes(
+        _capacity(data.links, (8, 16, 32)),
+        _capacity(data.s.shape[1], (4, 8, 16, 60)),
+        _capacity(data.nodes, (28, 44, 92)),
+    )
+
+
+def work_space(data, dtype=float, sizes=None):
+    """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
+    sizes = sizes or _sizes(data.links, data.s.shape[1], data.nodes)
+    return kernel.Work(
+        **{name: np.zeros(_shape(spec, sizes), dtype) for name, spec in kernel.WORK.items()}
+    )
+
+
+def packed(values, specs, sizes):
+    """A namedtuple of arrays as an array of one record, which compiled code takes by reference.
+
+    Shapes are part of a record's type: with them fixed no array is passed or counted. Arrays are padded with
+    zeros to the sizes given.
+
+    `specs` has the axes of each field, by the names of `sizes`.
+    """
+    fields = {name: np.asarray(value) for name, value in values._asdict().items()}
+    shapes = {name: _shape(specs[name], sizes) for name in fields}
+    kind = [(name, field.dtype, shapes[name]) for name, field in fields.items()]
+    # No recarray: its attribute look-ups in Python cost more per call than the kernels do.
+    record = np.zeros(1, np.dtype(kind, align=True))
+    for name, field in fields.items():
+        record[name][(0, *(slice(n) for n in field.shape))] = field
+    return record
+
+
+def cumulative(points, ends):
+    """Matrix that integrates a function given at Gauss points of [0, 1] from 0 to each of `ends`."""
+    values = legendre.legvander(2.0 * points - 1.0, points.size - 1)
+    primitives = [legendre.legint(row, lbnd=-1.0) for row in np.eye(points.size)]
+    integrals = np.array([legendre.legval(2.0 * ends - 1.0, p) for p in primitives]).T
+    return 0.5 * np.linalg.solve(values.T, integrals.T).T
+
+
+def modes_of(link, shapes):
+    """(shapes, number, direction) of each mode of a link, in the order of the arm's modal coordinates."""
+    return [
+        (shapes[link.name, direction], i, direction)
+        for direction in DIRECTIONS
+        if direction in link.flexible
+        for i in range(link.flexible[direction].modes)
+    ]
+
+
+@dataclass(frozen=True)
+class Load:
+    """A rigid body in a frame: its mass, first moment and inertia about the frame's origin.
+
+    Attributes
+    ----------
+    averaged : bool
+        It turns about the next joint: as a load of a beam its first moment does not count.
+    """
+
+    mass: float
+    moment: np.ndarray
+    inertia: np.ndarray
+    averaged: bool = False
+
+    def moved(self, R, p):
+        """The same body in a frame where this one's origin is p and its axes are R's columns."""
+        moment = R @ self.moment
+        cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+        first = np.outer(moment, p)
+        shift = 2.0 * (moment @ p) * np.eye(3) - first - first.T
+        return Load(
+            self.mass,
+            moment + self.mass * p,
+            R @ self.inertia @ R.T + shift - self.mass * cross @ cross,
+        )
+
+    def __add__(self, other):
+        return Load(
+            self.mass + other.mass, self.moment + other.moment, self.inertia + other.inertia
+        )
+
+
+def _payload(arm):
+    p = arm.payload
+    c = np.asarray(p.offset)
+    inertia = np.asarray(p.inertia) + p.mass * (c @ c * np.eye(3) - np.outer(c, c))
+    return Load(p.mass, p.mass * c, inertia)
+
+
+def _straight(link, joint):
+    """A link's undeformed self with its hub and the motor at its base, in its base frame."""
+    L, rho = link.length, link.mass_per_length
+    a = np.asarray(joint.axis)
+    second = rho * L**3 / 3.0
+    inertia = np.diag([link.polar_inertia_per_length * L, second, second])
+    return Load(
+        joint.motor_mass + rho * L,
+        np.array([rho * L**2 / 2.0, 0.0, 0.0]),
+        inertia + joint.hub_inertia * np.outer(a, a),
+    )
+
+
+def outboard(arm):
+    """What hangs on each link's tip when all joints are at zero and all links straight."""
+    loads = [_payload(arm)]
+    for link, joint in list(zip(arm.links, arm.joints, strict=True))[:0:-1]:
+        rotor = Load(0.0, np.zeros(3), joint.rotor_inertia * np.outer(joint.axis, joint.axis))
+        beyond = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0]))
+        whole = beyond + _straight(link, joint) + rotor
+        whole = whole.moved(rotation(joint.origin_rpy), np.asarray(joint.origin_xyz))
+        loads.insert(0, replace(whole, averaged=True))
+    return loads
+
+
+def shapes_of(link, direction, flexibility, load):
+    """Mode shapes of a link in a direction, of the kind that the arm file names.
+
+    The load of an inner link is averaged over the turns of the joints beyond: its mass sits at the tip, its
+    inertia about the tip counts, its first moment does not.
+
+    `flexibility` is the arm file's for that direction: kind of shape and number of modes.
+    """
+    L, rho, modes = link.length, link.mass_per_length, flexibility.modes
+    if direction == "twist":
+        polar, GJ = link.polar_inertia_per_length, link.stiffness["twist"]
+        if flexibility.shape == "from_frequencies":
+            return beam.twist_from_frequencies(flexibility.frequencies[:modes], L, polar, GJ)
+        tip = load.inertia[0, 0] if flexibility.shape == "loaded" else 0.0
+        return beam.twist(modes, L, polar, tip)
+    if flexibility.shape == "clamped_free":
+        return beam.clamped_free(modes)
+    if flexibility.shape == "from_frequencies":
+        return beam.from_frequencies(
+            flexibility.frequencies[:modes], L, rho, link.stiffness[direction]
+        )
+    mass, inertia, offset = _bending_load(load, direction)
+    return beam.loaded(modes, L, rho, mass, inertia - mass * offset**2, offset)
+
+
+def _bending_load(load, direction):
+    """Mass, inertia about the tip, and distance along x of a load's centre of mass."""
+    axis = 2 if direction == "y" else 1
+    offset = 0.0
+    if load.mass > 0.0 and not load.averaged:
+        offset = load.moment[0] / load.mass
+    return load.mass, load.inertia[axis, axis], offset
+
+
+def _clamped_mass(link, direction, shapes, load):
+    """Modal mass of a link with its base held and its load at its tip: what modal damping refers to."""
+    if direction == "twist":
+        tip = shapes(1.0)
+        return link.polar_inertia_per_length * link.length * shapes.gram() + load.inertia[
+            0, 0
+        ] * np.outer(tip, tip)
+    mass, inertia, offset = _bending_load(load, direction)
+    tip, slope = shapes(1.0), shapes(1.0, 1) / link.length
+    centre = tip + offset * slope
+    return (
+        link.mass * shapes.gram()
+        + mass * np.outer(centre, centre)
+        + (inertia - mass * offset**2) * np.outer(slope, slope)
+    )
+
+
+def bishop_integrals(data, index, weights):
+    """int phi_j'' phi_k' dx for j along y and k along z of a link, from the nodes; shape (K, K)."""
+    y, z = data.direction[index] == kernel.Y, data.direction[index] == kernel.Z
+    out = np.einsum("g,gj,gk->jk", weights, data.node_bend[index], data.node_slope[index])
+    return out * np.outer(y, z)
+
+
+def assemble(arm, shapes, loads):
+    """`kernels.chain.Data` of an arm."""
+    N = len(arm.links)
+    modes = [modes_of(link, shapes) for link in arm.links]
+    K = max(1, *(len(m) for m in modes)) if N > 1 else max(1, len(modes[0]))
+    level = kernel.FIRST_ORDER
+    if arm.foreshortening:
+        level = kernel.FORESHORTENING
+    if arm.finite_slope:
+        level = kernel.FINITE_SLOPE
+    most = max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
+    G = 1 if level == kernel.FIRST_ORDER or not most else 12 + 4 * most
+    points, weights = np.polynomial.legendre.leggauss(G)
+    points, weights = 0.5 * (points + 1.0), 0.5 * weights
+    integrate = cumulative(points, np.append(points, 1.0))
+    z = np.zeros
+    a = {
+        "links": N,
+        "level": level,
+        "nodes": G,
+        "count": np.array([len(m) for m in modes], np.int64),
+        "first": np.cumsum([0] + [len(m) for m in modes])[:-1].astype(np.int64),
+        "direction": np.zeros((N, K), np.int64),
+        "axis": np.array([j.axis for j in arm.joints]),
+        "xyz": np.array([j.origin_xyz for j in arm.joints]),
+        "turn": np.array([rotation(j.origin_rpy) for j in arm.joints]),
+        "gear": np.array([j.gear_ratio for j in arm.joints]),
+        "rotor": np.array([j.rotor_inertia for j in arm.joints]),
+        "length": np.array([link.length for link in arm.links]),
+        "mass": z(N), "moment": z(N), "inertia": z((N, 3, 3)), "s": z((N, K)), "e": z((N, K)),
+        "gram": z((N, K, K)), "stiffness": z((N, K, K)), "damping": z((N, K, K)), "tip": z((N, K)),
+        "slope": z((N, K)), "node_x": z((N, G)), "node_mass": z((N, G)), "node_phi": z((N, G, K)),
+        "node_slope": z((N, G, K)), "node_bend": z((N, G, K)), "node_ei": z((N, G, 2)),
+        "cumulate": z((N, G + 1, G)), "bishop": z((N, K, K)),
+    }  # fmt: skip
+    for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
+        L, rho = link.length, link.mass_per_length
+        body = _straight(link, joint)
+        a["mass"][i], a["moment"][i], a["inertia"][i] = body.mass, body.moment[0], body.inertia
+        a["node_x"][i], a["node_mass"][i] = L * points, L * rho * weights
+        a["cumulate"][i] = L * integrate
+        for c, direction in enumerate(("y", "z")):
+            a["node_ei"][i, :, c] = L * weights * link.stiffness.get(direction, 0.0)
+        for j, (shape, number, direction) in enumerate(modes[i]):
+            _fill_mode(a, i, j, link, shape, number, direction, points)
+        for j, (shape, number, direction) in enumerate(modes[i]):
+            for k, (other, second, across) in enumerate(modes[i]):
+                a["gram"][i, j, k] = _gram(link, shape, number, direction, other, second, across)
+        start = 0
+        for direction in DIRECTIONS:
+            if direction not in link.flexible:
+                continue
+            shape = shapes[link.name, direction]
+            block = (i, slice(start, start + shape.count), slice(start, start + shape.count))
+            start += shape.count
+            power = 1 if direction == "twist" else 2
+            stiff = link.stiffness[direction] / L ** (2 * power - 1) * shape.gram(power)
+            a["stiffness"][block] = stiff
+            a["damping"][block] = damping_matrix(
+                _clamped_mass(link, direction, shape, loads[i]),
+                stiff,
+                link.flexible[direction].damping,
+            )
+    body = _payload(arm)
+    data = kernel.Data(
+        **a,
+        payload_mass=np.array([body.mass]),
+        payload_moment=body.moment,
+        payload_inertia=body.inertia,
+        gravity=np.asarray(arm.gravity, float),
+    )
+    if level != kernel.FIRST_ORDER:
+        for i in range(N):
+            data.bishop[i] = bishop_integrals(data, i, data.cumulate[i, -1])
+    return data
+
+
+def _fill_mode(a, i, j, link, shape, number, direction, points):
+    """The constants of one mode that concern no other."""
+    L, rho = link.length, link.mass_per_length
+    a["direction"][i, j] = _KIND[direction]
+    if direction == "twist":
+        a["s"][i, j] = link.polar_inertia_per_length * L * shape.integral()[number]
+        a["slope"][i, j] = shape(1.0)[number]
+        return
+    a["s"][i, j] = rho * L * shape.integral()[number]
+    a["e"][i, j] = rho * L**2 * shape.integral(lambda xi: xi)[number]
+    a["tip"][i, j] = shape(1.0)[number]
+    a["slope"][i, j] = shape(1.0, 1)[number] / L
+    a["node_phi"][i, :, j] = shape(points)[:, number]
+    a["node_slope"][i, :, j] = shape(points, 1)[:, number] / L
+    a["node_bend"][i, :, j] = shape(points, 2)[:, number] / L**2
+
+
+def _gram(link, shape, number, direction, other, second, across):
+    """int phi_j phi_k dm of two modes of a link; zero between bending and twist."""
+    if (direction == "twist") != (across == "twist"):
+        return 0.0
+    if direction == "twist":
+        return link.polar_inertia_per_length * link.length * shape.gram()[number, second]
+    if direction == across:
+        return link.mass * shape.gram()[number, second]
+    return link.mass * beam.overlap(shape, other)[number, second]

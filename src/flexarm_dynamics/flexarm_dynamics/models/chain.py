@@ -1,0 +1,493 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Arms of any number of links, rigid or flexible: the general model, evaluated by `kernels.chain`.
+
+Every link is a uniform beam along its frame's x axis, which bends (Euler-Bernoulli, no rotary inertia of the
+sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm file:
+:math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. The mass matrix depends on the deflections; nothing of the
+Lagrangian is left out at the arm's `level`:
+
+- first order: displacements linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
+- `foreshortening`: the axis keeps its length to second order, and with that stiffens when it spins;
+- `finite_slope`: the axis keeps its length exactly, its curvature is y''/sqrt(1 - y'^2), the tip turns by
+  arcsin y'.
+
+The hub's inertia turns with its link; a rotor behind a gear of ratio N spins at ``a . w_carrier + N qd``; the
+motor's mass sits at the joint and hangs on the previous link. The paper's control model (assumptions a) and
+b): no deflections in the mass matrix, no products of deflections) is what `Chain.terms` gives without
+deflections.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..kernels import chain as plain
+from ..kernels import generated, integrators, load
+from .assembly import (
+    assemble,
+    bishop_integrals,
+    cumulative,
+    modes_of,
+    outboard,
+    packed,
+    roomy,
+    shapes_of,
+    work_space,
+)
+from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation, scaled_payload
+
+CHAIN_SOURCES = (load.source(plain), load.source(integrators))
+
+#: Short enough to be written out in the integrators' loops.
+INLINE = ("slope", "net_torque", "low_storage")
+
+#: Imaginary step of the complex-step derivatives: no difference is taken, so that it costs no digits.
+STEP = 1e-30
+
+
+class Chain(ArmModel):
+    """A serial chain of flexible links (module docstring).
+
+    Parameters
+    ----------
+    arm : Arm
+    compiled : bool
+        False: evaluate the kernels as plain Python, for debugging; some hundred times slower.
+    shapes : mapping, optional
+        (link, direction) to `beam.ModeShapes`, where they are not to be those of this arm's own loads.
+    """
+
+    def __init__(self, arm, compiled=True, shapes=None):
+        super().__init__(arm)
+        self._compiled = compiled
+        loads = outboard(arm)
+        if shapes is None:
+            shapes = {
+                (link.name, direction): shapes_of(link, direction, flexibility, body)
+                for link, body in zip(arm.links, loads, strict=True)
+                for direction, flexibility in link.flexible.items()
+            }
+        self._shapes = dict(shapes)
+        self.data = assemble(arm, self._shapes, loads)
+        self._check_inertia()
+
+    @cached_property
+    def kernel(self):
+        """The kernels: compiled on first use, or plain."""
+        return load.joined("chain", CHAIN_SOURCES, self._compiled)
+
+    @cached_property
+    def complex_kernel(self):
+        """The same for complex numbers: a module of its own, so that both can be compiled at once."""
+        return load.joined("chain_complex", CHAIN_SOURCES, self._compiled)
+
+    @cached_property
+    def _room(self):
+        return roomy(self.data)
+
+    def _packed(self, data):
+        return packed(data, plain.DATA, self._room) if self._compiled else (data,)
+
+    def _new_work(self, dtype=float):
+        if not self._compiled:
+            return (work_space(self.data, dtype),)
+        return packed(work_space(self.data, dtype, self._room), plain.WORK, self._room)
+
+    @cached_property
+    def _data(self):
+        return self._packed(self.data)
+
+    @cached_property
+    def _work(self):
+        return self._new_work()
+
+    @cached_property
+    def _complex_work(self):
+        return self._new_work(complex)
+
+    def _check_inertia(self):
+        """Refuse an arm with a motion that moves no mass: a roll joint on a line of mass, say."""
+        n = self.n_joints
+        for q in (np.zeros(n), 0.7 + np.arange(n)):
+            M = self.mass_matrix(q)
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(M), 1e-300))
+            values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
+            weightless = np.flatnonzero(np.diag(M)[:n] <= 1e-14 * np.diag(M)[:n].max())
+            if weightless.size or values[0] <= 1e-13:
+                worst = np.abs(vectors[:, 0])
+                i = int(weightless[0] if weightless.size else np.argmax(worst[:n]))
+                raise ModelError(
+                    f"joints[{i}]: {self.joint_names[i]} can turn without moving any mass; give it a hub_inertia,"
+                    " or its link a polar_inertia_per_length"
+                )
+
+    def mode_shapes(self, link, direction):
+        try:
+            return self._shapes[link, direction]
+        except KeyError:
+            raise ModelError(f"{link} has no modes in direction {direction}") from None
+
+    def with_payload(self, scale):
+        return type(self)(scaled_payload(self.arm, scale), self._compiled, self._shapes)
+
+    def friction_table(self):
+        return np.array(
+            [
+                [j.friction.viscous, j.friction.coulomb, j.friction.smoothing]
+                for j in self.arm.joints
+            ]
+        )
+
+    # Equations of motion -----------------------------------------------------------------------
+
+    def mass_matrix(self, q, delta=None):
+        """M of (2), shape (n + m, n + m)."""
+        n, m = self.n_joints, self.n_modes
+        q, delta = self._joint(q, "q"), self._modal(delta, "delta")
+        M = np.zeros((n + m, n + m))
+        self.kernel.mass_matrix(
+            self._data, self._work, q, delta, np.zeros(n), np.zeros(m), np.zeros(3), M
+        )
+        return M
+
+    def forces(self, q, qd, delta=None, delta_d=None):
+        """What the joints and modes must give at zero acceleration, friction aside; shape (n + m,).
+
+        Coriolis, centrifugal, gravitational and elastic forces and modal damping: all of (2) but M.
+        """
+        n, m = self.n_joints, self.n_modes
+        out = np.zeros(n + m)
+        self.kernel.bias_forces(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            self._joint(qd, "qd"), self._modal(delta_d, "delta_d"), np.zeros(n), np.zeros(m), out,
+        )  # fmt: skip
+        return out
+
+    def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
+        """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
+
+        Of a free motion the modal part is zero.
+        """
+        accelerations = np.concatenate([self._joint(qdd, "qdd"), self._modal(delta_dd, "delta_dd")])
+        out = self.forces(q, qd, delta, delta_d) + self.mass_matrix(q, delta) @ accelerations
+        out[: self.n_joints] += self.friction(self._joint(qd, "qd"))
+        return out
+
+    def linearisation(self, q, qd, delta=None, delta_d=None):
+        r"""Derivatives of `forces` by delta and by its rates, to machine precision (complex step).
+
+        Returns
+        -------
+        K, C : ndarray, shape (n + m, m)
+            :math:`\partial/\partial\delta` and :math:`\partial/\partial\dot\delta`.
+        """
+        n, m = self.n_joints, self.n_modes
+        K, C = np.zeros((n + m, m)), np.zeros((n + m, m))
+        arrays = (
+            self._joint(q, "q"),
+            self._modal(delta, "delta"),
+            self._joint(qd, "qd"),
+            self._modal(delta_d, "delta_d"),
+        )
+        zeros = (np.zeros(n, complex), np.zeros(m, complex), np.zeros(n + m, complex))
+        self.complex_kernel.linearise(
+            self._data, self._complex_work, *(a.astype(complex) for a in arrays), STEP, *zeros, K, C
+        )
+        return K, C
+
+    def terms(self, q, qd, delta=None, delta_d=None):
+        """Terms of (2).
+
+        C and K are the derivatives of the forces by delta_d and delta at the straight arm (Jacobian of the
+        elastic, centrifugal, Coriolis and gravitational forces). Without deflections f is what is left at
+        the straight arm: the paper's control model, assumptions a) and b). With deflections f takes the
+        products of deflections as well, so that f + C delta_d + K delta is exact.
+        """
+        n = self.n_joints
+        q, qd = self._joint(q, "q"), self._joint(qd, "qd")
+        if delta is None:
+            K, C, f = self._straight_arm(q, qd)
+        else:
+            K, C = self.linearisation(q, qd)
+            delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
+            f = self.forces(q, qd, delta, delta_d) - K @ delta - C @ delta_d
+        f[:n] += self.friction(qd)
+        return Terms(
+            M=self.mass_matrix(q, delta), f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:]
+        )
+
+    @cached_property
+    def _straight(self):
+        """What `_straight_arm` works in: position, velocity, then zeros, and room for the forces; all complex."""
+        n, m = self.n_joints, self.n_modes
+        return tuple(np.zeros(size, complex) for size in (n, n, m, m, n, m, n + m))
+
+    def _straight_arm(self, q, qd):
+        """K, C and forces without deflections: control laws ask for them at every sample."""
+        n, m = self.n_joints, self.n_modes
+        K, C = np.zeros((n + m, m)), np.zeros((n + m, m))
+        if not m:
+            return K, C, self.forces(q, qd)
+        position, velocity, delta, delta_d, zero, modal_zero, out = self._straight
+        position[:], velocity[:] = q, qd
+        self.complex_kernel.linearise(
+            self._data, self._complex_work, position, delta, velocity, delta_d, STEP, zero, modal_zero, out,
+            K, C,
+        )  # fmt: skip
+        # The last derivative's real part: an imaginary step does not change it.
+        return K, C, out.real.copy()
+
+    def derivative(self, state, torque):
+        n, m = self.n_joints, self.n_modes
+        state = np.asarray(state, float)
+        if state.shape != (2 * (n + m),):
+            raise ShapeError(f"state has shape {state.shape}, wanted {(2 * (n + m),)}")
+        out = np.empty_like(state)
+        net = np.asarray(torque, float) - self.friction(state[n + m : 2 * n + m])
+        self.kernel.slope(state, net, (self._data, self._work, *self._none), out)
+        return out
+
+    @cached_property
+    def _none(self):
+        """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
+        n, K = self.data.links, self.data.s.shape[1]
+        return np.zeros(n), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
+
+    def stiffness_matrix(self):
+        m = self.n_modes
+        out = np.zeros((m, m))
+        for i in range(self.data.links):
+            a, k = self.data.first[i], self.data.count[i]
+            out[a : a + k, a : a + k] = self.data.stiffness[i, :k, :k]
+        return out
+
+    def kinetic_energy(self, q, qd, delta, delta_d):
+        v = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
+        return 0.5 * v @ self.mass_matrix(q, delta) @ v
+
+    def potential_energy(self, q, delta):
+        delta = self._modal(delta, "delta")
+        return float(
+            self.kernel.potential_energy(self._data, self._work, self._joint(q, "q"), delta,
+                                         np.zeros(self.n_joints), np.zeros(self.n_modes))
+        )  # fmt: skip
+
+    def momentum(self, q, qd, delta=None, delta_d=None):
+        """Linear momentum, and angular momentum about the base's origin, in the base frame.
+
+        Returns
+        -------
+        linear, angular : ndarray, shape (3,)
+            [kg m/s], [kg m^2/s]; rotors count with their spin about their joint's axis.
+        """
+        out = np.zeros((2, 3))
+        self.kernel.momentum(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            self._joint(qd, "qd"), self._modal(delta_d, "delta_d"), out,
+        )  # fmt: skip
+        return out[0], out[1]
+
+    # Kinematics --------------------------------------------------------------------------------
+
+    def frames(self, q, delta=None):
+        """Orientation and origin of each link's base frame, and last of the tip's, in the base frame.
+
+        Returns
+        -------
+        R : ndarray, shape (n + 1, 3, 3)
+        p : ndarray, shape (n + 1, 3)
+        """
+        n = self.n_joints
+        R, p = np.zeros((n + 1, 3, 3)), np.zeros((n + 1, 3))
+        self.kernel.frames(
+            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
+            np.zeros(n), np.zeros(self.n_modes), R, p,
+        )  # fmt: skip
+        return R, p
+
+    def point(self, link, position, q, delta=None, offset=(0.0, 0.0, 0.0)):
+        """Position of a point of a link in the base frame, shape (3,) [m].
+
+        Parameters
+        ----------
+        link : str
+        position : float
+            From the link's base along its axis [m].
+        q, delta : ndarray
+        offset : array_like, shape (3,)
+            From the axis, in the section's frame [m].
+        """
+        return self._point(link, position, q, delta, offset)[0]
+
+    def jacobian(self, link, position, q, delta=None, offset=(0.0, 0.0, 0.0)):
+        """Jacobian of a point's velocity and of its section's angular velocity, shape (6, n + m).
+
+        Rows: linear [m/s], angular [rad/s], in the base frame; columns: (qd, delta_d).
+
+        The point is at `position` [m] along the link's axis, and off it by `offset` [m] in the section's frame.
+        """
+        return self._point(link, position, q, delta, offset)[1]
+
+    def velocity(self, link, position, q, qd, delta=None, delta_d=None, offset=(0.0, 0.0, 0.0)):
+        """Linear and angular velocity of a point of a link in the base frame, shape (6,)."""
+        rates = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
+        return self.jacobian(link, position, q, delta, offset) @ rates
+
+    def _point(self, link, position, q, delta, offset):
+        index = [item.name for item in self.arm.links].index(link)
+        piece = self._cut(index, float(position))
+        n, m = self.n_joints, self.n_modes
+        jacobian, place = np.zeros((6, n + m)), np.zeros(3)
+        self.kernel.point(
+            self._packed(piece), self._work, index, self._joint(q, "q"), self._modal(delta, "delta"),
+            np.zeros(n), np.zeros(m), np.asarray(offset, float), place, jacobian,
+        )  # fmt: skip
+        return place, jacobian
+
+    def _cut(self, index, position):
+        """The data with link `index` ending at `position`, for the kinematics of that section."""
+        link = self.arm.links[index]
+        if not 0.0 <= position <= link.length * (1.0 + 1e-12):
+            raise ModelError(f"{link.name}: {position} m is not on a link of {link.length} m")
+        d = self.data
+        xi = position / link.length
+        tip, slope, length = d.tip.copy(), d.slope.copy(), d.length.copy()
+        bishop, cumulate = d.bishop.copy(), d.cumulate.copy()
+        length[index] = position
+        for j, (shapes, number, direction) in enumerate(modes_of(link, self._shapes)):
+            tip[index, j] = 0.0 if direction == "twist" else shapes(xi)[number]
+            slope[index, j] = shapes(xi, 0 if direction == "twist" else 1)[number] / (
+                1.0 if direction == "twist" else link.length
+            )
+        if d.level != plain.FIRST_ORDER:
+            points = d.node_x[index] / link.length
+            cumulate[index, -1] = link.length * cumulative(points, np.array([xi]))[0]
+            bishop[index] = bishop_integrals(d, index, cumulate[index, -1])
+        return d._replace(
+            links=index + 1, tip=tip, slope=slope, length=length, bishop=bishop,
+            cumulate=cumulate,
+        )  # fmt: skip
+
+    def tip_position(self, q, delta):
+        return self.frames(q, delta)[1][-1]
+
+    def tip_velocity(self, q, qd, delta, delta_d):
+        link = self.arm.links[-1]
+        return self.velocity(link.name, link.length, q, qd, delta, delta_d)[:3]
+
+    def tip_deflection(self, delta, link=None):
+        """Deflection of a link's tip along y and z of its base frame (last link if not named), (2,) [m]."""
+        delta = self._modal(delta, "delta")
+        names = [item.name for item in self.arm.links]
+        i = len(names) - 1 if link is None else names.index(link)
+        d = self.data
+        out = np.zeros(2)
+        for j in range(d.count[i]):
+            if d.direction[i, j] != plain.TWIST:
+                out[d.direction[i, j] - 1] += d.tip[i, j] * delta[d.first[i] + j]
+        return out
+
+    def link_ends(self, q, delta=None):
+        """Positions of all links' tips in the base frame, shape (n, 3) [m]."""
+        R, p = self.frames(q, delta)
+        ends = p[1:].copy()
+        for i in range(self.n_joints - 1):
+            # The next joint sits off the tip by its origin, in the tip's frame: undo that joint's turn.
+            joint = self.arm.joints[i + 1]
+            turn = rotation(joint.origin_rpy) @ about_axis(joint.axis, q[i + 1])
+            ends[i] -= R[i + 1] @ turn.T @ np.asarray(joint.origin_xyz)
+        return ends
+
+    @cached_property
+    def planar_axis(self):
+        """Axis of an arm whose joints all turn about parallel axes, in the base frame; None for others."""
+        R, _ = self.frames(np.zeros(self.n_joints))
+        axes = np.einsum("ijk,ik->ij", R[:-1], self.data.axis)
+        return axes[0] if np.allclose(np.cross(axes, axes[0]), 0.0, atol=1e-9) else None
+
+    def base_angles(self, q, delta=None):
+        """Absolute rotation of each link's base about its joint's axis, of a planar arm, shape (n,) [rad].
+
+        From the base frame's orientation, fixed turns of the joints' origins left out; counted on beyond a
+        turn. For a straight planar arm the sum of the joint angles.
+        """
+        q = self._joint(q, "q")
+        R, _ = self.frames(q, delta)
+        rest, _ = self.frames(np.zeros(self.n_joints))
+        axis = self.planar_axis
+        signs = np.sign(np.einsum("ijk,ik->ij", rest[:-1], self.data.axis) @ axis)
+        about = np.cumsum(signs * q)
+        angles = np.empty(self.n_joints)
+        for i in range(self.n_joints):
+            turn = R[i] @ rest[i].T
+            sine = 0.5 * axis @ (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])
+            cosine = 0.5 * (np.trace(turn) - 1.0)
+            error = np.arctan2(sine, cosine) - about[i]
+            angles[i] = about[i] + (error + np.pi) % (2.0 * np.pi) - np.pi
+        return angles * signs
+
+    # Integration -------------------------------------------------------------------------------
+
+    @cached_property
+    def straight_line(self):
+        """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
+        if self.data.level != plain.FIRST_ORDER or not self._compiled:
+            return None
+        sources, constants, operations = generated.right_hand_side(
+            self.data, work_space(self.data, object)
+        )
+        if operations > generated.MOST_OPERATIONS:
+            return None
+        return load.joined("generated", sources, inline=INLINE), constants
+
+    def stepper(self, method, straight_line=True):
+        """As `ArmModel.stepper`; ``straight_line=False`` asks for the recursion in loops."""
+        if method is not None and straight_line and self.straight_line is not None:
+            module, constants = self.straight_line
+            return explicit_stepper(module, method, constants, self)
+        return self._loops(method)
+
+    def lockable_stepper(self, method):
+        return self._loops(method, lockable=True)
+
+    def _loops(self, method, lockable=False):
+        """A stepper that runs the recursion in loops."""
+        none = tuple(np.zeros_like(part) for part in self._none)
+        driven, n, size = none[2], self.n_joints, 2 * (self.n_joints + self.n_modes)
+        stages = np.zeros((4, size))  # of the implicit method
+
+        def lock(mask):
+            driven[:] = mask  # with the acceleration zero
+            stages[:, size // 2 : size // 2 + n] = 0.0
+
+        lock = lock if lockable else None
+        data = (self._data, self._new_work(), *none)
+        if method is not None:
+            return explicit_stepper(self.kernel, method, data, self, lock)
+        extra = (np.zeros_like(none[0]), np.zeros_like(none[1]))
+        arguments = (stages, np.zeros(n), extra)
+        step, trajectory = self.kernel.implicit_step, self.kernel.implicit_trajectory
+        return Stepper(self, step, trajectory, arguments, data, lock)
+
+    def driven_stepper(self, method):
+        """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion."""
+        none = [np.zeros_like(part) for part in self._none]
+        none[2][:] = 1
+        data = (self._data, self._new_work(), *none)
+        stepper = explicit_stepper(self.kernel, method, data, self)
+        # Friction is part of the torque that it takes, not of the motion.
+        stepper.friction[:, :2] = 0.0
+        return stepper
+
+    def _joint(self, value, name):
+        value = np.ascontiguousarray(value, float)
+        if value.shape != (self.n_joints,):
+            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_joints,)}")
+        return value
+
+    def _modal(self, value, name):
+        value = np.zeros(self.n_modes) if value is None else np.ascontiguousarray(value, float)
+        if value.shape != (self.n_modes,):
+            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_modes,)}")
+        return value

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Inverse kinematics: joint angles that put the tip at a point, of the straight or of the statically bent arm.
+
+The tip of an arm at rest is :math:`p(q, \delta_s(q))`, with :math:`\delta_s` the deflections under gravity
+(`ArmModel.static_deflection`), so that links that hang down are counted with. Newton's method with the least
+step that reaches the point, damped as Levenberg and Marquardt have it,
+
+.. math:: \Delta q = J^T (J J^T + \lambda I)^{-1} (p_{wanted} - p), \qquad
+    J = \frac{\partial p}{\partial q} - \frac{\partial p}{\partial\delta}
+    \left(\frac{\partial F_2}{\partial\delta}\right)^{-1} \frac{\partial F_2}{\partial q},
+
+:math:`F_2` the forces on the modes at rest. The least step keeps an arm with more joints than it needs near where
+it starts. A joint at a limit of the arm file that would be left is held there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from .chain import Chain
+
+#: A tip nearer than this has arrived [m].
+TOLERANCE = 1e-10
+#: No joint turns farther in one step of the search [rad].
+LONGEST_STEP = 0.5
+_STEPS = 100
+_DIFFERENCE = 1e-6
+#: How far from the start further searches begin [rad]: out of singular configurations, and around limits.
+_SPREADS = (0.05, 0.3, 1.0, 2.0, 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    q : (n,) array
+        Joint angles [rad].
+    tip : (3,) array
+        The tip there [m].
+    distance : float
+        From the point that was asked for [m].
+    """
+
+    q: np.ndarray
+    tip: np.ndarray
+    distance: float
+
+
+class TipKinematics:
+    """Position of an arm's tip at rest as a function of its joints.
+
+    Parameters
+    ----------
+    model : ArmModel
+    bent : bool
+        Under its own weight, or straight as if it were rigid.
+    """
+
+    def __init__(self, model, bent=True):
+        self.model = model
+        self.bent = bool(bent and model.n_modes and any(model.arm.gravity))
+        limits = [joint.limits.position for joint in model.arm.joints]
+        self.low, self.high = np.array(limits, float).T
+
+    def deflection(self, q):
+        """Deflections at rest, (m,)."""
+        return self.model.static_deflection(q) if self.bent else np.zeros(self.model.n_modes)
+
+    def tip(self, q, delta=None):
+        """Position of the tip, (3,) [m]."""
+        return self.model.tip_position(q, self.deflection(q) if delta is None else delta)
+
+    def jacobian(self, q, delta=None):
+        """Derivative of `tip` by the joints, (3, n) [m/rad]; good to some nine digits."""
+        delta = self.deflection(q) if delta is None else delta
+        J = _differences(lambda x: self.model.tip_position(x, delta), q)
+        if not self.bent:
+            return J
+        give = np.linalg.solve(
+            _differences(lambda x: self._modal_forces(q, x), delta),
+            _differences(lambda x: self._modal_forces(x, delta), q),
+        )
+        return J - _differences(lambda x: self.model.tip_position(q, x), delta) @ give
+
+    def _modal_forces(self, q, delta):
+        """Forces on the modes at rest, (m,): zero at the deflections of `deflection`."""
+        n, rest = self.model.n_joints, np.zeros(self.model.n_joints)
+        if isinstance(self.model, Chain):  # without the derivatives that its terms come with
+            return self.model.forces(q, rest, delta)[n:]
+        terms = self.model.terms(q, rest, delta, np.zeros(self.model.n_modes))
+        return terms.f2 + terms.K2 @ delta
+
+    def search(self, target, start) -> Solution:
+        """Go from `start` as near to the target as the way leads; see `solve`."""
+        q, damping = np.clip(start, self.low, self.high), 1e-3
+        tip = self.tip(q)
+        error = target - tip
+        for _ in range(_STEPS):
+            if np.linalg.norm(error) <= TOLERANCE:
+                break
+            J = self.jacobian(q)
+            push = J.T @ error
+            held = ((q <= self.low) & (push < 0.0)) | ((q >= self.high) & (push > 0.0))
+            J = np.where(held, 0.0, J)
+            size = np.trace(J @ J.T)
+            if size == 0.0:
+                break
+            step = J.T @ np.linalg.solve(J @ J.T + damping * size * np.eye(3), error)
+            step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300))
+            there = np.clip(q + step, self.low, self.high)
+            new = self.tip(there)
+            if np.linalg.norm(target - new) < np.linalg.norm(error):
+                gain = np.linalg.norm(error) - np.linalg.norm(target - new)
+                q, tip, error, damping = there, new, target - new, max(0.03 * damping, 1e-13)
+                if np.linalg.norm(error) > TOLERANCE and gain < 1e-8 * np.linalg.norm(error):
+                    break  # as near as it gets
+            elif damping > 1e6:
+                break
+            else:
+                damping *= 10.0
+        return Solution(q, tip, float(np.linalg.norm(error)))
+
+
+def _differences(function, x):
+    """Derivative of a function by central differences, (k, len(x))."""
+    out = []
+    for i in range(x.size):
+        h = np.zeros(x.size)
+        h[i] = _DIFFERENCE
+        out.append((function(x + h) - function(x - h)) / (2.0 * _DIFFERENCE))
+    return np.array(out).T
+
+
+def solve(model, target, start=None, bent=True) -> Solution:
+    """Joint angles that put the tip of the arm at rest at a point.
+
+    Parameters
+    ----------
+    model : ArmModel
+        Of any kind that knows its tip's position.
+    target : (3,) array_like
+        In the base frame [m].
+    start : (n,) array_like, optional
+        Where the search begins; solutions near it are found first. Zero if not given [rad].
+    bent : bool
+        The arm bent by its weight, or straight.
+
+    Returns
+    -------
+    Solution
+        Within `TOLERANCE` of the target, and within the joints' limits.
+
+    Raises
+    ------
+    ShapeError
+        If `target` or `start` has another shape.
+    ModelError
+        If the point is not finite or no configuration was found that reaches it; names the distance.
+    """
+    target, start = checked(model, target, start)
+    kinematics = TipKinematics(model, bent)
+    best = kinematics.search(target, start)
+    random = np.random.default_rng(0)
+    for spread in _SPREADS:
+        if best.distance <= TOLERANCE:
+            return best
+        near = start + spread * random.uniform(-1.0, 1.0, start.size)
+        best = min(best, kinematics.search(target, near), key=lambda s: s.distance)
+    if best.distance <= TOLERANCE:
+        return best
+    raise ModelError(f"{model.arm.name}: the tip can't be at {show(target)} m: {nearest(best)}")
+
+
+def checked(model, target, start):
+    """`target` and `start` as arrays of the right shapes."""
+    target = np.array(target, float)
+    if target.shape != (3,):
+        raise ShapeError(f"the tip's position has shape {target.shape}, wanted (3,)")
+    if not np.isfinite(target).all():
+        raise ModelError(f"the tip's position is {show(target)} m: it must be finite")
+    start = np.zeros(model.n_joints) if start is None else np.array(start, float)
+    if start.shape != (model.n_joints,):
+        raise ShapeError(f"start has shape {start.shape}, wanted {(model.n_joints,)}")
+    return target, start
+
+
+def nearest(solution):
+    """Say how near a search came."""
+    return (
+        f"the nearest found is {show(solution.tip)} m, {solution.distance:.6g} m away, at q ="
+        f" {show(solution.q)} rad"
+    )
+
+
+def show(vector):
+    """A short list of numbers."""
+    return "[" + ", ".join(f"{v:.6g}" for v in np.round(vector, 9) + 0.0) + "]"

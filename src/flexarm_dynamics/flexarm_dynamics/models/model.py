@@ -1,0 +1,456 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""What every model of an arm offers, and the terms of the equations of motion (2).
+
+.. math::
+    M(q,\delta)\begin{bmatrix}\ddot q\\ \ddot\delta\end{bmatrix}
+    + \begin{bmatrix}f_1\\f_2\end{bmatrix}
+    + \begin{bmatrix}C_1\dot\delta\\C_2\dot\delta\end{bmatrix}
+    + \begin{bmatrix}K_1\delta\\K_2\delta\end{bmatrix}
+    = \begin{bmatrix}u\\0\end{bmatrix} \qquad (2)
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import eigh
+
+from .. import registry
+from ..errors import ModelError, ShapeError
+from ..kernels import chain as kernel
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Terms of (2) at one state, for n joints and m modal coordinates.
+
+    Attributes
+    ----------
+    M : ndarray, shape (n + m, n + m)
+        Mass matrix.
+    f1, f2 : ndarray, shape (n,), (m,)
+        Coriolis, centrifugal, gravitational and friction terms.
+    C1, C2 : ndarray, shape (n, m), (m, m)
+        What multiplies the deflection rates; structural damping is in C2.
+    K1, K2 : ndarray, shape (n, m), (m, m)
+        What multiplies the deflections; K2 holds the elastic and the centrifugal stiffness.
+    """
+
+    M: np.ndarray
+    f1: np.ndarray
+    f2: np.ndarray
+    C1: np.ndarray
+    C2: np.ndarray
+    K1: np.ndarray
+    K2: np.ndarray
+
+    @property
+    def n(self):
+        """Number of joints."""
+        return self.f1.size
+
+    @property
+    def H(self):
+        """Inverse of the mass matrix, (3)."""
+        return np.linalg.inv(self.M)
+
+    def partition(self):
+        """H11, H12, H21, H22 of (3)."""
+        n, H = self.n, self.H
+        return H[:n, :n], H[:n, n:], H[n:, :n], H[n:, n:]
+
+
+class ArmModel(ABC):
+    """A model of an arm: equations of motion, kinematics of the tip, energy.
+
+    The vectors are q (n,) [rad] and delta (m,) [m for bending, rad for twist]; the state of the integrators
+    is (q, delta, qd, delta_d).
+    """
+
+    def __init__(self, arm):
+        self.arm = arm
+        self.joint_names = arm.joint_names
+        self.mode_names = arm.mode_names
+
+    @property
+    def n_joints(self):
+        """Number of joints n."""
+        return len(self.joint_names)
+
+    @property
+    def n_modes(self):
+        """Number of modal coordinates m."""
+        return len(self.mode_names)
+
+    @abstractmethod
+    def terms(self, q, qd, delta=None, delta_d=None):
+        """Terms of (2).
+
+        Without deflections, the paper's control model: a) H does not depend on the deflections, b) no
+        products of deflections, so that C1 and K1 depend on the joints alone.
+
+        Returns
+        -------
+        Terms
+        """
+
+    @abstractmethod
+    def kinetic_energy(self, q, qd, delta, delta_d):
+        """Kinetic energy [J]."""
+
+    @abstractmethod
+    def potential_energy(self, q, delta):
+        """Elastic and gravitational energy [J]."""
+
+    @abstractmethod
+    def tip_position(self, q, delta):
+        """Position of the last link's tip in the base frame, shape (3,) [m]."""
+
+    @abstractmethod
+    def tip_velocity(self, q, qd, delta, delta_d):
+        """Velocity of the last link's tip in the base frame, shape (3,) [m/s]."""
+
+    @abstractmethod
+    def tip_deflection(self, delta, link=None):
+        """Deflection of a link's tip (the last one's) in its base frame, shape (2,): along y and z [m]."""
+
+    @abstractmethod
+    def mode_shapes(self, link, direction):
+        """`beam.ModeShapes` of a link in a direction."""
+
+    @abstractmethod
+    def friction_table(self):
+        """Viscous, Coulomb and smoothing speed of each joint, shape (n, 3)."""
+
+    @abstractmethod
+    def stepper(self, method):
+        """Compiled fixed-step integrator.
+
+        Parameters
+        ----------
+        method : Tableau or None
+            An explicit Runge-Kutta method; None: the implicit one, which damps stiff modes.
+
+        Returns
+        -------
+        Stepper
+        """
+
+    def lockable_stepper(self, method):
+        """As `stepper`, with `Stepper.lock`: for brakes.
+
+        `method` as there.
+
+        Raises
+        ------
+        ModelError
+            Where the model has none.
+        """
+        raise ModelError(
+            f"model {self.arm.model} can't lock joints: take safe_action damp or zero, or model chain"
+        )
+
+    def with_payload(self, scale):
+        """The same arm in the same mode shapes, with its payload's mass and inertia scaled.
+
+        Parameters
+        ----------
+        scale : float
+            0: no payload; its centre of mass stays where it is.
+
+        Returns
+        -------
+        ArmModel
+            Of the same class.
+
+        Raises
+        ------
+        ModelError
+            Where the model takes no other payload.
+        """
+        raise ModelError(f"model {self.arm.model} takes no other payload than its arm file's")
+
+    def friction(self, qd):
+        """Friction torque of the joints, shape (n,) [N m]: ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
+        viscous, coulomb, smoothing = self.friction_table().T
+        return viscous * qd + coulomb * np.tanh(qd / smoothing)
+
+    def derivative(self, state, torque):
+        """Time derivative of the state (q, delta, qd, delta_d): the form (6), ready for scipy.
+
+        Parameters
+        ----------
+        state : ndarray, shape (2 (n + m),)
+        torque : ndarray, shape (n,)
+
+        Returns
+        -------
+        ndarray, shape (2 (n + m),)
+
+        Raises
+        ------
+        ShapeError
+            For a state of another length.
+        """
+        n, m = self.n_joints, self.n_modes
+        if np.shape(state) != (2 * (n + m),):
+            raise ShapeError(f"state has shape {np.shape(state)}, wanted {(2 * (n + m),)}")
+        q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
+        t = self.terms(q, qd, delta, delta_d)
+        force = np.concatenate(
+            [
+                np.asarray(torque, float) - t.f1 - t.C1 @ delta_d - t.K1 @ delta,
+                -t.f2 - t.C2 @ delta_d - t.K2 @ delta,
+            ]
+        )
+        return np.concatenate([qd, delta_d, np.linalg.solve(t.M, force)])
+
+    def energy(self, state):
+        """Total energy of a state [J]."""
+        n, m = self.n_joints, self.n_modes
+        q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
+        return self.kinetic_energy(q, qd, delta, delta_d) + self.potential_energy(q, delta)
+
+    def stiffness_matrix(self):
+        """Elastic stiffness of the modes for small deflections, shape (m, m)."""
+        n = self.n_joints
+        return self.terms(np.zeros(n), np.zeros(n)).K2
+
+    def normal_modes(self, q=None, locked=False):
+        """Undamped natural modes of the straight arm at rest; gravity is left out.
+
+        Parameters
+        ----------
+        q : ndarray, shape (n,), optional
+            Where; zero if not given.
+        locked : bool
+            Joints locked, or free (rigid-body motions, of frequency zero, are left out).
+
+        Returns
+        -------
+        omega : ndarray, shape (m,)
+            Ascending [rad/s].
+        shapes : ndarray, shape (n + m, m)
+            (q, delta) of each, of unit modal mass.
+        """
+        n, m = self.n_joints, self.n_modes
+        q = np.zeros(n) if q is None else np.asarray(q, float)
+        M, K = self.terms(q, np.zeros(n)).M, self.stiffness_matrix()
+        give = np.zeros((n, m))  # how the joints follow the modes
+        if not locked:
+            give = -np.linalg.solve(M[:n, :n], M[:n, n:])
+        # Joints free: what is left of the modal inertia once the joints give way.
+        mass = M[n:, n:] + M[n:, :n] @ give
+        squares, vectors = eigh(K, 0.5 * (mass + mass.T)) if m else (np.zeros(0), np.zeros((0, 0)))
+        return np.sqrt(np.maximum(squares, 0.0)), np.vstack([give @ vectors, vectors])
+
+    def frequencies(self, q=None, locked=False):
+        """Natural frequencies of `normal_modes` [rad/s]."""
+        return self.normal_modes(q, locked)[0]
+
+    def static_deflection(self, q):
+        """Deflections at which the arm rests under gravity with its joints held, shape (m,).
+
+        Raises
+        ------
+        ModelError
+            When there is none near the straight arm: it buckles or folds under its own weight.
+        """
+        n, m = self.n_joints, self.n_modes
+        delta, rest = np.zeros(m), np.zeros(n)
+        if not m or not any(self.arm.gravity):
+            return delta
+        for _ in range(50):
+            t = self.terms(q, rest, delta, np.zeros(m))
+            change = np.linalg.solve(t.K2, -(t.f2 + t.K2 @ delta))
+            delta = delta + change
+            if np.abs(change).max() <= 1e-12 * max(np.abs(delta).max(), 1e-12):
+                return delta
+        raise ModelError(
+            f"{self.arm.name}: no rest under gravity near the straight arm at q = {list(q)}"
+        )
+
+
+@dataclass(frozen=True)
+class Tableau:
+    """An explicit Runge-Kutta method: Butcher coefficients (p, p), (p,) and (p,)."""
+
+    A: np.ndarray
+    weights: np.ndarray
+    nodes: np.ndarray
+
+
+class Stepper:
+    """A compiled fixed-step integrator of one arm; see `ArmModel.stepper`.
+
+    It releases the interpreter's lock while it runs; each thread wants a stepper of its own.
+
+    Parameters
+    ----------
+    model : ArmModel
+    step, trajectory : callable
+        Compiled functions of `kernels`.
+    arguments : tuple
+        What they take after the number of substeps, but for friction and data.
+    data : object
+        What the right-hand side needs.
+    lock : callable, optional
+        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call; they have to be
+        at rest, and their torque zero.
+
+    Attributes
+    ----------
+    friction : ndarray, shape (n, 3)
+        Taken where a call names none.
+    """
+
+    def __init__(self, model, step, trajectory, arguments, data, lock=None):
+        self._step, self._trajectory = step, trajectory
+        self._arguments, self._data = arguments, data
+        self._none = np.zeros(model.n_joints)
+        self.lock = lock
+        self.friction = model.friction_table()
+
+    def __call__(self, state, torque, step, substeps=1, friction=None, change=None):
+        """Advance a state in place.
+
+        Parameters
+        ----------
+        state : ndarray, shape (2 (n + m),)
+            (q, delta, qd, delta_d); overwritten.
+        torque : ndarray, shape (n,)
+            At the start [N m].
+        step : float
+            Length of a substep [s].
+        substeps : int
+            How many.
+        friction : ndarray, shape (n, 3), optional
+            As `ArmModel.friction_table`, which is the default.
+        change : ndarray, shape (n,), optional
+            What the torque changes by until the end, linearly; nothing if not given [N m].
+        """
+        self._step(
+            state,
+            torque,
+            self._none if change is None else change,
+            step,
+            substeps,
+            *self._arguments,
+            self.friction if friction is None else friction,
+            self._data,
+        )
+
+    def trajectory(self, states, starts, ends, step, substeps=1, friction=None):
+        """Fill ``states[1:]`` from ``states[0]`` in one compiled loop.
+
+        Parameters
+        ----------
+        states : ndarray, shape (s + 1, 2 (n + m))
+            Row k + 1 is `substeps` steps after row k.
+        starts, ends : ndarray, shape (s, n)
+            Torque at both ends of each interval; linear between [N m].
+        step, substeps, friction
+            As for a call.
+        """
+        self._trajectory(
+            states,
+            starts,
+            ends,
+            step,
+            substeps,
+            *self._arguments,
+            self.friction if friction is None else friction,
+            self._data,
+        )
+
+
+def explicit_stepper(module, method, data, model, lock=None):
+    """`ArmModel.stepper` of a compiled module that has ``slope`` and the integrators."""
+    n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
+    net, coefficients = np.zeros(n), (method.weights, method.nodes)
+    if not np.tril(method.A, -2).any():
+        below = np.concatenate([[0.0], np.diag(method.A, -1)])
+        work = tuple(np.zeros(size) for _ in range(3))
+        arguments = (below, *coefficients, work, net)
+        functions = (module.low_storage, module.low_storage_trajectory)
+        return Stepper(model, *functions, arguments, data, lock)
+    arguments = (method.A, *coefficients, np.zeros((method.weights.size + 1, size)), net)
+    functions = (module.runge_kutta, module.runge_kutta_trajectory)
+    return Stepper(model, *functions, arguments, data, lock)
+
+
+def scaled_payload(arm, scale):
+    """The arm with its payload's mass and inertia scaled, its centre of mass where it is."""
+    load = arm.payload
+    inertia = tuple(tuple(scale * x for x in row) for row in load.inertia)
+    return replace(arm, payload=replace(load, mass=scale * load.mass, inertia=inertia))
+
+
+def build(arm):
+    """The model that an arm file names, found through the entry points `flexarm.models`.
+
+    Parameters
+    ----------
+    arm : Arm
+
+    Returns
+    -------
+    ArmModel
+
+    Raises
+    ------
+    UnknownComponentError
+        When no installed package has a model of that name.
+    ModelError
+        When that model can't represent this arm.
+    """
+    return registry.find("flexarm.models", arm.model)(arm)
+
+
+def rotation(rpy):
+    """Fixed-axis roll, pitch, yaw, as in URDF; shape (3, 3)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def about_axis(axis, angle):
+    """Rotation about a unit vector, shape (3, 3)."""
+    out = np.zeros((3, 3))
+    kernel.about_axis(np.asarray(axis, float), angle, out)
+    return out
+
+
+def damping_matrix(M22, K, ratios):
+    r"""Modal damping :math:`D = M_{22}\Psi\,\mathrm{diag}(2\zeta_i\omega_i)\,\Psi^T M_{22}` of the clamped modes.
+
+    Parameters
+    ----------
+    M22, K : ndarray, shape (m, m)
+        Modal mass and stiffness.
+    ratios : sequence of float
+        Damping ratios by ascending frequency; shorter than m: the last one repeats; empty: none.
+
+    Returns
+    -------
+    ndarray, shape (m, m)
+
+    Raises
+    ------
+    ModelError
+        Where the stiffness is not positive definite.
+    """
+    m = K.shape[0]
+    if not len(ratios):
+        return np.zeros((m, m))
+    zeta = np.array([ratios[min(i, len(ratios) - 1)] for i in range(m)])
+    squares, psi = eigh(K, M22)
+    if squares.min() <= 0.0:
+        raise ModelError(f"stiffness is not positive definite (eigenvalue {squares.min():.3g})")
+    left = M22 @ psi
+    return left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From how far off the nonlinear loop brings the arm back to rest, with its torque limits, sensors and observer.
+
+The loop starts with a joint beside where it is to be held, or with the arm bent; the offset is scaled up until the
+arm does not come back, by bisection. The result is a few rays into the domain of attraction, not the domain.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.singular_perturbation import fast_subsystem
+
+from ..loop import scenario as scenarios
+
+#: Joint errors are looked at up to this [rad], deflections up to this share of the arm's length.
+LARGEST_TURN, LARGEST_BEND = 3.0, 0.3
+#: What the arm has to come back to: share of the farthest that it went, and no less than this [rad], [m].
+BACK, FLOOR = 0.1, 1e-4
+#: Over how long at the end that is judged [s].
+LATE = 0.25
+#: Time allowed: decay times of the slowest pole, within limits [s].
+DECAYS, SHORTEST, LONGEST = 8.0, 1.0, 8.0
+
+
+def directions(subject):
+    """Name, joint offset (n,) [rad] or deflection (m,) [m, rad], the largest scale and its unit, of each ray."""
+    model, n, m = subject.model, subject.model.n_joints, subject.model.n_modes
+    for i, name in enumerate(model.joint_names):
+        offset = np.zeros(n)
+        offset[i] = 1.0
+        yield name, offset, np.zeros(m), LARGEST_TURN, "rad"
+    shape = lowest_shape(subject)
+    if shape is not None:
+        reach = sum(link.length for link in subject.arm.links)
+        yield "lowest fast mode", np.zeros(n), shape, LARGEST_BEND * reach, "m"
+
+
+def lowest_shape(subject):
+    """Deflections of the lowest mode of the boundary layer, 1 m at the tip; None where the tip does not move."""
+    model, q = subject.model, subject.q
+    m = model.n_modes
+    if not m:
+        return None
+    A2, _ = fast_subsystem(model.terms(q, np.zeros(model.n_joints)))
+    values, vectors = np.linalg.eig(A2[m:, :m])
+    shape = np.real(vectors[:, np.argmin(np.abs(values))])
+    small = 1e-3
+    moved = model.tip_position(q, small * shape) - model.tip_position(q, np.zeros(m))
+    size = np.linalg.norm(moved) / (small * np.linalg.norm(shape))
+    return None if size < 1e-6 else shape * small / np.linalg.norm(moved)
+
+
+def comes_back(subject, joint, bend, watched):
+    """Whether the loop brings the arm back to the motion's end from an offset.
+
+    Parameters
+    ----------
+    subject : Subject
+    joint : ndarray, shape (n,)
+        [rad]
+    bend : ndarray, shape (m,)
+        About the static deflection [m, rad].
+    watched : float
+        [s]
+    """
+    q = subject.q
+    values = subject.scenario.controller | {"start_tolerance": 10.0}
+    hold = {"times": [0.0, 0.01], "positions": [q.tolist()] * 2}
+    scenario = replace(subject.scenario, controller=values, trajectory=hold)
+    try:
+        loop = scenarios.loop_of(scenario)
+        motion = scenarios.trajectory_of(hold, loop.model, q)
+        simulator = loop.simulator
+        simulator.reset(q + joint)
+        modes = [simulator.plant_model.mode_names.index(name) for name in loop.model.mode_names]
+        simulator.plant.delta[modes] += bend
+        simulator._measure()
+        record = loop.follow(motion, watched)
+    except FlexarmError:
+        return False
+    if loop.lost:
+        return False
+    rest = loop.model.static_deflection(q)
+    late = record.time > record.time[-1] - LATE
+    off = np.abs(record.plant_position - q).max(1)
+    bent = np.abs(record.plant_amplitude[:, modes] - rest).max(1, initial=0.0)
+    # Each by its own peak: what bends the arm a little may turn the joint by much on the way.
+    return all(bool(v[late].max() < max(BACK * v.max(), FLOOR)) for v in (off, bent))
+
+
+def study(subject, steps=5, progress=None):
+    """Scale along each ray up to which the arm comes back.
+
+    Parameters
+    ----------
+    subject : Subject
+    steps : int
+        Bisections; the largest offset is tried before.
+    progress : Progress, optional
+
+    Returns
+    -------
+    dict
+        ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
+        ``searched``, with which `scale` is equal where the arm came back even from there.
+    """
+    if subject.without_poles:
+        return {"reason": subject.without_poles, "rays": []}
+    decay = subject.decay()
+    if decay <= 0.0:
+        return {"reason": "the linear loop is not stable", "rays": []}
+    watched = float(np.clip(DECAYS / decay, SHORTEST, LONGEST))
+    rays, every = [], list(directions(subject))
+    for i, (name, joint, bend, largest, unit) in enumerate(every):
+        good, bad = 0.0, largest
+        if comes_back(subject, largest * joint, largest * bend, watched):
+            good = largest
+        else:
+            for _ in range(steps):
+                middle = 0.5 * (good + bad)
+                back = comes_back(subject, middle * joint, middle * bend, watched)
+                good, bad = (middle, bad) if back else (good, middle)
+        rays.append({"direction": name, "scale": good, "unit": unit, "searched": largest})
+        if progress is not None:
+            progress.fraction((i + 1) / len(every))
+    return {"reason": "", "watched_s": watched, "rays": rays}

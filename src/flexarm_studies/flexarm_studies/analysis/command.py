@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm analyze``: time scales, the bound on mu, margins, domain of attraction, Monte Carlo of a design."""
+
+import json
+import sys
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..loop import scenario as scenarios
+from ..progress import Progress
+from . import attraction, bound, margins, monte_carlo, report, scales
+from . import subject as subjects
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "What can be said of an arm and a controller before the arm moves; some of it by "
+        "short runs."
+    )
+    parser.epilog = (
+        "example: flexarm analyze R paper_composite --out results/analysis --monte-carlo 100"
+    )
+    add = parser.add_argument
+    add("arm", help="a shipped name or the path of an arm file")
+    add("controller", help="parameter file of the nodes: a shipped name or a path")
+    add(
+        "--trajectory",
+        default="paper",
+        metavar="FILE|SPEC",
+        help="the motion it is for, as `flexarm simulate` takes it (paper)",
+    )
+    add(
+        "--set",
+        nargs="+",
+        action="extend",
+        metavar="NAME=VALUE",
+        help="parameters beyond the file's: slow.kp=[4.0] fast.alpha=4.0",
+    )
+    add("--rate", type=float, help="samples per second [Hz] (as in the file, or 1000)")
+    add("--configurations", type=int, default=200, metavar="N", help="of the workspace (200)")
+    add("--quick", action="store_true", help="no nonlinear runs, a shorter search for the bound")
+    add("--monte-carlo", type=int, metavar="N", help="N runs of arms that are not quite as told")
+    add("--seed", type=int, default=0, help="of configurations and samples (0)")
+    add("--workers", type=int, metavar="N", help="processes of the Monte Carlo (one per core)")
+    add(
+        "--scheduler", metavar="ADDRESS", help="a Dask cluster for the Monte Carlo: tcp://host:8786"
+    )
+    add(
+        "--out",
+        metavar="DIR",
+        help="figures, analysis.json, and the Monte Carlo's results, resumed",
+    )
+    add("--json", action="store_true", help="the results as JSON")
+
+
+def analyze(options):
+    """Run the sub-command."""
+    if options.configurations < 1:
+        raise FlexarmError(f"--configurations {options.configurations}: 1 or more is wanted")
+    if options.seed < 0:
+        raise FlexarmError(f"--seed {options.seed}: 0 or more is wanted")
+    if options.monte_carlo is None and (options.workers or options.scheduler):
+        raise FlexarmError("--workers, --scheduler: only with --monte-carlo")
+    values = scenarios.parameters(options.controller, options.set or ())
+    scenario = scenarios.Scenario(
+        options.arm, values, trajectory=options.trajectory, rate=options.rate
+    )
+    found = study(scenario, options, Progress())
+    text = json.dumps(found, allow_nan=False)
+    if options.out:
+        from pathlib import Path
+
+        from . import figures
+
+        directory = Path(options.out)
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "analysis.json").write_text(text + "\n", encoding="utf-8")
+        figures.draw(found, directory)
+    print(text if options.json else "\n".join(report.lines(found)), file=sys.stdout)
+
+
+def study(scenario, options, progress):
+    """Everything that was asked for.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    options : namespace
+        ``quick``, ``configurations``, ``seed``, ``monte_carlo``, ``workers``, ``scheduler``, ``out``.
+    progress : Progress
+
+    Returns
+    -------
+    dict
+        Ready for JSON: ``scenario``, ``scales``, ``gain_sweep``, ``bound``, ``margins``, ``attraction`` (None if
+        quick), ``monte_carlo`` (None if not asked for).
+    """
+    total = 3 + (not options.quick) + (options.monte_carlo is not None)
+    progress.step("time scales and full-order poles", 1, total)
+    subject = subjects.of(scenario)
+    found = {"scenario": scenario.as_dict(), "rate_Hz": 1.0 / subject.period}
+    found["scales"] = s = scales.study(subject, options.configurations, options.seed)
+    progress.fraction(0.5)
+    found["gain_sweep"] = scales.gain_sweep(subject)
+    progress.step("bound on mu", 2, total)
+    if s["reason"]:
+        found["bound"] = {"bound": None, "reason": s["reason"]}
+    else:
+        mu = scales.at(subject, subject.q, 0.0 * subject.q, scales.slow_poles(subject))["mu"]
+        found["bound"] = bound.study(subject, mu, options.quick)
+    progress.step("margins", 3, total)
+    found["margins"] = margins.study(subject, not options.quick, progress=progress)
+    found["attraction"] = None
+    if not options.quick:
+        progress.step("domain of attraction", 4, total)
+        found["attraction"] = attraction.study(subject, progress=progress)
+    found["monte_carlo"] = None
+    if options.monte_carlo is not None:
+        progress.step(f"Monte Carlo, {options.monte_carlo} runs", total, total)
+        spec = monte_carlo.specification(scenario, options.seed)
+        results = monte_carlo.run(
+            spec,
+            options.monte_carlo,
+            options.out,
+            options.workers,
+            options.scheduler,
+            progress,
+        )
+        found["monte_carlo"] = monte_carlo.summary(results)
+    progress.done()
+    return found

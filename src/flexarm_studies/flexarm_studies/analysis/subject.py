@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is analysed: an arm, its design in one configuration, the motion it is for."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from flexarm_control.composite import full_order
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm, scaled
+
+from ..loop import scenario as scenarios
+
+#: A design is analysed whether it is stable or not: the check of its poles is put as far off as it goes [1/s].
+UNCHECKED = -1e3
+#: Configurations along the motion.
+ALONG = 21
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A design and what it is for.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Its design is not refused for its poles.
+    model : ArmModel
+    law : CompositeControl
+    period : float
+        [s]
+    times : ndarray, shape (k,)
+        Along the motion [s].
+    positions, velocities : ndarray, shape (k, n)
+        [rad], [rad/s]
+    """
+
+    scenario: scenarios.Scenario
+    model: object
+    law: object
+    period: float
+    times: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+
+    @property
+    def q(self):
+        """The motion's end, where the linear loop is taken, shape (n,) [rad]."""
+        return self.positions[-1]
+
+    @property
+    def arm(self):
+        """The arm file's content."""
+        return self.model.arm
+
+    @property
+    def without_poles(self):
+        """Why the linear loop says nothing of the design; empty if it does."""
+        if self.law.slow.drifts:
+            return "the slow law leaves the joints free"
+        return ""
+
+    def poles(self, plant=None, delay=0.0, period=None, gain=1.0):
+        """Poles of the sampled full-order loop as those of continuous time [1/s], slowest first.
+
+        Parameters
+        ----------
+        plant : Arm, optional
+            The arm that the design meets; its own if not given.
+        delay, period : float
+            [s]
+        gain : float
+            Of the torque on its way to the arm [-].
+        """
+        from flexarm_dynamics.models import model
+
+        met = None if plant is None else model.build(plant)
+        return full_order.poles(self.law, self.q, period or self.period, delay, met, gain)
+
+    def decay(self, **changed):
+        """How fast the slowest part of the loop dies out [1/s]; negative: it grows."""
+        return -float(self.poles(**changed)[0].real)
+
+
+def unchecked(scenario):
+    """The scenario with a design that is not refused for its poles."""
+    return replace(scenario, controller=scenario.controller | {"stability_margin": UNCHECKED})
+
+
+def of(scenario):
+    """The subject that a scenario describes.
+
+    Raises
+    ------
+    FlexarmError
+        For an arm, a parameter, a design or a trajectory that is impossible.
+    """
+    scenario = unchecked(scenario)
+    loop = scenarios.loop_of(scenario)
+    motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
+    times = 1e-9 * np.asarray(motion.times_ns, float)
+    velocities = np.zeros_like(motion.positions) if motion.velocities is None else motion.velocities
+    along = np.linspace(times[0], times[-1], ALONG)
+    at = lambda values: np.column_stack([np.interp(along, times, v) for v in np.transpose(values)])  # noqa: E731
+    return Subject(
+        scenario,
+        loop.model,
+        loop.controller.law,
+        1e-9 * loop.simulator.period_ns,
+        along,
+        at(motion.positions),
+        at(velocities),
+    )
+
+
+def redesigned(subject, **parameters):
+    """The composite control with other parameters, on the same arm (`slow.kp` is written `slow__kp`)."""
+    given = {k.replace("__", "."): v for k, v in parameters.items()}
+    controller = subject.scenario.controller | given | {"feedforward": "none"}
+    return scenarios.loop_of(replace(subject.scenario, controller=controller)).controller.law
+
+
+def slower_bending(scenario, factor):
+    r"""The same design for an arm whose bending is slower: mu times `factor`, told to arm and controller alike.
+
+    With EI and GJ by 1/factor^2 the fast time scale is `factor` times as long and everything else as it was. The
+    fast control is redesigned for the same loop in its own time: in (18) :math:`\delta/\mu^2`, :math:`\dot\delta/\mu`
+    and :math:`t/\mu` take the places of delta, its rate and t. Gains of other laws follow from the arm.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    factor : float
+        Above 0 [-].
+
+    Returns
+    -------
+    Scenario
+        Its `arm` is an `Arm`.
+    """
+    arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
+    kind = scenarios.type_of("fast", scenario.controller)
+    values = dict(scenario.controller)
+    declared = {p.name: p for p in scenarios._declared("fast", scenario.controller)}
+    modes = len(arm.mode_names)
+    if {"q", "alpha"} <= set(declared):
+        q = np.asarray(values.get("fast.q", declared["q"].default), float)
+        q = np.broadcast_to(q, 2 * modes).copy()
+        q[:modes] *= factor**-4
+        q[modes:] *= factor**-2
+        values["fast.q"] = q.tolist()
+        values["fast.alpha"] = float(values.get("fast.alpha", declared["alpha"].default)) / factor
+    if "observer_pole" in declared:
+        pole = values.get("fast.observer_pole", declared["observer_pole"].default)
+        values["fast.observer_pole"] = float(pole) / factor
+    values["fast.type"] = kind
+    return replace(scenario, arm=scaled(arm, stiffness=factor**-2), controller=values)
+
+
+def first_loss(stable, start, end, scan=12, steps=20):
+    """Where a loop that is stable at `start` first is not, on the way to `end`; bisection after a scan.
+
+    Parameters
+    ----------
+    stable : callable
+        Of the value; a bool.
+    start, end : float
+        Both above 0: the scan is geometric; otherwise even.
+    scan, steps : int
+        Intervals of the scan, and halvings of the one that holds the loss.
+
+    Returns
+    -------
+    float or None
+        The last value known as stable, None: stable all the way. `start` itself where it is not stable there.
+    """
+    grid = np.geomspace if min(start, end) > 0.0 else np.linspace
+    values = grid(start, end, scan + 1)
+    if not stable(float(values[0])):
+        return float(start)
+    for good, bad in pairwise(values):
+        if stable(float(bad)):
+            continue
+        for _ in range(steps):
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if stable(float(middle)) else (good, middle)
+        return float(good)
+    return None

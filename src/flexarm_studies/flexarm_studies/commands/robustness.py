@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""``flexarm robustness``: how many lost samples, and how much random delay, a loop bears. No ROS.
+
+A motion is carried out with samples lost, each on its own with a probability, and separately with every sample late
+by a time uniform from 0 to a largest delay (`network`): several seeds at each level, observer, controller, limits and
+the driver's timeout included. A run is stable when the loop kept the arm and, beside the same run with no loss and no
+delay,
+
+- no joint was ever farther from its reference than `TRACKING` times the farthest there, and `ALLOWED` beyond;
+- the bending, :math:`\sqrt{\delta^T K\delta}` with the links' stiffness K, was never more than `BENDING` times the
+  largest there;
+- over the last 0.5 s of the window after the motion the tip was never farther from where it belongs than there, and
+  `SETTLED` of the arm's reach beyond.
+
+Errors are against the reference at that time, not against the older one that a late sample is answered with.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..loop import scenario as scenarios
+from ..loop.metrics import tracking_metrics
+from ..progress import Progress
+
+#: Bounds of a stable run; see the module. `ALLOWED` in rad, `SETTLED` as a share of the reach.
+TRACKING, ALLOWED, BENDING, SETTLED = 2.0, 0.05, 1.5, 0.005
+#: What is swept: the field of `Scenario`, its name in words, a factor to the command's unit, and that unit.
+SWEPT = {
+    "loss": ("samples lost", 100.0, "%"),
+    "jitter": ("delay uniform from 0 to", 1e3, "ms"),
+}
+#: More levels than this are a mistake in a range.
+MOST_LEVELS = 200
+COLUMNS = (
+    "controller", "disturbance", "level", "unit", "stable", "of",
+    "joint error [deg]", "bending [-]", "tip at rest [mm]", "why",
+)  # fmt: skip
+
+
+def add_arguments(parser):
+    """Arguments of ``robustness``."""
+    parser.description = (
+        "Carries out a motion with samples lost at random, and separately with random "
+        "delays, at rising levels, and tells where the loop breaks."
+    )
+    parser.epilog = (
+        "example: flexarm robustness R --controller paper_composite --loss 0:0.1:0.9 --delay 0:4:40"
+    )
+    add = parser.add_argument
+    add("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add(
+        "--controller",
+        action="append",
+        metavar="FILE",
+        help="parameter file of the nodes, shipped name or path; may be repeated (the nodes' defaults: default)",
+    )
+    add("--trajectory", default="paper", metavar="FILE|SPEC", help="the motion (paper)")
+    add("--rate", type=float, default=500.0, help="samples per second (500)")
+    add("--loss", default="0:0.1:0.9", metavar="FROM:STEP:TO", help="share lost (0:0.1:0.9)")
+    add("--delay", default="0:4:40", metavar="FROM:STEP:TO", help="largest delay [ms] (0:4:40)")
+    add("--seeds", type=int, default=3, help="runs at each level (3)")
+    add("--noise", action="store_true", help="gauges have the arm file's noise")
+    add("--window", type=float, default=3.0, help="time after the motion [s] (3)")
+    add("--figure", metavar="FILE.png", help="draw it")
+    add("--json", action="store_true", help="rows as JSON")
+
+
+def robustness(options):
+    """Sweep, print a table and where each loop breaks, draw."""
+    if not 1 <= options.seeds <= 1000:
+        raise FlexarmError(f"--seeds {options.seeds}: from 1 to 1000 are possible")
+    levels = {
+        "loss": levels_of("--loss", options.loss, 1.0),
+        "jitter": [1e-3 * ms for ms in levels_of("--delay", options.delay, 1000.0)],
+    }
+    progress, rows = Progress(), []
+    for name in options.controller or ["default"]:
+        scenario = scenarios.Scenario(
+            options.arm,
+            {} if name == "default" else scenarios.parameters(name),
+            trajectory=options.trajectory,
+            rate=options.rate,
+            noise=options.noise,
+            window=options.window,
+        )
+        for what, values in levels.items():
+            progress.step(f"{Path(name).stem}, {SWEPT[what][0]}")
+            found = sweep(scenario, what, values, options.seeds, progress.fraction)
+            rows += [{"controller": Path(name).stem, **row} for row in found]
+    progress.done()
+    if options.json:
+        print(json.dumps(rows, indent=1))
+    else:
+        print("\n".join([*table(rows), "", *breaks(rows)]))
+    if options.figure:
+        draw(rows, options.figure, f"{options.arm}, {options.trajectory}, {options.rate:g} Hz")
+
+
+def levels_of(option, text, most):
+    """Numbers from ``from:step:to``, or a single one."""
+    try:
+        parts = [float(word) for word in text.split(":")]
+    except ValueError:
+        parts = []
+    if len(parts) == 1:
+        parts = [parts[0], 1.0, parts[0]]
+    if len(parts) != 3 or not np.isfinite(parts).all() or parts[1] <= 0.0:
+        raise FlexarmError(f"{option} {text}: FROM:STEP:TO is wanted, such as 0:0.1:0.9")
+    first, step, last = parts
+    if not 0.0 <= first <= last <= most:
+        raise FlexarmError(f"{option} {text}: from 0 to {most:g}, ascending, is possible")
+    count = int(np.floor((last - first) / step + 1e-9)) + 1
+    if count > MOST_LEVELS:
+        raise FlexarmError(f"{option} {text}: {count} levels; at most {MOST_LEVELS}")
+    return (first + step * np.arange(count)).round(12).tolist()
+
+
+class Judge:
+    """Tells stable runs from others, beside the undisturbed one.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Without loss and jitter.
+    """
+
+    def __init__(self, scenario):
+        self.scenario = scenario
+        # The smallest jitter there is: the same loop, and samples on its clock.
+        record, _, loop = scenarios.run_loop(replace(scenario, jitter=1e-9))
+        if loop.lost:
+            raise FlexarmError(f"the loop is lost without any loss or delay: {loop.lost}")
+        self._reference = record
+        motion = specs_of(scenario, loop)
+        self._end = 1e-9 * int(motion.times_ns[-1])
+        self._reach = sum(link.length for link in loop.model.arm.links)
+        self.undisturbed = self._sizes(record, loop)
+
+    def run(self, **disturbance):
+        """One run; what `sweep` tells of each.
+
+        The `disturbance` is of fields of the scenario.
+
+        Returns
+        -------
+        tuple of (float, float, float, str)
+            Largest joint error [rad], largest bending in parts of the undisturbed one [-], the tip at rest [m],
+            and why the run is not stable; empty if it is.
+        """
+        try:
+            record, _, loop = scenarios.run_loop(replace(self.scenario, **disturbance))
+        except FlexarmError as error:
+            return np.nan, np.nan, np.nan, str(error)
+        error, bending, rest = self._sizes(record, loop)
+        error0, bending0, rest0 = self.undisturbed
+        share = bending / bending0 if bending0 else 0.0
+        why = loop.lost
+        if not why and error > TRACKING * error0 + ALLOWED:
+            why = f"a joint is {np.degrees(error):.3g} deg off its reference"
+        elif not why and share > BENDING:
+            why = f"bent {share:.3g} times as far as undisturbed"
+        elif not why and rest > rest0 + SETTLED * self._reach:
+            why = f"the tip is still {1e3 * rest:.3g} mm off"
+        return error, share, rest, why
+
+    def _sizes(self, record, loop):
+        """Largest joint error [rad], bending [J^0.5] and the tip's error at rest [m]."""
+        kept = self._reference
+        columns = [np.interp(record.time, kept.time, x) for x in kept.reference.T]
+        record = replace(record, reference=np.stack(columns, axis=1))
+        moving = record.time >= 0.0
+        error = np.abs(record.reference - record.plant_position)[moving].max(initial=0.0)
+        plant = loop.simulator.plant_model
+        stiffness = plant.terms(record.plant_position[0], np.zeros(plant.n_joints)).K2
+        delta = record.plant_amplitude[moving]
+        with np.errstate(over="ignore", invalid="ignore"):
+            energy = np.einsum("ki,ij,kj->k", delta, stiffness, delta)
+            found = tracking_metrics(record, loop.model, plant, self._end, self.scenario.window)
+        rest = 1e-3 * found["final_tip_error_mm"]
+        return float(error), float(np.sqrt(energy.max(initial=0.0))), rest
+
+
+def specs_of(scenario, loop):
+    """The scenario's trajectory for its loop."""
+    return scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
+
+
+def sweep(scenario, what, levels, seeds=3, progress=lambda fraction: None):
+    """Runs at every level of one disturbance.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    what : str
+        ``loss`` or ``jitter``.
+    levels : sequence of float
+        [-] or [s]
+    seeds : int
+        Runs at each.
+    progress : callable
+        Called with the fraction done.
+
+    Returns
+    -------
+    list of dict
+        A row per level: keys `COLUMNS` but the controller, the worst of its runs' numbers, None where a run gave none.
+
+    Raises
+    ------
+    FlexarmError
+        When the loop is lost undisturbed.
+    """
+    judge, (words, factor, unit), rows = Judge(scenario), SWEPT[what], []
+    for i, level in enumerate(levels):
+        runs = [judge.run(**{what: level, "seed": scenario.seed + k}) for k in range(seeds)]
+        error, share, rest = (_worst([r[j] for r in runs]) for j in range(3))
+        reasons = [r[3] for r in runs if r[3]]
+        head = (words, round(factor * level, 9), unit, seeds - len(reasons), seeds)
+        worst = (
+            None if error is None else float(np.degrees(error)),
+            share,
+            None if rest is None else 1e3 * rest,
+        )
+        rows.append(dict(zip(COLUMNS[1:], (*head, *worst, (reasons or [""])[0]), strict=True)))
+        progress((i + 1) / len(levels))
+    return rows
+
+
+def _worst(values):
+    values = np.array(values)
+    return float(values.max()) if np.isfinite(values).all() else None
+
+
+def table(rows):
+    """Lines of the table, Markdown."""
+    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + " --- |" * len(COLUMNS)]
+    for row in rows:
+        words = [f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()]
+        lines.append("| " + " | ".join("-" if w == "None" else w for w in words) + " |")
+    return lines
+
+
+def breaks(rows):
+    """Lines that say up to where each loop was stable in all of its runs."""
+    lines = []
+    for controller, what in dict.fromkeys((r["controller"], r["disturbance"]) for r in rows):
+        own = [r for r in rows if (r["controller"], r["disturbance"]) == (controller, what)]
+        bad = next((i for i, r in enumerate(own) if r["stable"] < r["of"]), None)
+        unit, runs = own[0]["unit"], f"{own[0]['of']} of {own[0]['of']} runs"
+        if bad is None:
+            lines.append(
+                f"{controller}: {what} {own[-1]['level']:g} {unit}, the most tried: {runs} stable"
+            )
+            continue
+        upto = f"stable in {runs} up to {own[bad - 1]['level']:g} {unit}, " if bad else ""
+        first = own[bad]
+        lines.append(
+            f"{controller}: {what}: {upto}breaks at {first['level']:g} {unit} in"
+            f" {first['of'] - first['stable']} of {first['of']}: {first['why']}"
+        )
+    return lines
+
+
+def draw(rows, path, title):
+    """The worst joint error and tip error at rest over both disturbances, crosses where a run is not stable."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from ..case_study.figures import STYLE
+
+    kinds = list(dict.fromkeys((r["disturbance"], r["unit"]) for r in rows))
+    measures = {"joint error [deg]": "largest joint error [deg]", "tip at rest [mm]": None}
+    measures["tip at rest [mm]"] = "tip's error at rest [mm]"
+    with plt.rc_context({**STYLE, "figure.figsize": (8.0, 5.6)}):
+        figure, axes = plt.subplots(
+            len(measures), len(kinds), sharex="col", sharey="row", squeeze=False
+        )
+        names = list(dict.fromkeys(r["controller"] for r in rows))
+        for line, (key, label) in zip(axes, measures.items(), strict=True):
+            line[0].set_ylabel(label)
+            for column, (what, _) in zip(line, kinds, strict=True):
+                for k, name in enumerate(names):
+                    own = [r for r in rows if r["controller"] == name and r["disturbance"] == what]
+                    _curve(column, own, key, f"C{k}", name)
+                column.set_yscale("log")
+        for column, (what, unit) in zip(axes[-1], kinds, strict=True):
+            column.set_xlabel(f"{what} [{unit}]")
+        axes[0, 0].legend()
+        figure.suptitle(
+            f"{title}: worst of {rows[0]['of']} runs; crosses: not stable in all", size=11
+        )
+        figure.tight_layout()
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
+        plt.close(figure)
+
+
+def _curve(axes, rows, key, colour, name):
+    """One loop's curve: dots where all runs were stable, crosses elsewhere."""
+    level = np.array([r["level"] for r in rows])
+    value = np.array([np.nan if r[key] is None else r[key] for r in rows])
+    stable = np.array([r["stable"] == r["of"] for r in rows])
+    axes.plot(level, value, color=colour, label=name)
+    axes.plot(level[stable], value[stable], "o", color=colour, ms=4)
+    axes.plot(level[~stable], value[~stable], "x", color=colour, ms=7)

@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm simulate``: an arm under given torques, or moved as prescribed, to a table. No ROS.
+
+With ``--controller`` the arm is in a closed loop: `run_controller`.
+"""
+
+import itertools
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError, ModelError
+from flexarm_dynamics.models import model
+from flexarm_dynamics.models.chain import Chain
+from flexarm_sim.integrators import METHODS, substeps
+
+from .. import tables
+from ..progress import Progress
+from . import run_controller
+from .options import add_model_arguments, angles, load_arm
+
+#: A table of more rows than this is a mistake in --rate or --duration.
+MOST_ROWS = 10_000_000
+#: What options are without a controller when they are not given.
+DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Simulates an arm from rest: under torques over time, with its joints moved as "
+        "prescribed, or in a loop with an observer and a controller, of which it tells how "
+        "well they did."
+    )
+    parser.epilog = (
+        "examples:\n"
+        "  flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv\n"
+        "  flexarm simulate R --controller paper_composite --trajectory paper "
+        "--payload-scale 2"
+    )
+    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    parser.add_argument(
+        "--torque",
+        metavar="FILE.csv",
+        help="columns t,tau1,tau2,... [s], [N m]; linear between rows, a repeated time is a step; none: no torque",
+    )
+    parser.add_argument(
+        "--prescribed",
+        metavar="FILE.csv",
+        help="joint angles in place of torques: columns t,q1,... [s], [rad]; the torques come out",
+    )
+    parser.add_argument(
+        "--initial",
+        metavar="q1,q2,...",
+        help="joint angles at the start [rad]; the arm is straight, at rest",
+    )
+    parser.add_argument(
+        "--duration",
+        type=float,
+        default=None,
+        help="simulated time [s] (4; with a controller the motion and the window after it)",
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=None,
+        help="rows per second (100); with a controller samples per second (1000)",
+    )
+    parser.add_argument(
+        "--step", type=float, default=None, help="longest step of the integrator [s] (0.001)"
+    )
+    parser.add_argument(
+        "--method",
+        choices=list(METHODS),
+        default=None,
+        help="integrator (dop853); implicit damps stiff modes",
+    )
+    add_model_arguments(parser)
+    parser.add_argument("--out", metavar="FILE.csv", help="where to; standard output if not given")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="columns and rows, or a summary with --out, as JSON; with a controller the metrics",
+    )
+    run_controller.add_arguments(parser)
+
+
+def simulate(options, recorder=None):
+    """Run the sub-command; `recorder` writes the bag that ``--bag`` asks for, see `scenario.run_loop`."""
+    run_controller.check_arguments(options)
+    if options.controller is not None:
+        run_controller.run_controller(options, recorder)
+        return
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
+    arm = load_arm(options)
+    arm_model = model.build(arm)
+    kinematics = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
+    if options.torque and options.prescribed:
+        raise FlexarmError("--torque and --prescribed: give one of them")
+    drive = None
+    if options.torque:
+        drive = tables.Steps(*tables.read(options.torque, "tau", arm.joint_names))
+    motion = None
+    if options.prescribed:
+        if not isinstance(arm_model, Chain):
+            raise ModelError(
+                f"{arm.name}: model {arm.model} can't be moved as prescribed; model chain can"
+            )
+        if options.initial:
+            raise FlexarmError("--initial: a prescribed motion starts where its table does")
+        table = tables.read(options.prescribed, "q", arm.joint_names)
+        motion = tables.Motion(*table, options.prescribed)
+    times = _times(options, motion)
+    columns = column_names(kinematics)
+    q = angles(options.initial, arm, "--initial")
+    rows = np.empty((times.size, len(columns)))
+    run = (
+        _free(arm_model, drive, q, times, options)
+        if motion is None
+        else _prescribed(arm_model, motion, times, options)
+    )
+    show, shown = Progress(), 0
+    if times.size > 5000:
+        show.step(f"{arm.name}, {times[-1] - times[0]:g} s")
+    for k, (state, torque) in enumerate(run):
+        if not np.isfinite(state).all() or np.abs(state).max() > 1e9:
+            raise ModelError(
+                f"{arm.name}: stopped at t = {times[k]:g} s: the state is beyond what this model holds for"
+                " (a shorter --step, or --foreshortening where links spin fast)"
+            )
+        rows[k] = row(kinematics, times[k], state, torque)
+        if times.size > 5000 and k * 50 // times.size > shown:
+            shown = k * 50 // times.size
+            show.fraction(k / times.size)
+    if times.size > 5000:
+        show.done()
+    _report(options, arm_model, columns, rows)
+    return columns, rows
+
+
+def _times(options, motion):
+    for name in ("rate", "step"):
+        value = getattr(options, name)
+        if not (np.isfinite(value) and value > 0.0):
+            raise FlexarmError(f"--{name} {value}: a number greater than 0 is wanted")
+    start, end = (0.0, np.inf) if motion is None else (motion.start, motion.end)
+    duration = options.duration
+    if duration is None:
+        duration = min(4.0, end - start)
+    if not (np.isfinite(duration) and duration >= 0.0):
+        raise FlexarmError(f"--duration {duration}: a number not below 0 is wanted")
+    if duration > (end - start) * (1.0 + 1e-9) + 1e-9:
+        raise FlexarmError(
+            f"--duration {duration:g}: the motion in {options.prescribed} lasts {end - start:g} s"
+        )
+    if duration * options.rate > MOST_ROWS:
+        raise FlexarmError(
+            f"--duration {duration:g} at --rate {options.rate:g} makes {duration * options.rate:.0f} rows;"
+            f" at most {MOST_ROWS}"
+        )
+    # Whole rows only; the end itself is one when the rate divides the duration.
+    return np.minimum(
+        start + np.arange(int(duration * options.rate + 1e-9) + 1) / options.rate, end
+    )
+
+
+def _free(arm_model, drive, q, times, options):
+    """Yield state and torque at each time, under torque."""
+    n, m = arm_model.n_joints, arm_model.n_modes
+    advance = arm_model.stepper(METHODS[options.method])
+    state = np.zeros(2 * (n + m))
+    state[:n] = q
+    if drive is None:
+        drive = tables.Steps(np.zeros(1), np.zeros((1, n)))
+    longest = options.step / substeps(arm_model, options.step, options.method)
+    yield state, drive.right_of(times[0])
+    for begin, end in itertools.pairwise(times):
+        inner = drive.times[(drive.times > begin + 1e-12) & (drive.times < end - 1e-12)]
+        cuts = np.unique(np.concatenate([[begin], inner, [end]]))
+        for a, b in itertools.pairwise(cuts):
+            count = max(1, int(np.ceil((b - a) / longest - 1e-9)))
+            torque = drive.right_of(a)
+            advance(state, torque, (b - a) / count, count, None, drive.left_of(b) - torque)
+        yield state, drive.right_of(end)
+
+
+def _prescribed(chain, motion, times, options):
+    """Yield state and torque at each time, with the joints moved as prescribed."""
+    n, m = chain.n_joints, chain.n_modes
+    if options.method == "implicit":
+        raise FlexarmError("--method implicit: a prescribed motion wants dop853 or rk4")
+    advance = chain.driven_stepper(METHODS[options.method])
+    state = np.zeros(2 * (n + m))
+    longest = options.step / substeps(chain, options.step, options.method)
+    for k, t in enumerate(times):
+        if k:
+            count = max(1, int(np.ceil((t - times[k - 1]) / options.step - 1e-9)))
+            grid = np.linspace(times[k - 1], t, count + 1)
+            for a, b in itertools.pairwise(grid):
+                start, end = motion(a)[2], motion(b)[2]
+                inner = max(1, int(np.ceil((b - a) / longest - 1e-9)))
+                advance(state, start, (b - a) / inner, inner, None, end - start)
+        # The joints are where the table says, not where rounding took them.
+        state[:n], state[n + m : 2 * n + m], acceleration = motion(t)
+        yield state, prescribed_torque(chain, state, acceleration)
+
+
+def prescribed_torque(chain, state, acceleration):
+    """Torque under which the joints have an acceleration, the modes moving freely, shape (n,) [N m]."""
+    n, m = chain.n_joints, chain.n_modes
+    q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
+    M = chain.mass_matrix(q, delta)
+    forces = chain.forces(q, qd, delta, delta_d)
+    modal = np.linalg.solve(M[n:, n:], -forces[n:] - M[n:, :n] @ acceleration)
+    return M[:n, :n] @ acceleration + M[:n, n:] @ modal + forces[:n] + chain.friction(qd)
+
+
+def column_names(chain):
+    """Columns of the table."""
+    n, links = chain.n_joints, len(chain.arm.links)
+    names = ["t"]
+    for prefix in ("q", "qd", "tau"):
+        names += [f"{prefix}{i + 1}" for i in range(n)]
+    names += [*chain.mode_names, "tip_x", "tip_y", "tip_z"]
+    for i in range(links):
+        names += [f"link{i + 1}_tip_{axis}" for axis in "xyz"]
+        if chain.planar_axis is not None:
+            names.append(f"link{i + 1}_base_angle")
+        names += [f"link{i + 1}_defl_{axis}" for axis in "yz"]
+    return names
+
+
+def row(chain, t, state, torque):
+    """One row of the table."""
+    n, m = chain.n_joints, chain.n_modes
+    q, delta, qd, _ = np.split(state, [n, n + m, 2 * n + m])
+    ends, values = chain.link_ends(q, delta), [[t], q, qd, torque, delta]
+    values.append(ends[-1])
+    base = chain.base_angles(q, delta) if chain.planar_axis is not None else None
+    for i, link in enumerate(chain.arm.links):
+        values.append(ends[i])
+        if base is not None:
+            values.append(base[i : i + 1])
+        values.append(chain.tip_deflection(delta, link.name))
+    return np.concatenate(values)
+
+
+def _report(options, arm_model, columns, rows):
+    arm = arm_model.arm
+    if options.json:
+        result = {"arm": arm.name, "model": arm.model, "columns": columns}
+        if options.out:
+            result |= {"out": options.out, "rows": len(rows)}
+            result["last"] = dict(zip(columns, rows[-1].tolist(), strict=True))
+        else:
+            result["rows"] = rows.tolist()
+        if options.out:
+            tables.write(columns, rows, options.out)
+        print(json.dumps(result))
+        return
+    tables.write(columns, rows, options.out)
+    if options.out:
+        print(
+            f"{options.out}: {arm.name}, {len(rows)} rows of {len(columns)} columns, t = {rows[0, 0]:g} to"
+            f" {rows[-1, 0]:g} s",
+            file=sys.stderr,
+        )

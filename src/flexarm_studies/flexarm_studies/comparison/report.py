@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of a comparison, for the terminal and for docs/comparison.md."""
+
+from ..markdown import write_between
+from .contenders import OWN, PID, SHIPPED
+
+BEGIN, END = "<!-- comparison: begin -->", "<!-- comparison: end -->"
+HEAD = (
+    "joint error, peak [mrad]",
+    "tip error, peak [mm]",
+    "rms [mm]",
+    "residual, rms [mm]",
+    "settled after [s]",
+    "torque, peak [N m]",
+)
+#: How much sooner than the joints' PID the shipped controller is to settle, on soft arms.
+SOONER = 5.0
+
+
+def cells(row, window):
+    """The table's cells of a row, one per name in `HEAD`."""
+    if "refused" in row:
+        return ["refused", *[""] * (len(HEAD) - 1)]
+    if "lost" in row:
+        return ["arm lost", *[""] * (len(HEAD) - 1)]
+    return [
+        f"{1e3 * row['peak_joint_error_rad']:.3g}",
+        f"{row['peak_tip_mm']:.4g}",
+        f"{row['rms_tip_mm']:.4g}",
+        f"{row['residual_mm']:.3g}",
+        settled(row, window),
+        "; ".join(f"{u:.3g}" for u in row["peak_torque_Nm"]),
+    ]
+
+
+def settled(row, window):
+    """Settling time as a word."""
+    if "cost" not in row or "refused" in row or "lost" in row:
+        return ""
+    return f"> {window:g}" if row["settling_s"] is None else f"{row['settling_s']:.2f}"
+
+
+def text(found):
+    """All tables, Markdown."""
+    return "\n\n".join(part for subject in found["subjects"] for part in _subject(subject))
+
+
+def _subject(subject):
+    window = subject["window_s"]
+    yield (
+        f"## {subject['arm']}\n\n`{subject['motion']}`, {subject['rate_Hz']:g} Hz,"
+        f" {subject['budget']} simulations per tuning."
+    )
+    if subject["contenders"]:
+        yield _table(
+            ("controller", *HEAD, "with noise: residual [mm]", "settled [s]", "cost"),
+            [_contender(name, c, window) for name, c in subject["contenders"].items()],
+        )
+        yield _gains(subject["contenders"])
+        yield "\n".join(f"- {line}" for line in verdicts(subject))
+    if subject["combinations"]:
+        parts = ("slow", "fast", "manifold", "feedforward")
+        rows = sorted(subject["combinations"], key=lambda c: c["row"]["cost"])
+        yield _table(
+            (*parts, *HEAD, "cost"),
+            [(*(c[p] for p in parts), *cells(c["row"], window), _cost(c["row"])) for c in rows],
+        )
+
+
+def _contender(name, c, window):
+    noisy = c["noisy"]
+    heard = "residual_mm" in noisy
+    residual = f"{noisy['residual_mm']:.3g}" if heard else cells(noisy, window)[0]
+    return (name, *cells(c["row"], window), residual, settled(noisy, window), _cost(c["row"]))
+
+
+def _cost(row):
+    return "" if "refused" in row or "lost" in row else f"{row['cost']:.3g}"
+
+
+def _gains(contenders):
+    lines = []
+    for name, c in contenders.items():
+        if c["gains"]:
+            gains = ", ".join(f"{k} = {v:.4g}" for k, v in c["gains"].items())
+            lines.append(
+                f"- {name}: {gains} (cost {c['first']:.3g} at the first guess, {c['best']:.3g} after"
+                f" {c['simulations']} simulations)"
+            )
+    return "\n".join(lines)
+
+
+def verdicts(subject):
+    """What the rows say, a sentence each."""
+    contenders, window = subject["contenders"], subject["window_s"]
+    if SHIPPED not in contenders:
+        return []
+    own = contenders[SHIPPED]["row"]
+    if "residual_mm" not in own:
+        return [f"The shipped controller fails: {own.get('lost') or own.get('refused')}."]
+    lines = []
+    rivals = {
+        name: c["row"]
+        for name, c in contenders.items()
+        if name not in OWN and "residual_mm" in c["row"]
+    }
+    if PID in rivals:
+        lines.append(_against_pid(own, rivals[PID], window))
+    better = [
+        name
+        for name, row in rivals.items()
+        if row["rms_tip_mm"] < own["rms_tip_mm"] and row["residual_mm"] < own["residual_mm"]
+    ]
+    lines.append(
+        f"The shipped controller loses on tip tracking (rms) and residual alike to {', '.join(better)}."
+        if better
+        else "No rival beats the shipped controller on tip tracking (rms) and residual alike."
+    )
+    return lines
+
+
+def _against_pid(own, pid, window):
+    if own["settling_s"] is None:
+        return f"The shipped controller does not settle within {window:g} s."
+    late = window if pid["settling_s"] is None else pid["settling_s"]
+    more = "more than " if pid["settling_s"] is None else ""
+    torques = zip(own["peak_torque_Nm"], pid["peak_torque_Nm"], strict=True)
+    share = max(a / b for a, b in torques if b)
+    return (
+        f"The shipped controller settles {more}{late / own['settling_s']:.2g} times sooner than the tuned joint PID,"
+        f" with at most {share:.2f} times its peak torque in any joint."
+    )
+
+
+def _table(head, rows):
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def write(found, file):
+    """Put the tables between the markers of a Markdown file.
+
+    `found` is what the comparison gave, as in its JSON.
+
+    Raises
+    ------
+    FlexarmError
+        When the file has no markers.
+    """
+    write_between(file, BEGIN, END, f"\n{text(found)}\n")

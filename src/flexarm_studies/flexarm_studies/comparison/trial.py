@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run of a contender, and the few numbers that are compared."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from flexarm_control.feedforward.model import Preparation
+from flexarm_dynamics.errors import FlexarmError, MessageError
+
+from ..loop import scenario as scenarios
+from ..loop.metrics import tracking_metrics
+from . import subjects
+
+#: What the metric weighs against each other: one of each is as bad. Errors in parts of the arm's length [-], [-], [s].
+TRACKING, RESIDUAL, SETTLING = 1e-2, 1e-3, 1.0
+#: Cost of a run that loses the arm, more where it loses it earlier; of a design that is refused.
+LOST, REFUSED = 1e3, 1e4
+#: A joint so far off its reference has lost the arm [rad].
+OFF = 0.7
+
+
+def run(subject, setup, noisy=False, seed=0):
+    """Run a contender.
+
+    Parameters
+    ----------
+    subject : Subject
+    setup : Setup
+    noisy : bool
+        Whether the sensors have noise.
+    seed : int
+        Of the noise.
+
+    Returns
+    -------
+    dict
+        Ready for JSON; see `row_of`. Of a design that is refused: ``refused``, why.
+    """
+    try:
+        return _run(subject, setup, noisy, seed)
+    except FlexarmError as error:
+        return {"refused": str(error), "cost": REFUSED}
+
+
+def _run(subject, setup, noisy, seed):
+    arm = subjects.arm_of(subject.arm, noisy)
+    scenario = scenarios.Scenario(
+        arm, setup.controller, noise=noisy, seed=seed, rate=subject.rate, window=subject.window
+    )
+    loop = scenarios.loop_of(scenario)
+    loop.LARGEST_ERROR = OFF
+    controller = loop.controller
+    if setup.law is not None:
+        controller.law = setup.law(loop.model)
+    wanted = scenarios.trajectory_of(subject.motion, loop.model, loop.simulator.position)
+    motion = wanted if setup.motion is None else setup.motion(loop.model)
+    loop.simulator.reset(motion.positions[0])
+    if controller.plans:
+        _share_plan(subject, setup.controller["feedforward"], controller)
+    end = 1e-9 * int(wanted.times_ns[-1])
+    try:
+        record = loop.follow(motion, end + subject.window)
+    except MessageError as error:
+        return {"refused": str(error), "cost": REFUSED}
+    if loop.lost:
+        part = float(record.time[-1]) / (end + subject.window)
+        return {"lost": loop.lost, "cost": LOST * (2.0 - part)}
+    if setup.motion is not None:  # what is judged is the motion that was asked for
+        profile = subjects.profile_of(subject)
+        time = np.clip(record.time, 0.0, profile.duration)
+        record = replace(record, reference=profile.position(time).reshape(len(time), -1))
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = tracking_metrics(
+            record, loop.model, loop.simulator.plant_model, end, subject.window
+        )
+    return row_of(found, subject, sum(link.length for link in arm.links))
+
+
+def row_of(found, subject, length):
+    """What is compared, from `tracking_metrics`.
+
+    Parameters
+    ----------
+    found : dict
+    subject : Subject
+    length : float
+        Of the arm [m].
+
+    Returns
+    -------
+    dict
+        ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag where there is gravity),
+        ``residual_mm``, ``settling_s`` (None: not within the window), ``peak_torque_Nm`` (per joint),
+        ``saturation_share`` and ``cost``.
+    """
+    about = "about_sag_mm" if "static_sag_mm" in found else "mm"
+    row = {
+        "peak_joint_error_rad": max(found["peak_joint_error_rad"]),
+        "peak_tip_mm": found[f"peak_tip_error_{about}"],
+        "rms_tip_mm": found[f"rms_tip_error_{about}"],
+        "residual_mm": found["residual_tip_rms_mm"],
+        "settling_s": found["settling_time_s"],
+        "peak_torque_Nm": found["peak_torque_Nm"],
+        "saturation_share": found["saturation_share"],
+    }
+    settling = subject.window if row["settling_s"] is None else row["settling_s"]
+    row["cost"] = (
+        1e-3 * row["rms_tip_mm"] / length / TRACKING
+        + 1e-3 * row["residual_mm"] / length / RESIDUAL
+        + settling / SETTLING
+    )
+    return row
+
+
+#: What feed-forwards prepared, by subject, kind and start.
+_PREPARED = {}
+
+
+def _share_plan(subject, kind, controller):
+    """Let a motion be prepared once: that depends on arm, motion and rate, on no gain that is tuned."""
+
+    def prepare(trajectory, law):
+        start = controller.reference.resting
+        if start is None:
+            return None
+        key = (subject, kind, start.tobytes())
+        if key not in _PREPARED:
+            law.limit = controller.torque_limit
+            _PREPARED[key] = law.feedforward.prepare(trajectory, start)
+        found = _PREPARED[key]
+        return Preparation(found.start, found.gains, found.plan)
+
+    controller.prepare = prepare

@@ -1,0 +1,456 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Output-error fit of an arm's parameters, with intervals that hold when the residuals are coloured.
+
+Parameters :math:`\theta`, gauge biases and initial state x_0 are chosen so that the prediction of `predictor` is
+nearest to the measurement,
+
+.. math:: \min_{\theta, x_0} \sum_k\sum_c w_{kc}\,(y_{kc} - \hat y_{kc})^2/\sigma_c^2 ,
+
+with :math:`\sigma_c` of each channel from its residuals. An encoder that stays on one count for r samples has told
+one thing, not r: its samples weigh :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and 9.)
+
+A frequency that is off by a share s is out of step after 1/(2 s) periods, where the sum has other minima: the fit
+begins with the first periods of the motion and goes on to longer and longer parts of it.
+
+The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
+
+.. math:: P = A^{-1} S A^{-1}, \quad A = J^T J, \quad
+          S = \sum_{|l|\le L}\left(1 - \tfrac{|l|}{L + 1}\right)\sum_k s_k s_{k+l}^T
+
+(Newey and West 1987; L by Andrews 1991 from the most coloured channel), which for white residuals is the usual
+:math:`\sigma^2 (J^TJ)^{-1}`; of both the larger variance is taken. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
+
+What the motion does not determine keeps the file's value: a parameter whose interval is wider than a share of its
+value, the worst one first, and the rest fitted again.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from flexarm_dynamics.models import model
+
+from .predictor import Predictor
+from .quantities import changed, held, quantities
+
+#: Two-sided 95 % of the normal distribution.
+NORMAL = 1.959964
+#: Difference step of the Jacobian, of a quantity's scale [-].
+STEP = 1e-7
+#: Parts of the motion that are fitted one after the other: periods of the slowest mode, and how they grow.
+FIRST_PERIODS, GROWTH = 1.0, 2.0
+#: In the parts, a quantity is held to the file's value with this deviation, of its scale [-].
+PRIOR = 0.5
+#: Quantities stay within these multiples of their scale [-].
+MOST = 30.0
+#: A channel's residual is taken as no smaller than this [rad], [strain].
+LEAST = 1e-9
+#: A residual that is prior to any fit is worth so much where no noise is stated, of the signal [-].
+ASSUMED = 1e-3
+#: Least bandwidth of the covariance is this times the third root of the samples [-].
+LAG_FACTOR = 1.0
+#: Correlation of a residual with the one before that counts at most [-].
+MOST_COLOUR = 0.97
+#: The model does not explain the motion when a channel's residual is so much of the signal's deviation [-].
+POOR = 0.05
+#: Stiffnesses that are tried where the first fit is poor, times the file's [-].
+TRIED = (0.4, 0.6, 1.6, 2.5)
+#: Singular value of the Jacobian, columns scaled to one, below which it is zero to its own precision [-].
+SINGULAR = 1e-5
+#: So close to its least value, in scales, a quantity has it.
+AT_LIMIT = 1e-6
+#: Correlation from which on two parameters are named together [-].
+TOGETHER = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What a fit found.
+
+    Attributes
+    ----------
+    arm : Arm
+        With the found values; the file's where a quantity is held or undetermined.
+    quantities : list of Quantity
+        All of them.
+    values, half_widths : ndarray, shape (p,)
+        Value, and half of the 95 % interval; NaN where the file's value was kept [SI].
+    covariance : ndarray, shape (p, p)
+        Of the values; zero where held.
+    initial : ndarray, shape (2 (n + m),)
+        Initial state.
+    predicted : ndarray, shape (s, n + g)
+        Joint angles and strains of the fit.
+    measured : ndarray, shape (s, n + g)
+    noise : ndarray, shape (n + g,)
+        Rms residual of each channel [rad], [strain].
+    held, undetermined : tuple of str
+        Kept because asked for; because the motion does not tell them.
+    warnings : tuple of str
+    """
+
+    arm: object
+    quantities: list
+    values: np.ndarray
+    half_widths: np.ndarray
+    covariance: np.ndarray
+    initial: np.ndarray
+    predicted: np.ndarray
+    measured: np.ndarray
+    noise: np.ndarray
+    held: tuple = ()
+    undetermined: tuple = ()
+    warnings: tuple = field(default=())
+
+
+def identify(arm, recording, hold=(), share=0.5):
+    """Fit an arm's parameters to a recorded motion.
+
+    Parameters
+    ----------
+    arm : Arm
+        Where the fit starts, and what is kept where the motion tells nothing.
+    recording : Recording
+    hold : sequence of str
+        Names, or patterns with ``*``, of quantities that keep the file's value.
+    share : float
+        Of a quantity's value; one with a wider half-interval is undetermined [-].
+
+    Returns
+    -------
+    Identified
+
+    Raises
+    ------
+    FlexarmError
+        For a pattern that names nothing, and where the model can't follow the motion at all.
+    """
+    problem = Problem(arm, recording, hold)
+    problem.leave_out_singular()
+    problem.fit()
+    while (worst := problem.undetermined(share)) is not None:
+        problem.leave_out(worst)
+        problem.refine()
+    return problem.result()
+
+
+class Problem:
+    """A fit under way; see the module."""
+
+    def __init__(self, arm, recording, hold=()):
+        self.arm, self.recording = arm, recording
+        self.found = quantities(arm, recording)
+        self.predictor = Predictor(arm, recording)
+        names = held(self.found, hold)
+        self.held = tuple(q.name for q in self.found if q.name in names)
+        self.left_out, self.warnings = [], list(recording.notes)
+        self.free = np.array([q.name not in names for q in self.found], bool)
+        self.file = np.array([q.get(arm) for q in self.found])
+        self.values, self.initial = self.file.copy(), self.predictor.guess(arm)
+        self.measured = np.hstack([recording.position, recording.strain])
+        self.weight = self._weights()
+        self.noise = self._prior_noise()
+        self.state_scale = self._state_scale()
+
+    # Scales ----------------------------------------------------------------------------------
+
+    def _weights(self):
+        """Square roots of w, shape (s, n + g): runs of one count weigh as one; what is missing not at all."""
+        weight = np.isfinite(self.measured).astype(float)
+        for c in range(self.predictor.n):
+            reading = self.measured[:, c]
+            edges = np.flatnonzero(np.diff(reading) != 0.0) + 1
+            lengths = np.diff(np.concatenate([[0], edges, [reading.size]]))
+            weight[:, c] /= np.sqrt(np.repeat(lengths, lengths))
+        self.measured = np.nan_to_num(self.measured)
+        return weight
+
+    def _prior_noise(self):
+        """Rms error that each channel is taken to have before any fit."""
+        spread = self.measured.std(axis=0)
+        noise = np.maximum(ASSUMED * spread, LEAST)
+        for c, joint in enumerate(self.arm.joints):
+            if joint.encoder_counts:
+                noise[c] = max(noise[c], 2.0 * np.pi / joint.encoder_counts / np.sqrt(12.0))
+        for c, gauge in enumerate(self.arm.gauges, self.predictor.n):
+            noise[c] = max(noise[c], gauge.uncertainty)
+        return noise
+
+    def _state_scale(self):
+        """Of the initial state's differences: what its channels span, as angles, amplitudes and rates."""
+        m = self.predictor.m
+        angle = np.maximum(np.ptp(self.recording.position, axis=0), 1e-3)
+        link = max(link.length for link in self.arm.links)
+        delta = np.full(m, 1e-2 * link)
+        rate = np.maximum(np.abs(np.gradient(self.recording.position, axis=0)).max(0), 1e-4)
+        return np.concatenate([angle, delta, rate / self.recording.period, 10.0 * delta])
+
+    # Residuals -------------------------------------------------------------------------------
+
+    @property
+    def _scales(self):
+        scales = np.array([q.scale for q in self.found])[self.free]
+        return np.concatenate([scales, self.state_scale])
+
+    def _point(self, x):
+        """Values of all quantities, and initial state, of scaled unknowns."""
+        values, p = self.values.copy(), int(self.free.sum())
+        values[self.free] = x[:p] * self._scales[:p]
+        return values, x[p:] * self.state_scale
+
+    def _unknowns(self):
+        return np.concatenate([self.values[self.free], self.initial]) / self._scales
+
+    def residuals(self, x, samples):
+        """Weighted residuals (measured less predicted), shape (samples, n + g)."""
+        values, initial = self._point(x)
+        arm = changed(self.arm, self.found, values)
+        predicted = self.predictor.predict(arm, initial, samples)
+        r = self.weight[:samples] * (self.measured[:samples] - predicted) / self.noise
+        # A model that runs away is far off, and says so with a number.
+        return np.clip(np.nan_to_num(r, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
+
+    def jacobian(self, x, samples):
+        """Derivative of `residuals` by forward differences, shape (samples, n + g, unknowns)."""
+        values, initial = self._point(x)
+        arm, p = changed(self.arm, self.found, values), int(self.free.sum())
+        states, built = self.predictor.states(arm, initial, samples)
+        base = self.predictor.outputs(arm, states, built)
+        out = np.zeros((samples, base.shape[1], x.size))
+        for j, index in enumerate(np.flatnonzero(self.free)):
+            other = values.copy()
+            other[index] += STEP * self.found[index].scale
+            other = changed(self.arm, self.found, other)
+            # Gains and biases move nothing: the states are those of before.
+            same = self.found[index].kind in ("gain", "bias")
+            made = (states, built) if same else self.predictor.states(other, initial, samples)
+            out[:, :, j] = (self.predictor.outputs(other, *made) - base) / STEP
+        for j in range(initial.size):
+            other = initial.copy()
+            other[j] += STEP * self.state_scale[j]
+            moved = self.predictor.run(built, other, samples)
+            out[:, :, p + j] = (self.predictor.outputs(arm, moved, built) - base) / STEP
+        out *= -(self.weight[:samples] / self.noise)[:, :, None]
+        return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
+
+    # The fit ---------------------------------------------------------------------------------
+
+    def fit(self):
+        """Fit longer and longer parts, then the whole; other stiffnesses where that ends badly."""
+        self._fit_from(1.0)
+        best = self._kept()
+        stiff = any(q.kind == "EI" for q, free in zip(self.found, self.free, strict=True) if free)
+        for factor in TRIED if self.poor() and stiff else ():
+            self._fit_from(factor)
+            if (now := self._kept())[3] < best[3]:
+                best = now
+            if not self.poor():
+                break
+        self.values, self.initial, self.noise, _ = best
+        for channel in self.poor():
+            self.warnings.append(
+                f"{channel}: the fit leaves more than {100 * POOR:g} % of it; the model does not explain this"
+                " motion, and the intervals are not to be trusted"
+            )
+
+    def _kept(self):
+        """The present point, and its cost by the noise assumed before any fit: comparable between fits."""
+        noise, self.noise = self.noise, self._prior_noise()
+        cost = float(np.sum(self.residuals(self._unknowns(), len(self.measured)) ** 2))
+        self.noise = noise
+        return self.values, self.initial, noise, cost
+
+    def _fit_from(self, factor):
+        stiff = np.array([q.kind == "EI" for q in self.found]) & self.free
+        self.values = np.where(stiff, factor * self.file, self.file)
+        self.initial, self.noise = self.predictor.guess(self.arm), self._prior_noise()
+        for samples in self.parts():
+            self._solve(samples, prior=True, tolerance=1e-2, most=8)
+        self.refine()
+
+    def refine(self):
+        """Fit the whole, with the noise that the residuals show."""
+        whole = len(self.measured)
+        for tolerance in (1e-4, 1e-7):
+            self._solve(whole, prior=False, tolerance=tolerance, most=40)
+            self._measure_noise()
+
+    def parts(self):
+        """Ends of the parts of the motion that are fitted first [samples]."""
+        whole, r = len(self.measured), self.recording
+        if not self.predictor.m:
+            return []
+        away = np.abs(r.torque - r.torque[1]).max(axis=1)
+        active = np.flatnonzero(away[1:] > 0.05 * away.max()) if away.max() > 0.0 else [0]
+        begin = int(active[0])
+        built = model.build(self.arm)
+        slowest = max(float(built.frequencies(r.position[0])[0]), 1e-3)
+        span, ends = FIRST_PERIODS * 2.0 * np.pi / slowest / r.period, []
+        while begin + span < whole:
+            ends.append(max(begin + int(span), 20))
+            span *= GROWTH
+        return ends
+
+    def _solve(self, samples, prior, tolerance, most):
+        """Least squares from where the point is; with `prior`, held to the file's values a little."""
+        start, p = self._unknowns(), int(self.free.sum())
+        scales = self._scales[:p]
+        file = self.file[self.free] / scales
+        first = self.residuals(start, samples)
+        pull = (np.sqrt(np.mean(first**2)) if prior else 0.0) / PRIOR
+
+        def residuals(x):
+            return np.concatenate([self.residuals(x, samples).ravel(), pull * (x[:p] - file)])
+
+        def jacobian(x):
+            rows = self.jacobian(x, samples)
+            return np.vstack([rows.reshape(-1, x.size), pull * np.eye(p, x.size)])
+
+        low = np.array([q.low for q in self.found])[self.free] / scales
+        bounds = (np.full(start.size, -np.inf), np.full(start.size, np.inf))
+        bounds[0][:p], bounds[1][:p] = low, MOST
+        start[:p] = np.clip(start[:p], low + 1e-9, MOST)
+        solution = least_squares(
+            residuals, start, jacobian, bounds, ftol=tolerance, xtol=1e-9, gtol=1e-10, max_nfev=most
+        )
+        self.values, self.initial = self._point(solution.x)
+
+    def _measure_noise(self):
+        r = self.residuals(self._unknowns(), len(self.measured)) * self.noise
+        rms = np.sqrt(np.sum(r**2, axis=0) / np.maximum(np.sum(self.weight**2, axis=0), 1.0))
+        self.noise = np.maximum(rms, LEAST)
+
+    def poor(self):
+        """Names of channels that the fit does not explain."""
+        names = (*self.arm.joint_names, *self.arm.gauge_names)
+        used = self.weight.any(axis=0)
+        spread = np.array(
+            [
+                self.measured[w > 0.0, c].std() if w.any() else 0.0
+                for c, w in enumerate(self.weight.T)
+            ]
+        )
+        floor = 3.0 * self._prior_noise()
+        bad = used & (self.noise > np.maximum(POOR * spread, floor))
+        return [name for name, b in zip(names, bad, strict=True) if b]
+
+    # What is determined ----------------------------------------------------------------------
+
+    def covariance(self):
+        """Of the free quantities and the initial state, scaled; see the module."""
+        whole, x = len(self.measured), self._unknowns()
+        J, r = self.jacobian(x, whole), self.residuals(x, whole)
+        size = np.sqrt(np.sum(J**2, axis=(0, 1)))
+        size[size == 0.0] = 1.0
+        J /= size
+        flat = J.reshape(-1, x.size)
+        bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)
+        white = bread
+        scores = np.einsum("kcx,kc->kx", J, r)
+        lags = min(bandwidth(r), whole // 4)
+        meat = scores.T @ scores
+        for lag in range(1, lags + 1):
+            gamma = scores[lag:].T @ scores[:-lag]
+            meat += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
+        robust = bread @ meat @ bread
+        variance = np.maximum(np.diag(robust), 1e-300)
+        grow = np.sqrt(np.maximum(np.diag(white) / variance, 1.0))
+        used = np.count_nonzero(self.weight)
+        grow *= np.sqrt(used / max(used - x.size, 1))
+        return robust * np.outer(grow, grow) / np.outer(size, size)
+
+    def undetermined(self, share):
+        """Index of the free quantity whose interval is widest beside its value, beyond `share`; None."""
+        if not self.free.any():
+            return None
+        cov, indices = self.covariance(), np.flatnonzero(self.free)
+        widths = NORMAL * np.sqrt(np.diag(cov))[: indices.size]  # in scales
+        values = np.abs(self.values[indices]) / np.array([self.found[i].scale for i in indices])
+        ratio = widths / np.maximum(values, 1.0)
+        worst = int(np.argmax(ratio))
+        if not ratio[worst] > share:
+            return None
+        deviation = np.sqrt(np.diag(cov))[: indices.size]
+        alike = np.abs(cov[worst, : indices.size]) / (deviation[worst] * deviation)
+        partners = [
+            self.found[i].name for k, i in enumerate(indices) if k != worst and alike[k] > TOGETHER
+        ]
+        why = f"its interval would be +-{100.0 * ratio[worst]:.3g} % of it"
+        if partners:
+            why += f", and it can't be told from {', '.join(partners)}"
+        self._because = why
+        return int(indices[worst])
+
+    def leave_out_singular(self):
+        """Leave out what does not move the measurements at all, or only as others do."""
+        while self.free.any():
+            J = self.jacobian(self._unknowns(), len(self.measured))
+            J = J.reshape(-1, J.shape[-1])
+            size, p = np.linalg.norm(J, axis=0), int(self.free.sum())
+            indices = np.flatnonzero(self.free)
+            silent = np.flatnonzero(size[:p] <= 1e-12 * max(size.max(), 1e-300))
+            if silent.size:
+                self._because = "it moves nothing that was measured"
+                self.leave_out(int(indices[silent[0]]))
+                continue
+            _, values, directions = np.linalg.svd(J / np.maximum(size, 1e-300), full_matrices=False)
+            share = np.abs(directions[-1])
+            involved = np.flatnonzero(share[:p] > 0.1)
+            if values[-1] > SINGULAR * values[0] or not involved.size:
+                return
+            names = [self.found[indices[k]].name for k in involved]
+            # The one that moves least goes by the file.
+            least = int(involved[np.argmin(size[involved])])
+            self._because = f"{', '.join(names)} act alike on what was measured"
+            self.leave_out(int(indices[least]))
+
+    def leave_out(self, index):
+        """Keep the file's value of a quantity."""
+        name = self.found[index].name
+        self.left_out.append(name)
+        self.free[index] = False
+        self.values[index] = self.file[index]
+        self.warnings.append(
+            f"{name} is not determined by this motion and keeps the file's"
+            f" {self.file[index]:.6g} {self.found[index].unit}: {self._because}; the others' intervals hold for"
+            " that value"
+        )
+
+    def _end_at_limits(self):
+        """What the search left a hair above its least possible value has that value."""
+        low = np.array([q.low for q in self.found])
+        close = self.free & (self.values - low < AT_LIMIT * np.array([q.scale for q in self.found]))
+        self.values = np.where(close, low, self.values)
+
+    def result(self):
+        """The fit as it stands."""
+        p, indices = len(self.found), np.flatnonzero(self.free)
+        covariance, widths = np.zeros((p, p)), np.full(p, np.nan)
+        if indices.size:
+            scales = np.array([self.found[i].scale for i in indices])
+            block = self.covariance()[: indices.size, : indices.size] * np.outer(scales, scales)
+            covariance[np.ix_(indices, indices)] = block
+            widths[indices] = NORMAL * np.sqrt(np.diag(block))
+        self._end_at_limits()
+        arm = changed(self.arm, self.found, self.values)
+        predicted = self.predictor.predict(arm, self.initial)
+        return Identified(
+            arm, self.found, self.values, widths, covariance, self.initial, predicted,
+            np.where(self.weight > 0.0, self.measured, np.nan), self.noise, self.held,
+            tuple(self.left_out), tuple(self.warnings),
+        )  # fmt: skip
+
+
+def bandwidth(r):
+    r"""Lags L of the covariance for residuals (s, c).
+
+    L is :math:`1.1447\,(\alpha s)^{1/3}` with
+    :math:`\alpha = 4\rho^2/(1 - \rho^2)^2` of the channel with the largest correlation :math:`\rho` from one
+    sample to the next.
+    """
+    power = np.maximum(np.sum(r**2, axis=0), 1e-300)
+    rho = np.clip(np.max(np.abs(np.sum(r[1:] * r[:-1], axis=0)) / power), 0.0, MOST_COLOUR)
+    alpha = 4.0 * rho**2 / (1.0 - rho**2) ** 2
+    third = len(r) ** (1.0 / 3.0)
+    return int(np.ceil(max(1.1447 * alpha ** (1.0 / 3.0), LAG_FACTOR) * third))

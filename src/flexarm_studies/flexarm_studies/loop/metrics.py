@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is reported of a run: tracking, vibration, torque; from recorded samples, without ROS."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE_FOOT
+
+
+@dataclass(frozen=True)
+class Record:
+    """Samples of a run, one row each; time zero is where the trajectory starts.
+
+    Attributes
+    ----------
+    time : ndarray, shape (k,)
+        [s]
+    reference, reference_velocity, position, velocity : ndarray, shape (k, n)
+        [rad], [rad/s]
+    amplitude, rate, quasi_steady : ndarray, shape (k, m)
+        [m], [m/s]
+    slow_torque, fast_torque, torque : ndarray, shape (k, n)
+        [N m]
+    """
+
+    time: np.ndarray
+    reference: np.ndarray
+    reference_velocity: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    amplitude: np.ndarray
+    rate: np.ndarray
+    quasi_steady: np.ndarray
+    slow_torque: np.ndarray
+    fast_torque: np.ndarray
+    torque: np.ndarray
+
+    def thinned(self, every):
+        """The same with one row in `every`."""
+        return type(self)(*(getattr(self, f.name)[::every] for f in fields(self)))
+
+    def tip_deflection(self, model):
+        """Deflection of the tip, y = phi_e delta, of an arm of one link, shape (k,) [m]."""
+        return self.amplitude @ _phi_tip(model)
+
+    def tip_x(self, model):
+        """End point along X0, (A9), actual and of the rigid arm on the reference, each (k,) [m]."""
+        length, y = model.arm.links[0].length, self.tip_deflection(model)
+        q = self.position[:, 0]
+        return length * np.cos(q) - y * np.sin(q), length * np.cos(self.reference[:, 0])
+
+    def tip_x_rate(self, model):
+        """Its rate, (A10), actual and of the rigid arm on the reference, each (k,) [m/s]."""
+        length, y = model.arm.links[0].length, self.tip_deflection(model)
+        q, qd = self.position[:, 0], self.velocity[:, 0]
+        actual = (-length * np.sin(q) - y * np.cos(q)) * qd
+        actual -= (self.rate @ _phi_tip(model)) * np.sin(q)
+        wanted = -length * np.sin(self.reference[:, 0]) * self.reference_velocity[:, 0]
+        return actual, wanted
+
+
+@dataclass(frozen=True)
+class SimulatedRecord(Record):
+    """A record that also knows what no sensor tells.
+
+    Attributes
+    ----------
+    plant_position : ndarray, shape (k, n)
+        The simulated arm's joint angles [rad].
+    plant_amplitude : ndarray, shape (k, modes of the plant)
+        Its true modal amplitudes [m, rad].
+    saturated : ndarray of bool, shape (k,)
+        Whether the controller met a limit.
+    state : ndarray of int, shape (k,)
+        The controller's, as `Supervisor` numbers them.
+    """
+
+    plant_position: np.ndarray
+    plant_amplitude: np.ndarray
+    saturated: np.ndarray
+    state: np.ndarray
+
+
+def _phi_tip(model):
+    """Shapes along y of the one link at its tip, shape (m,)."""
+    return model.mode_shapes(model.arm.links[0].name, "y")(1.0)
+
+
+def case_study_metrics(record, model, settle=3.0, until=8.0):
+    """The figures that the reference table of the case study has, in its units.
+
+    Parameters
+    ----------
+    record : Record
+    model : ArmModel
+        Of one link.
+    settle, until : float
+        Window of the residual: from the trajectory's start [s].
+
+    Returns
+    -------
+    dict
+        Keys as in ``summary.json``.
+    """
+    inside = (record.time >= 0.0) & (record.time <= until + 1e-9)
+    late = inside & (record.time >= settle - 1e-9)
+    error = np.degrees(np.abs(record.reference - record.position)[:, 0])
+    tip = record.tip_deflection(model) / FOOT
+    return {
+        "peak_joint_error_deg": float(error[inside].max()),
+        "max_joint_error_after_3s_deg": float(error[late].max()),
+        "residual_tip_rms_ft": float(np.sqrt(np.mean(tip[late] ** 2))),
+        "peak_tip_deflection_ft": float(np.abs(tip[inside]).max()),
+        "peak_torque_lbf_ft": {
+            "slow": float(np.abs(record.slow_torque[inside]).max() / POUND_FORCE_FOOT),
+            "fast": float(np.abs(record.fast_torque[inside]).max() / POUND_FORCE_FOOT),
+            "total": float(np.abs(record.torque[inside]).max() / POUND_FORCE_FOOT),
+        },
+    }
+
+
+#: A settling time is not told finer than this [s].
+SETTLING_FLOOR = 0.05
+#: How far apart static deflections are evaluated along the motion; linear between [s].
+SAG_INTERVAL = 0.01
+#: What is called final: over the last of a record [s].
+FINAL = 0.5
+
+
+def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3):
+    """How well an arm followed a motion, and how it came to rest; for any number of joints and links.
+
+    The tip's error is its distance from where the tip of the equivalent rigid arm is at the reference. Under
+    gravity the arm sags even at rest: the errors `about_sag` are distances from the tip of the statically bent
+    arm at the reference instead, and settling is judged by them.
+
+    Parameters
+    ----------
+    record : SimulatedRecord
+    model, plant_model : ArmModel
+        The arm as the controller knows it, and as it is simulated.
+    end : float
+        When the motion ends [s].
+    window : float
+        Over how long after the end the rest is judged [s].
+    tolerance : float
+        Of the tip, for the settling time [m].
+
+    Returns
+    -------
+    dict
+        Numbers, lists with one number per joint, and None for what the record does not reach: ready for JSON.
+
+        ``peak_joint_error_rad``, ``rms_joint_error_rad``
+            Reference less the true joint angle, over the whole motion and after it, per joint.
+        ``peak_tip_error_mm``, ``rms_tip_error_mm``
+            Of the tip, as above; under gravity also ``…_about_sag_mm``, and ``static_sag_mm`` of the arm at rest
+            at the motion's end.
+        ``residual_tip_rms_mm``
+            Deflection of the tip about its static value, over the window.
+        ``final_tip_error_mm``
+            The tip's greatest error over the record's last `FINAL`: large where the loop oscillates, too.
+        ``settling_time_s``
+            From the motion's end until the tip's error stays below the tolerance, at least `SETTLING_FLOOR`.
+        ``peak_torque_Nm``, ``rms_torque_Nm``
+            As sent, per joint.
+        ``saturation_share``
+            Share of the samples whose torque met a limit.
+        ``peak_deflection_mm``, ``case_study``
+            Of arms of one link in a plane: the tip's own deflection y, and `case_study_metrics` where the record
+            reaches its window.
+    """
+    if record.time[-1] >= 0.0:  # else the arm was lost before the motion began
+        record = _from(record, 0.0)
+    error = np.abs(record.reference - record.plant_position)
+    tip = _path(plant_model, record.plant_position, record.plant_amplitude)
+    wanted = _path(model, record.reference, np.zeros((record.time.size, model.n_modes)))
+    found = {
+        "peak_joint_error_rad": error.max(0).tolist(),
+        "rms_joint_error_rad": _rms(error, 0).tolist(),
+        **_tip_errors("mm", distance := np.linalg.norm(tip - wanted, axis=1)),
+    }
+    if any(plant_model.arm.gravity):
+        at_rest = _sagging_path(plant_model, record)
+        distance = np.linalg.norm(tip - at_rest, axis=1)
+        found["static_sag_mm"] = 1e3 * float(np.linalg.norm(at_rest[-1] - wanted[-1]))
+        found |= _tip_errors("about_sag_mm", distance)
+    found["residual_tip_rms_mm"] = _residual(record, plant_model, tip, end, window)
+    last = record.time >= record.time[-1] - FINAL - 1e-9
+    found["final_tip_error_mm"] = 1e3 * float(distance[last].max())
+    found["settling_time_s"] = _settling_time(record.time, distance, end, tolerance)
+    found["peak_torque_Nm"] = np.abs(record.torque).max(0).tolist()
+    found["rms_torque_Nm"] = _rms(record.torque, 0).tolist()
+    found["saturation_share"] = float(np.mean(record.saturated))
+    if len(model.arm.links) == 1 and set(model.arm.links[0].flexible) == {"y"}:
+        deflection = record.plant_amplitude @ _phi_tip(plant_model)
+        found["peak_deflection_mm"] = 1e3 * float(np.abs(deflection).max())
+        long_enough = record.time[-1] >= 8.0 - 1e-9
+        found["case_study"] = case_study_metrics(record, model) if long_enough else None
+    return found
+
+
+def _from(record, start):
+    """The part of a record from a time on [s]."""
+    kept = record.time >= start - 1e-9
+    return type(record)(*(getattr(record, f.name)[kept] for f in fields(record)))
+
+
+def _rms(values, axis=None):
+    return np.sqrt(np.mean(np.square(values), axis))
+
+
+def _tip_errors(unit, distance):
+    return {
+        f"peak_tip_error_{unit}": 1e3 * float(distance.max()),
+        f"rms_tip_error_{unit}": 1e3 * float(_rms(distance)),
+    }
+
+
+def _path(model, position, amplitude):
+    """The tip along a record, shape (k, 3) [m]; a row that repeats the one before is not computed again."""
+    rows, out = np.hstack([position, amplitude]), np.empty((len(position), 3))
+    new = np.append(True, (rows[1:] != rows[:-1]).any(1))
+    for k in np.flatnonzero(new):
+        out[k] = model.tip_position(position[k], amplitude[k])
+    return out[np.maximum.accumulate(np.where(new, np.arange(len(out)), 0))]
+
+
+def _sagging_path(model, record):
+    """The tip of the statically bent arm along the reference, shape (k, 3) [m]."""
+    time, reference = record.time, record.reference
+    knots = np.searchsorted(time, np.arange(time[0], time[-1], SAG_INTERVAL) - 1e-9)
+    knots = np.unique(np.append(knots, len(time) - 1))
+    amplitude, before = [], None
+    for k in knots:
+        if before is None or (reference[k] != before).any():
+            before, bent = reference[k], model.static_deflection(reference[k])
+        amplitude.append(bent)
+    amplitude = np.array(amplitude).reshape(len(knots), model.n_modes)
+    columns = [np.interp(time, time[knots], column) for column in amplitude.T]
+    return _path(model, reference, np.array(columns).reshape(model.n_modes, len(time)).T)
+
+
+def _residual(record, model, tip, end, window):
+    """Rms of the tip's deflection about its static value after the end [mm]; None before that."""
+    late = (record.time >= end - 1e-9) & (record.time <= end + window + 1e-9)
+    if record.time[-1] < end + window - 1e-6 or not late.any():
+        return None
+    position = record.plant_position[late]
+    straight = np.zeros((len(position), model.n_modes))
+    middle = position.mean(0)
+    bent = model.tip_position(middle, model.static_deflection(middle))
+    static = bent - model.tip_position(middle, straight[0])
+    deflection = tip[late] - _path(model, position, straight)
+    return 1e3 * float(_rms(np.linalg.norm(deflection - static, axis=1)))
+
+
+def _settling_time(time, distance, end, tolerance):
+    """From the end until the tip stays within the tolerance [s]; None when it does not."""
+    outside = np.flatnonzero((time >= end - 1e-9) & (distance > tolerance))
+    if time[-1] < end - 1e-9 or (outside.size and outside[-1] == len(time) - 1):
+        return None
+    settled = float(time[outside[-1] + 1] - end) if outside.size else 0.0
+    return max(settled, SETTLING_FLOOR)
+
+
+def linear_metrics(model, law, q):
+    """Frequencies, gains and poles of a composite design, at rest in configuration q.
+
+    Parameters
+    ----------
+    model : ArmModel
+        Of one link.
+    law : CompositeControl
+    q : ndarray, shape (n,)
+
+    Returns
+    -------
+    dict
+        Keys as in ``summary.json``; k_f in the paper's units, u_f = -k z_f.
+    """
+    from flexarm_dynamics import singular_perturbation as sp
+    from flexarm_dynamics.arm.units import POUND_FORCE
+
+    terms = model.terms(q, np.zeros(model.n_joints))
+    A2, B2 = sp.fast_subsystem(terms)
+    open_loop, _ = sp.frequencies_and_damping(np.linalg.eigvals(A2))
+    K = -law.fast.K_f
+    closed, damping = sp.frequencies_and_damping(np.linalg.eigvals(A2 - B2 @ K))
+    poles = np.linalg.eigvals(
+        sp.full_order_matrix(terms, law.slow.kp, law.slow.kv, law.slow.B_inverse(terms), K)
+    )
+    poles = sorted(poles, key=lambda p: (abs(p), p.imag))
+    return {
+        "open_loop_frequencies_rad_s": open_loop.tolist(),
+        "k_f": (K[0] / POUND_FORCE).tolist(),
+        "closed_loop_frequencies_rad_s": closed.tolist(),
+        "closed_loop_damping": damping.tolist(),
+        "full_order_poles": [[float(p.real), float(p.imag)] for p in poles],
+    }

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A network between the arm and its control: samples are lost and late, and the loop goes on as the nodes do.
+
+A sample of `arm_state` is lost with a probability, each on its own; else it arrives after ``delay`` and a random
+time, uniform from 0 to ``jitter``, drawn anew for each. One that arrives after a newer one is dropped, as a DDS
+reader drops it. Observer and controller answer at arrival, and the torque acts at once: what is late on the way of
+the torque has the same effect on the arm as what is late on the way of the sample.
+
+The driver's rules are those of `flexarm_ros.torque_gate`: a torque acts until the next one, but no longer than
+`TORQUE_TIMEOUT` after the sample that it answers; then each joint's safe action does. The controller gives up
+without a sample for `STATE_TIMEOUT`, as its node does.
+"""
+
+import math
+from dataclasses import replace
+from heapq import heappop, heappush
+
+import numpy as np
+
+from flexarm_control.loop.samples import ArmSample
+from flexarm_dynamics.errors import FlexarmError, MessageError
+
+from .closed_loop import ClosedLoop
+
+#: A torque is too old when it answers a sample that was measured longer ago [s].
+TORQUE_TIMEOUT = 0.05
+#: Without a sample for so long the controller gives up [s].
+STATE_TIMEOUT = 0.5
+#: A trajectory starts so long after it was sent [s].
+LEAD = 0.1
+
+
+class Network:
+    """Loses and delays samples.
+
+    Parameters
+    ----------
+    loss : float
+        Probability that a sample is lost [-].
+    delay, jitter : float
+        Every sample is late by `delay`, and by a time uniform from 0 to `jitter` [s].
+    seed : int
+        The same seed loses the same samples.
+    """
+
+    #: A longer delay than this is a wrong number [s].
+    LONGEST = 1.0
+
+    def __init__(self, loss=0.0, delay=0.0, jitter=0.0, seed=0):
+        if not 0.0 <= loss <= 1.0:
+            raise FlexarmError(f"loss {loss}: a share from 0 to 1 is wanted")
+        for name, value in (("delay", delay), ("jitter", jitter)):
+            if not 0.0 <= value <= self.LONGEST:
+                raise FlexarmError(f"{name} {value} s: from 0 to {self.LONGEST:g} s are possible")
+        self.loss, self.delay, self.jitter = loss, delay, jitter
+        # A stream of its own beside those of the sensors' noise.
+        self._random = np.random.default_rng([seed, 2])
+        self._on_the_way = []
+        self._newest = -1
+        self.sent = self.lost = self.dropped = 0
+
+    def send(self, sample):
+        """A sample leaves the arm at its stamp."""
+        self.sent += 1
+        # Both are drawn for each sample: a longer delay does not change which ones are lost.
+        lost, late = self._random.random(2)
+        if lost < self.loss:
+            self.lost += 1
+            return
+        arrival = sample.stamp_ns + round(1e9 * (self.delay + late * self.jitter))
+        heappush(self._on_the_way, (arrival, sample.sequence, sample))
+
+    def receive(self, until_ns):
+        """The next sample to arrive up to a time, and when; None when there is none."""
+        while self._on_the_way and self._on_the_way[0][0] <= until_ns:
+            arrival, sequence, sample = heappop(self._on_the_way)
+            if sequence > self._newest:
+                self._newest = sequence
+                return arrival, sample
+            self.dropped += 1
+        return None
+
+
+class NetworkedLoop(ClosedLoop):
+    """A `ClosedLoop` with a `Network` between simulator and observer.
+
+    Parameters
+    ----------
+    *args
+        Those of `ClosedLoop`.
+    network : Network
+    **others
+        Those of `ClosedLoop`, without `delay`.
+
+    Attributes
+    ----------
+    timeouts : int
+        How often the driver went over to the safe action for want of a fresh torque.
+    """
+
+    def __init__(self, *args, network, **others):
+        super().__init__(*args, **others)
+        self.network = network
+        self.timeouts = 0
+        self._sent, self._heard_ns = -1, self.simulator.stamp_ns
+        self._torque, self._until_ns = None, 0
+
+    def follow(self, trajectory, duration):
+        """As `ClosedLoop.follow`, from the first torque on: until then the controller knows no arm to move.
+
+        A trajectory with stamp 0 gets one by which it will be known, so that it starts with a sample of the arm.
+        """
+        simulator = self.simulator
+        latest = simulator.time + self.LONGEST_START
+        while not self._answer():
+            if simulator.time > latest:
+                reason = self.controller.reason or "no sample has arrived"
+                raise MessageError(f"no torque within {self.LONGEST_START:g} s: {reason}")
+            self._advance(None)
+        if not trajectory.stamp_ns:
+            ahead = math.ceil(1e9 * LEAD / simulator.period_ns) * simulator.period_ns
+            trajectory = replace(trajectory, stamp_ns=simulator.stamp_ns + ahead)
+        return super().follow(trajectory, duration)
+
+    def _why_lost(self):
+        """As `ClosedLoop._why_lost`, but what the controller answers is older than the arm: it may not have begun."""
+        waits = self.controller.enabled and self.controller.reference.pending
+        return "" if waits else super()._why_lost()
+
+    def _answer(self):
+        """Send the present sample and answer what has arrived by now; whether torque is enabled."""
+        simulator, now = self.simulator, self.simulator.stamp_ns
+        if simulator.sequence != self._sent:
+            self._sent = simulator.sequence
+            self.network.send(copied(self.measure()))
+        while arrived := self.network.receive(now):
+            self._take(*arrived)
+        if now - self._heard_ns > 1e9 * STATE_TIMEOUT and self.controller.enabled:
+            self.controller.distrust(f"no sample for {STATE_TIMEOUT:g} s")
+            self._torque = None
+        return self.controller.enabled
+
+    def _take(self, now_ns, sample):
+        """Observer and controller on a sample that arrives; the driver on their torque."""
+        self._heard_ns = now_ns
+        enabled = self._answer_to(sample)
+        self._torque = self.controller.torque.copy() if enabled else None
+        self._until_ns = sample.stamp_ns + round(1e9 * TORQUE_TIMEOUT)
+
+    def _advance(self, torque):
+        """One period of the plant; what arrives within it acts from then on."""
+        period = self.simulator.period_ns
+        time = self.simulator.stamp_ns
+        end, parts = time + period, []
+        while arrived := self.network.receive(end - 1):
+            parts += self._acting(time, arrived[0])
+            time = arrived[0]
+            self._take(*arrived)
+        parts += self._acting(time, end)
+        self.simulator.advance_in_parts([(u, span / period) for u, span in parts])
+
+    def _acting(self, start, end):
+        """(torque or None, span [ns]) one after the other from start to end [ns]."""
+        if self._torque is None or end <= self._until_ns:
+            return [(self._torque, end - start)]
+        fresh = max(self._until_ns - start, 0)
+        parts = [(self._torque, fresh), (None, end - start - fresh)]
+        self._torque = None
+        self.timeouts += 1
+        return parts
+
+
+def copied(sample):
+    """A sample that the next measurement does not change."""
+    out = ArmSample(sample.position.size)
+    for name in ArmSample.__slots__:
+        value = getattr(sample, name)
+        setattr(out, name, value.copy() if isinstance(value, np.ndarray) else value)
+    return out

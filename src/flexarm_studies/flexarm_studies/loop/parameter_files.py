@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameter files, read without ROS, so that the loop without ROS runs from the same file as the nodes."""
+
+from pathlib import Path
+
+import yaml
+
+from flexarm_dynamics.errors import ParameterError
+
+PREFIXES = {"controller": ("slow", "fast", "manifold"), "observer": ("observer",), "simulator": ()}
+
+
+def directory():
+    """Where the shipped controller files are."""
+    from flexarm_dynamics.arm.arm_file import arms_directories
+
+    return arms_directories()[0].parent / "controllers"
+
+
+def find(name):
+    """Path of a controller file given as a path or as a shipped name.
+
+    Raises
+    ------
+    ParameterError
+        When there is none; lists the shipped names.
+    """
+    for path in (Path(name).expanduser(), directory() / f"{name}.yaml"):
+        if path.is_file():
+            return path
+    shipped = ", ".join(sorted(p.stem for p in directory().glob("*.yaml")))
+    raise ParameterError(f"controller file {str(name)!r}: neither a file nor shipped ({shipped})")
+
+
+def load(name):
+    """Parameters of each node from a ROS parameter file.
+
+    Parameters
+    ----------
+    name : str or Path
+
+    Returns
+    -------
+    dict
+        Node name to flat parameters (``{"controller": {"slow.kp": [6.25], …}, …}``), wildcards applied.
+
+    Raises
+    ------
+    ParameterError
+        For a file that can't be read, or is none of parameters.
+    """
+    path = find(name)
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        sections = {key: _flat(section["ros__parameters"]) for key, section in data.items()}
+    except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        # ValueError: text that is no UTF-8, or a scalar that is not what it looks like, as a 13th month.
+        raise ParameterError(f"{path}: can't be read: {error}") from None
+    except (TypeError, KeyError, AttributeError, IndexError):
+        raise ParameterError(
+            f"{path}: not a ROS parameter file (node name: ros__parameters: …)"
+        ) from None
+    return {
+        node: {
+            name: value
+            for key, section in sections.items()
+            if key == "/**" or key.rsplit("/", 1)[-1] == node
+            for name, value in section.items()
+        }
+        for node in PREFIXES
+    }
+
+
+def _flat(tree, prefix=""):
+    flat = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat.update(_flat(value, f"{prefix}{key}."))
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def under(parameters, prefix):
+    """Parameters below ``prefix.``, without it."""
+    return {k[len(prefix) + 1 :]: v for k, v in parameters.items() if k.startswith(prefix + ".")}

@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run of an arm under control, described by plain data: what `flexarm simulate --controller` runs.
+
+A scenario says which arm, which parameters of observer and controller, which motion, and in what the arm differs
+from what its controller knows. It goes through JSON and to other processes; the same scenario gives the same
+samples, to the last bit.
+"""
+
+import difflib
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+import yaml
+
+from flexarm_control import trajectory
+from flexarm_control.composite.law import FAST, MANIFOLD, SLOW
+from flexarm_control.composite.law import PARAMETERS as DESIGN_PARAMETERS
+from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
+from flexarm_control.loop.arm_controller import START_TOLERANCE
+from flexarm_control.loop.supervisor import State
+from flexarm_control.observers.arm_observer import OBSERVERS
+from flexarm_control.observers.arm_observer import PARAMETERS as OBSERVER_PARAMETERS
+from flexarm_control.trajectory import specs
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Arm, scaled
+from flexarm_dynamics.errors import ParameterError, TrajectoryError
+from flexarm_sim.simulator import PARAMETERS as SIMULATOR_PARAMETERS
+
+from . import parameter_files
+from .closed_loop import ClosedLoop
+from .metrics import tracking_metrics
+from .network import Network, NetworkedLoop
+
+#: Groups of components by the prefix of their parameters, and the type where none is given, as in the nodes.
+COMPONENTS = {
+    "slow": (SLOW, "linear_model_following"),
+    "fast": (FAST, "lqr"),
+    "manifold": (MANIFOLD, "corrected"),
+    "observer": (OBSERVERS, "filtered_derivative"),
+}
+#: Parameters of the nodes themselves: they say nothing of the loop.
+OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
+CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS)
+#: What a scenario says itself.
+OF_SCENARIOS = ("plant_arm", "plant_modes", "noise", "seed")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One run; every field is plain data.
+
+    Attributes
+    ----------
+    arm : str or Arm
+        Arm file, as observer and controller know it: shipped name or path. An arm that was read goes to other
+        processes, too, but not through JSON.
+    controller : dict
+        Parameters of the loop by their names in a parameter file, flat: ``{"slow.type": "model_following",
+        "slow.kp": [6.25], "observer.type": "luenberger", "torque_limit": [5.0], "rate": 500.0, …}``; see
+        `parameters`.
+    trajectory : str or dict
+        A motion in a line, such as ``paper`` or ``quintic:to=1.5,duration=2`` (`trajectory.specs`); a file, .csv or
+        .yaml (`trajectory.files`); or a mapping with ``times`` [s], ``positions`` [rad] and, if wanted,
+        ``velocities`` and ``accelerations``. The arm starts where it does, unless `controller` has an
+        ``initial_position``.
+    payload_scale, stiffness_scale, damping_scale : float
+        Of the simulated arm alone, see `arm.scaled` [-].
+    plant_arm : str
+        Arm file of the simulated arm, where it is another; scaled as well.
+    plant_modes : int
+        Modes per flexible direction of the simulated arm; 0: as in its file.
+    noise : bool
+        Whether sensors have the noise that the arm file states.
+    seed : int
+        Of the noise, and of what the network does.
+    rate : float or None
+        Samples per second; None: as in `controller`, else 1000 [Hz].
+    delay : float
+        From a measurement until its torque begins to act [s].
+    loss : float
+        Probability that a sample is lost on its way to the observer, each on its own [-]; see `network`.
+    jitter : float
+        Every sample is later still by a time uniform from 0 to this [s].
+    duration : float or None
+        From the motion's start; None: to the end of the `window` [s].
+    window : float
+        Over how long after the motion the rest is judged [s].
+    tolerance : float
+        Of the tip, for the settling time [m].
+    repeat : int
+        How often the motion is carried out, for laws that learn. In between the arm goes back the way it came.
+    """
+
+    arm: str
+    controller: dict = field(default_factory=dict)
+    trajectory: str | dict = "paper"
+    payload_scale: float = 1.0
+    stiffness_scale: float = 1.0
+    damping_scale: float = 1.0
+    plant_arm: str = ""
+    plant_modes: int = 0
+    noise: bool = False
+    seed: int = 0
+    rate: float | None = None
+    delay: float = 0.0
+    loss: float = 0.0
+    jitter: float = 0.0
+    duration: float | None = None
+    window: float = 3.0
+    tolerance: float = 1e-3
+    repeat: int = 1
+
+    def as_dict(self):
+        """The fields, ready for JSON; ``Scenario(**fields)`` is the same again."""
+        return asdict(self)
+
+
+def parameters(file, settings=()):
+    """Flat parameters for `Scenario.controller`, from a parameter file and settings beyond it.
+
+    Parameters
+    ----------
+    file : str or Path
+        Parameter file of the nodes: shipped name or path. Each parameter is taken from the section of the node
+        that it belongs to.
+    settings : sequence of str
+        ``name=value`` each, the value as YAML, as `ros2 param set` takes it.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    ParameterError
+        For a file that can't be read, and for a setting that is no parameter of the components chosen.
+    """
+    nodes = parameter_files.load(file)
+    of_simulator = {p.name for p in SIMULATOR_PARAMETERS}
+    found = {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
+    # The rate is the simulator's: what the controller is told of it is for other sources.
+    found |= {k: v for k, v in nodes["simulator"].items() if k in of_simulator}
+    for node in ("observer", "controller"):
+        own = parameter_files.PREFIXES[node]
+        found |= {k: v for k, v in nodes[node].items() if k.split(".")[0] in own}
+    found = {k: v for k, v in found.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
+    chosen = dict(map(_setting, settings))
+    found |= chosen
+    for name in chosen:
+        _check_name(name, found)
+    return found
+
+
+def _setting(text):
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise ParameterError(f"{text!r}: write name=value, such as slow.kp=[6.25]")
+    try:
+        return name.strip(), yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ParameterError(f"{name}: {value!r} is not YAML: {error}") from None
+
+
+def _check_name(name, values):
+    """Refuse a name that none of the chosen components has."""
+    prefix = name.split(".")[0]
+    if prefix in COMPONENTS:
+        known = ("type", *(p.name for p in _declared(prefix, values)))
+        known = [f"{prefix}.{k}" for k in known]
+    else:
+        known = [p.name for p in (*CONTROLLER, *SIMULATOR_PARAMETERS)]
+        known = [k for k in known if k not in (*OF_NODES, *OF_SCENARIOS)]
+    if name in known:
+        return
+    if prefix in COMPONENTS:
+        there, what = known, f" of {type_of(prefix, values)!r}"
+    else:
+        there, what = [*known, *(f"{p}.…" for p in COMPONENTS)], ""
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise ParameterError(f"{name}: no such parameter{what}; there are {', '.join(there)}{hint}")
+
+
+def type_of(prefix, values):
+    """Name of the component of a group: slow, fast, manifold or observer."""
+    return values.get(f"{prefix}.type", COMPONENTS[prefix][1])
+
+
+def _declared(prefix, values):
+    """Parameters of the chosen component of a group."""
+    common = OBSERVER_PARAMETERS if prefix == "observer" else ()
+    kind = type_of(prefix, values)
+    if not isinstance(kind, str):
+        raise ParameterError(f"{prefix}.type: {kind!r} is not a name")
+    return (*common, *registry.find(COMPONENTS[prefix][0], kind).PARAMETERS)
+
+
+def _component(prefix, values):
+    """Mapping with `type` for one component; what belongs to others of its group is left out, as by the node."""
+    given = parameter_files.under(values, prefix) | {"type": type_of(prefix, values)}
+    own = {p.name for p in _declared(prefix, values)} | {"type"}
+    if not set(given) <= own:
+        everyone = registry.importable(COMPONENTS[prefix][0]).values()
+        others = {p.name for law in everyone for p in law.PARAMETERS} - own
+        given = {k: v for k, v in given.items() if k not in others}
+    return given
+
+
+def loop_of(scenario):
+    """The scenario's `ClosedLoop`, before its first sample.
+
+    Raises
+    ------
+    FlexarmError
+        For an arm, a parameter or a design that is impossible.
+    """
+    values = scenario.controller
+    simulator, controller = {}, {}
+    for name, value in values.items():
+        if name.split(".")[0] in COMPONENTS:
+            continue
+        _check_name(name, values)
+        if name in {p.name for p in CONTROLLER}:
+            controller[name] = value
+        if name in {p.name for p in SIMULATOR_PARAMETERS}:  # `rate` is both nodes'
+            simulator[name] = value
+    simulator |= {"noise": scenario.noise, "seed": scenario.seed}
+    simulator["plant_modes"] = scenario.plant_modes
+    if scenario.rate is not None:
+        simulator["rate"] = controller["rate"] = scenario.rate
+    controller.setdefault("feedforward", "model")
+    if type_of("observer", values) == "true_rates":
+        simulator["publish_rates"] = True
+    groups = {prefix: _component(prefix, values) for prefix in COMPONENTS}
+    arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
+    plant = scaled(
+        arm_file.load(scenario.plant_arm) if scenario.plant_arm else arm,
+        scenario.payload_scale,
+        scenario.stiffness_scale,
+        scenario.damping_scale,
+    )
+    parts = {**groups, "simulator": simulator, "controller": controller, "plant_arm": plant}
+    if scenario.loss or scenario.jitter:
+        network = Network(scenario.loss, scenario.delay, scenario.jitter, scenario.seed)
+        return NetworkedLoop(arm, **parts, network=network)
+    return ClosedLoop(arm, **parts, delay=scenario.delay)
+
+
+def run(scenario):
+    """Run a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+
+    Returns
+    -------
+    record : SimulatedRecord
+        Of the last time the motion was carried out.
+    metrics : dict
+        Of that record, ready for JSON: those of `tracking_metrics`, and
+
+        ``lost``, ``reason``
+            Whether the loop lost the arm (torque disabled, motion given up, arm bent or turned beyond all sense,
+            numbers no longer finite), and why; the record then ends there.
+        ``state``
+            Of the controller's supervisor at the end.
+        ``motion_s``, ``simulated_s``
+            Until the reference's end, and until the record's.
+        ``passes``
+            With `repeat` above 1: the metrics of each time.
+
+    Raises
+    ------
+    FlexarmError
+        For a scenario that can't be run: an arm, a parameter, a design or a trajectory that is refused, or an
+        observer that does not converge. A loop that loses its arm is no error.
+    """
+    return run_loop(scenario)[:2]
+
+
+def run_loop(scenario, recorder=None):
+    """As `run`, and the `ClosedLoop` in which it ran.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    recorder : callable, optional
+        Called with the loop, the arm file's name and the observer's name; returns a context that records the run,
+        such as ``functools.partial(flexarm_tools.recording.loop_bag.LoopBag, folder)``.
+
+    Raises
+    ------
+    ParameterError
+        For a `repeat` that is no count; and as `run`.
+    """
+    if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
+        raise ParameterError(f"repeat {scenario.repeat}: an integer not below 1 is wanted")
+    loop = loop_of(scenario)
+    motion = trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
+    if "initial_position" not in scenario.controller and motion.times_ns[0] == 0:
+        loop.simulator.reset(motion.positions[0])
+    back = _returning(motion, loop.simulator.position)
+    end = 1e-9 * int(motion.times_ns[-1])
+    duration = end + scenario.window if scenario.duration is None else scenario.duration
+    _check_times(scenario, duration)
+    if recorder is None:
+        return _passes(scenario, loop, motion, back, end, duration)
+    # An `Arm` that was read has no file any more.
+    arm = scenario.arm if isinstance(scenario.arm, str) else ""
+    with recorder(loop, arm, type_of("observer", scenario.controller)):
+        return _passes(scenario, loop, motion, back, end, duration)
+
+
+def _passes(scenario, loop, motion, back, end, duration):
+    """Carry the motion out as often as it is wanted; as `run_loop`."""
+    passes = []
+    for i in range(scenario.repeat):
+        if i and back is not None and not loop.lost:
+            loop.follow(_next(back, loop), duration)
+        if i and loop.lost:
+            break
+        record = loop.follow(_next(motion, loop) if i else motion, duration)
+        passes.append(_metrics(scenario, loop, record, end, duration))
+    metrics = passes[-1] | {"lost": bool(loop.lost), "reason": loop.lost}
+    if scenario.repeat > 1:
+        metrics["passes"] = passes
+    return record, metrics, loop
+
+
+def _check_times(scenario, duration):
+    limits = (
+        ("window", scenario.window),
+        ("tolerance", scenario.tolerance),
+        ("duration", duration),
+    )
+    for name, value in limits:
+        if not 0.0 <= value <= 1e5:
+            raise ParameterError(f"{name} {value}: a number from 0 to 1e5 is wanted")
+
+
+def _metrics(scenario, loop, record, end, duration):
+    found = {
+        "lost": bool(loop.lost),
+        "reason": loop.lost,
+        "state": State(record.state[-1]).name,
+        "motion_s": end,
+        "simulated_s": float(record.time[-1]),
+    }
+    window = min(scenario.window, max(duration - end, 0.0))
+    plant = loop.simulator.plant_model
+    # An arm that was lost may be anywhere: squares of its numbers need not be finite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found |= tracking_metrics(record, loop.model, plant, end, window, scenario.tolerance)
+    return found
+
+
+# Trajectories ----------------------------------------------------------------------------------
+
+
+def trajectory_of(given, model, start):
+    """A trajectory from what `Scenario.trajectory` may be.
+
+    Parameters
+    ----------
+    given : str or dict
+    model : ArmModel
+        Of the arm that follows it: its joints and their limits.
+    start : ndarray, shape (n,)
+        Where the joints are [rad].
+
+    Returns
+    -------
+    JointTrajectoryData
+        With stamp 0: now.
+
+    Raises
+    ------
+    TrajectoryError
+    """
+    if isinstance(given, str):
+        return specs.load(given, model, start)
+    names = model.joint_names
+    return trajectory.validate(names, names, 0, _points(given), *specs.limits(model))
+
+
+def _points(given):
+    unknown = set(given) - {"times", "positions", "velocities", "accelerations"}
+    if unknown or not {"times", "positions"} <= set(given):
+        raise TrajectoryError(
+            f"a trajectory has times, positions, velocities and accelerations, not {', '.join(given)}"
+        )
+    times = [round(1e9 * t) for t in given["times"]]
+    fields = [given.get(k, [()] * len(times)) for k in ("positions", "velocities", "accelerations")]
+    return [(*point, ()) for point in zip(times, *fields, strict=True)]
+
+
+def _returning(motion, start):
+    """The way back, None where a motion ends at its start."""
+    if np.abs(motion.positions[-1] - start).max() < 1e-9:
+        return None
+    last = int(motion.times_ns[-1])
+    signs = {"positions": 1.0, "velocities": -1.0, "accelerations": 1.0}
+    at = {"positions": start, "velocities": 0.0 * start, "accelerations": 0.0 * start}
+    first = int(motion.times_ns[0])
+    fields = []
+    for name, sign in signs.items():
+        values = getattr(motion, name)
+        if values is None:
+            fields.append([()] * (len(motion.times_ns) + bool(first)))
+            continue
+        values = np.vstack([at[name], values]) if first else values
+        fields.append(sign * values[::-1])
+    times = np.append(0, motion.times_ns) if first else motion.times_ns
+    points = [(int(last - t), *f, ()) for t, *f in zip(times[::-1], *fields, strict=True)]
+    names = motion.joint_names
+    return trajectory.validate(names, names, 0, points)
+
+
+def _next(motion, loop):
+    """The motion from the next sample on."""
+    return replace(motion, stamp_ns=loop.simulator.stamp_ns + loop.simulator.period_ns)

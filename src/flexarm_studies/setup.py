@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import find_packages, setup
+
+name = "flexarm_studies"
+
+setup(
+    name=name,
+    version="0.1.0",
+    description="Studies of arms under control: closed loop, case study, analysis, comparison, identification.",
+    license="Apache-2.0",
+    maintainer="flexarm maintainers",
+    maintainer_email="maintainers@flexarm.invalid",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
+        (f"share/{name}", ["package.xml"]),
+    ],
+    zip_safe=False,
+)

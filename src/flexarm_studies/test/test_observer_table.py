@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observers side by side, and the paper's motion under the control of what a Kalman filter makes of counts."""
+
+from argparse import ArgumentParser
+
+import numpy as np
+import pytest
+import yaml
+from numpy.testing import assert_allclose
+
+from flexarm_control.observers.arm_observer import observe
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models import model
+from flexarm_studies.case_study.runs import paper_trajectory
+from flexarm_studies.commands import observer_table
+from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS, ClosedLoop
+
+SLOW, FAST = {"type": "linear_model_following"}, {"type": "lqr"}
+
+
+@pytest.fixture(scope="module")
+def sensed(tmp_path_factory):
+    """Arm R with half a microstrain of noise and an encoder of 4096 counts, as a file."""
+    data = yaml.safe_load(arm_file.find("R").read_text())
+    for gauge in data["gauges"]:
+        gauge["noise"] = 0.5e-6
+    data["joints"][0]["encoder_counts"] = 4096
+    path = tmp_path_factory.mktemp("arms") / "R_sensed.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return str(path)
+
+
+def paper_motion(arm, observer, seconds=8.0):
+    """Estimated and true rates of the modes, and both for the joint, from the trajectory's start on."""
+    settings = {"rate": 500.0, "noise": True, "publish_joint_velocity": False}
+    loop = ClosedLoop(arm, SLOW, FAST, observer, settings)
+    loop.step()
+    verdict = loop.controller.offer(paper_trajectory(loop.model.joint_names))
+    assert verdict.accepted, verdict.reason
+    plant, simulator, found, true = loop.simulator.plant, loop.simulator, [], []
+    while simulator.stamp_ns <= TRAJECTORY_START_NS + seconds * 1e9:
+        started = simulator.stamp_ns >= TRAJECTORY_START_NS
+        state = np.concatenate([plant.delta_d, plant.qd])
+        loop.step()
+        if started:
+            found.append(np.concatenate([loop.observer.rate, loop.observer.velocity]))
+            true.append(state)
+    assert loop.controller.reference.finished
+    return np.array(found), np.array(true), loop
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=0))
+
+
+def test_the_papers_motion_with_counts_and_noisy_gauges_alone(sensed):
+    found, true, loop = paper_motion(sensed, {"type": "kalman"})
+    error, size = rms(found - true), rms(true)
+    assert error[0] < 0.05 * size[0]
+    assert error[2] < 0.01 * size[2]
+    assert loop.observer.observer.consistent
+    assert np.abs(loop.simulator.plant.q[0] - np.pi / 2) < 2e-3
+
+
+def test_the_table_ranks_observers_as_they_should_be():
+    names = ["filtered_derivative", "luenberger", "kalman"]
+    noises = {"none": (0.0, 0), "given": (5e-7, 4096)}
+    rows = observer_table.table("R", [500.0], noises, [0.0, 0.01], names, 1.0)
+    assert len(rows) == 2 * 3 * 3
+    error = {
+        (r["observer"], r["noise"], r["delay [ms]"], r["predicted"]): r["all modes [%]"]
+        for r in rows
+    }
+    derivative, luenberger, kalman = (error[name, "given", 0.0, False] for name in names)
+    assert kalman < 0.2 * luenberger < 0.2 * derivative
+    assert error["kalman", "none", 0.0, False] < 0.01
+    for name in names:
+        assert error[name, "none", 10.0, True] < 0.3 * error[name, "none", 10.0, False]
+
+
+def test_an_observer_hears_the_motion_as_its_sensors_give_it():
+    arm = model.build(arm_file.load("R"))
+    states, torques = observer_table.motion(arm, 500.0, 0.4)
+    core = observe(arm, "true_rates", {})
+    core.observer.update = lambda sample, dt: core.observer.amplitude.__setitem__(
+        slice(None), sample.amplitude
+    )
+    heard = observer_table.listen(arm, core, states, torques, 500.0)
+    assert_allclose(heard[:, :3], states[:, :3], atol=1e-12)
+    assert np.abs(states[:, 4:]).max() > 0.01
+
+
+def test_the_command_prints_a_row_per_case(capsys):
+    parser = ArgumentParser()
+    observer_table.add_arguments(parser)
+    options = parser.parse_args(
+        [
+            "two_link",
+            "--rates",
+            "250",
+            "--delays",
+            "0,0.004",
+            "--observers",
+            "luenberger",
+            "--duration",
+            "0.3",
+        ]
+    )
+    observer_table.observers(options)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 2 * 3
+    assert lines[0] == "| " + " | ".join(observer_table.COLUMNS) + " |"
+    assert [line.split("|")[5].strip() for line in lines[2:5]] == ["no", "no", "yes"]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--rates", "0"], "--rates 0: from 1 to 20000"),
+        (["--delays", "1.0"], r"--delays 1: from 0 to 0\.1"),
+        (["--rates", "fast"], "--rates fast: numbers separated by commas"),
+        (["--duration", "1e9"], "1000 Hz for 1e\\+09 s: from 10 to"),
+        (["--observers", "nobody"], "nobody"),
+    ],
+)
+def test_what_the_command_can_not_use_it_refuses(words, reason):
+    parser = ArgumentParser()
+    observer_table.add_arguments(parser)
+    with pytest.raises(FlexarmError, match=reason):
+        observer_table.observers(parser.parse_args(["R", "--duration", "0.1", *words]))

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameter files read without ROS: which section is whose, what is refused."""
+
+import pytest
+
+from flexarm_control.composite.law import design
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.models import model
+from flexarm_studies.loop import parameter_files
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Loads YAML text as a controller file."""
+
+    def load(text):
+        path = tmp_path / "some.yaml"
+        path.write_text(text)
+        return parameter_files.load(path)
+
+    return load
+
+
+def test_a_section_with_wildcards_is_every_nodes(load):
+    found = load("/**:\n  ros__parameters: {arm: R, slow: {kp: [6.25]}}\n")
+    assert set(found) == {"controller", "observer", "simulator"}
+    for values in found.values():
+        assert values == {"arm": "R", "slow.kp": [6.25]}
+
+
+@pytest.mark.parametrize("key", ["controller", "/controller", "/left/controller", "/**/controller"])
+def test_a_named_section_is_that_nodes_alone_in_any_namespace(load, key):
+    found = load(f"{key}:\n  ros__parameters: {{arm: R}}\n")
+    assert found == {"controller": {"arm": "R"}, "observer": {}, "simulator": {}}
+
+
+def test_a_later_section_wins_as_in_ros(load):
+    both = "{0}:\n  ros__parameters: {{arm: first, rate: 1.0}}\n{1}:\n  ros__parameters: {{arm: last}}\n"
+    for keys in (("/**", "controller"), ("controller", "/**")):
+        assert load(both.format(*keys))["controller"] == {"arm": "last", "rate": 1.0}
+
+
+def test_sections_of_other_nodes_are_nobodys(load):
+    assert load("camera:\n  ros__parameters: {arm: R}\n")["controller"] == {}
+
+
+def test_nested_and_dotted_names_are_the_same(load):
+    nested = load("/**:\n  ros__parameters:\n    slow:\n      gain: m11\n      a: {b: 1}\n")
+    dotted = load("/**:\n  ros__parameters: {slow.gain: m11, slow.a.b: 1}\n")
+    assert nested == dotted
+    assert nested["controller"] == {"slow.gain": "m11", "slow.a.b": 1}
+
+
+def test_an_empty_file_sets_nothing(load):
+    assert load("# nothing\n")["controller"] == {}
+
+
+def test_under_takes_a_prefix_and_no_namesake():
+    values = {"slow.kp": [1.0], "slow.a.b": 2, "slower.kp": 3, "slow": 4, "fast.r": 5}
+    assert parameter_files.under(values, "slow") == {"kp": [1.0], "a.b": 2}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "- a list",
+        "just text",
+        "controller: {arm: R}",
+        "controller: {ros__parameters: [1, 2]}",
+        "controller: {ros__parameters: }",
+        "controller:",
+        "controller: {ros__parameters: {slow: {1: 2}}}",
+    ],
+)
+def test_what_is_no_parameter_file_is_refused_naming_it(load, text):
+    with pytest.raises(ParameterError, match=r"some\.yaml: not a ROS parameter file"):
+        load(text)
+
+
+@pytest.mark.parametrize("text", ["a: [1, 2", "a: b: c", "\tx: 1", "a: !!python/object:x {}"])
+def test_malformed_yaml_is_refused_naming_the_file(load, text):
+    with pytest.raises(ParameterError, match=r"some\.yaml: can't be read"):
+        load(text)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / "binary.yaml"
+    path.write_bytes(b"\xff\xfe\x00\xd8")
+    with pytest.raises(ParameterError, match=r"binary\.yaml: can't be read"):
+        parameter_files.load(path)
+
+
+@pytest.mark.parametrize("name", ["paper_composit", "/nowhere/x.yaml", "", "."])
+def test_a_name_that_is_neither_file_nor_shipped_lists_the_shipped_ones(name):
+    with pytest.raises(
+        ParameterError, match=r"neither a file nor shipped.*paper_composite, .*paper_slow"
+    ):
+        parameter_files.load(name)
+
+
+@pytest.mark.parametrize("name", ["paper_composite", "paper_slow"])
+def test_a_shipped_file_designs_a_controller_for_every_shipped_arm(name):
+    values = parameter_files.load(name)["controller"]
+    groups = [parameter_files.under(values, p) for p in ("slow", "fast")]
+    for arm in ("R", "P3", "one_link"):
+        law = design(model.build(arm_file.load(arm)), *groups)
+        assert type(law.fast).__name__ == ("Lqr" if name == "paper_composite" else "NoFastLaw")
+    assert parameter_files.load(parameter_files.find(name)) == parameter_files.load(name)

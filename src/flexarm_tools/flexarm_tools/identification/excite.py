@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm excite``: shakes a running arm with the node `excite`, and writes a bag of what it did meanwhile."""
+
+import json
+import os
+import signal
+import subprocess
+import tempfile
+from pathlib import Path
+
+from flexarm_control.motions import excitation_run
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.progress import Progress
+
+from .live import PATIENCE, Graph
+
+#: Wall time without a new state after which the arm is taken for lost [s].
+SILENCE = 10.0
+#: This process's node.
+RECORDER = "excite_recorder"
+
+
+def add_arguments(parser):
+    """Arguments of ``excite``: the node's parameters, and where the bag goes."""
+    parser.description = (
+        "Runs the node `excite` on a running driver or simulator; records while its torque "
+        "is applied."
+    )
+    parser.epilog = (
+        "example: flexarm excite my_arm.yaml --kind sweep --amplitude 2 --out results/sweep "
+        "--allow-motion"
+    )
+    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    parser.add_argument(
+        "--out", required=True, metavar="BAG", help="directory of the bag, a new one"
+    )
+    parser.add_argument(
+        "--allow-motion", action="store_true", help="stand clear: the arm will move"
+    )
+    for p in excitation_run.PARAMETERS:
+        unit = f" [{p.unit}]" if p.unit != "-" else ""
+        default = f" (default {p.default:g})" if p.kind == "float" else ""
+        parser.add_argument(
+            "--" + p.name.replace("_", "-"),
+            type=float if p.kind == "float" else str,
+            choices=p.choices or None,
+            default=p.default,
+            help=f"{p.description}{unit}{default}".replace("%", "%%"),
+        )
+    parser.add_argument("--namespace", default="", help="of the arm's topics")
+    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
+
+
+def excite(options):
+    """Run ``excite``; the bag's path.
+
+    Raises
+    ------
+    FlexarmError
+        When the arm must not move, no driver answers, or the excitation was stopped; what came before is kept.
+    """
+    from ..recording.recorder import write_bag
+
+    if not options.allow_motion:
+        raise FlexarmError("this moves the arm: stand clear, and give --allow-motion")
+    out = Path(options.out)
+    if out.exists():
+        raise FlexarmError(f"--out {out}: exists already")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    arm_file.load(options.arm)  # refused here, and not in another process's log
+    with Graph(RECORDER, options.namespace) as graph:
+        states = graph.tap.raw["arm_state"]
+        silence = f"no arm_state for {PATIENCE:g} s: start the driver (or simulator)"
+        graph.wait_for(lambda: states, PATIENCE, silence)
+        if graph.tap.publishers("joint_torque"):
+            raise FlexarmError("a controller sends joint_torque: stop it")
+        progress = Progress()
+        progress.step(f"shake {options.arm}")
+        said = _run(options, graph)
+        progress.done()
+        kept = between(graph.tap.messages(), graph.tap.raw)
+    if not kept["joint_torque"]:
+        raise FlexarmError(f"no torque was sent:\n{said}")
+    write_bag(out, kept, options.arm)
+    count = len(kept["arm_state"])
+    print(
+        json.dumps({"out": str(out), "states": count})
+        if options.json
+        else f"{count} states in {out}"
+    )
+    if "excitation complete" not in said:
+        raise FlexarmError(f"{_ending(said) or said}; what came before is in {out}")
+    return out
+
+
+def node_parameters(options):
+    """Parameters of the node, from the options; name to value."""
+    from ..recording.recorder import KEPT
+
+    # The driver, and this recorder, which is to get every torque even if the machine leaves it waiting.
+    values = {"arm": str(arm_file.find(options.arm)), "readers": 2, "recorder": RECORDER}
+    topic = "/".join(("", options.namespace.strip("/"), "joint_torque")).replace("//", "/")
+    values |= {f"qos_overrides.{topic}.publisher.depth": KEPT}
+    values |= {p.name: getattr(options, p.name) for p in excitation_run.PARAMETERS}
+    return {k: v for k, v in values.items() if v != ""}
+
+
+def _run(options, graph):
+    """Run the node until it says that it has ended; what it said."""
+    from ..running.processes import arguments, executable
+
+    values = node_parameters(options)
+    remaps = [f"__ns:=/{options.namespace.strip('/')}"] if options.namespace.strip("/") else []
+    command = [executable("flexarm_control", "excite"), *arguments(values, None, remaps)]
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+            env={**os.environ, "RCUTILS_LOGGING_USE_STDOUT": "0"},
+        )  # fmt: skip
+
+        def said():
+            return os.pread(log.fileno(), 1_000_000, 0).decode(errors="replace")
+
+        def ended():
+            return process.poll() is not None or "excitation complete" in said() or _ending(said())
+
+        try:
+            seen = -1
+            while not ended():
+                new = len(graph.tap.raw["arm_state"])
+                if new == seen:
+                    raise FlexarmError(f"no arm_state for {SILENCE:g} s\n{said()}")
+                seen = new
+                graph.wait_for(
+                    lambda seen=seen: len(graph.tap.raw["arm_state"]) > seen or ended(),
+                    SILENCE,
+                    f"no arm_state for {SILENCE:g} s\n{said()}",
+                )
+            graph.tap.poll()
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        return said()
+
+
+def _ending(said):
+    """The line that says why it was stopped."""
+    lines = [x for x in said.splitlines() if "excitation stopped" in x or "not configured" in x]
+    return lines[0].split("]: ")[-1] if lines else ""
+
+
+def between(messages, raw):
+    """The raw messages from the first enabled torque to the last, topic to {stamp [ns]: bytes}.
+
+    Before and after acts the safe action, which no torque tells of.
+    """
+    from flexarm_ros.messages import stamp_ns
+
+    enabled = [stamp_ns(m.header.stamp) for m in messages["joint_torque"] if m.mode == m.ENABLED]
+    if not enabled:
+        return {topic: {} for topic in raw}
+    begin, end = min(enabled), max(enabled)
+    kept = {topic: {} for topic in raw}
+    for topic, rows in messages.items():
+        for message, data in zip(rows, raw[topic], strict=True):
+            if begin <= stamp_ns(message.header.stamp) <= end:
+                kept[topic][stamp_ns(message.header.stamp)] = data
+    return {topic: dict(sorted(rows.items())) for topic, rows in kept.items()}

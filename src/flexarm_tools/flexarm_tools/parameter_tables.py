@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of all parameters in Markdown, from the declarations that the nodes validate with."""
+
+import json
+
+from flexarm_studies.markdown import write_between
+
+BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
+
+
+def groups():
+    """Node name to its declared parameters by prefix."""
+    from flexarm_control.nodes import controller, excite, observer
+    from flexarm_ros.node import COMMON
+    from flexarm_sim import simulator
+    from flexarm_sim.nodes import simulator as simulator_node
+
+    common = {"": COMMON}
+    return {
+        "simulator": {"": (*common[""], *simulator.PARAMETERS, *simulator_node.PARAMETERS)},
+        "observer": _with(observer.parameter_groups(), common),
+        "controller": _with(controller.parameter_groups(), common),
+        "excite": _with(excite.parameter_groups(), common),
+    }
+
+
+def _with(given, common):
+    return {**given, "": (*common[""], *given[""])}
+
+
+def tables():
+    """One table per node."""
+    lines = []
+    for node, by_prefix in groups().items():
+        lines += [f"**`{node}`**", "", "| parameter | default | unit | range | what it does |"]
+        lines += ["|---|---|---|---|---|"]
+        for prefix, declared in by_prefix.items():
+            lines += [_row(prefix, p) for p in declared]
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def plain():
+    """The declarations as plain data: node to a list of parameters."""
+    return {
+        node: [
+            {
+                "name": prefix + p.name,
+                "type": p.kind,
+                "default": p.default,
+                "unit": p.unit,
+                "low": p.low,
+                "high": p.high,
+                "choices": list(p.choices),
+                "read_only": p.read_only,
+                "description": p.description,
+            }
+            for prefix, declared in by_prefix.items()
+            for p in declared
+        ]
+        for node, by_prefix in groups().items()
+    }
+
+
+def _row(prefix, p):
+    default = f"`{p.default!r}`".replace("'", '"').replace("True", "true").replace("False", "false")
+    if p.choices:
+        span = ", ".join(f"`{c}`" for c in p.choices)
+    elif p.low is not None or p.high is not None:
+        span = f"{p.low:g} … {p.high:g}"
+    else:
+        span = ""
+    text = p.description + ("" if not p.read_only else " *Read-only.*")
+    return f"| `{prefix}{p.name}` | {default} | {p.unit} | {span} | {text} |"
+
+
+def write(file):
+    """Put the tables between the markers of a Markdown file.
+
+    Raises
+    ------
+    FlexarmError
+        When the file has no markers.
+    """
+    write_between(file, BEGIN, END, tables())
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Prints every node's parameters as Markdown, or writes them between a file's markers."
+    )
+    parser.epilog = "example: flexarm parameters --write docs/parameters.md"
+    parser.add_argument("--write", metavar="FILE", help="rewrite the tables of this file")
+    parser.add_argument("--json", action="store_true", help="print the declarations as JSON")
+
+
+def parameters(options):
+    """Run the sub-command."""
+    if options.write:
+        write(options.write)
+    elif options.json:
+        print(json.dumps(plain(), indent=1))
+    else:
+        print(tables())

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes a motion, or writes it to a file: ``ros2 run flexarm_bringup publish_trajectory``."""
+
+import argparse
+import json
+import math
+import sys
+import time
+
+import numpy as np
+
+from flexarm_control.trajectory import files, specs
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_dynamics.models import model
+
+#: Points of the message; quintics between them follow the first two exactly, or nearly so, with few.
+POINTS = {"paper": 101, "quintic": 101}
+#: Settings of the families as options: what they are for messages; None: as they are written.
+_LISTS = {
+    "from": "angles",
+    "to": "angles",
+    "tip": "coordinates",
+    "via": "coordinates",
+    "torque-limit": "torques",
+    "velocity-limit": "speeds",
+}
+_PLAIN = ("duration", "smoothness", "shaper", "shape-modes")
+
+
+def add_arguments(parser):
+    """Arguments of the command, without ROS."""
+    parser.description = (
+        "Publishes a motion on joint_trajectory once, and waits until it is received."
+    )
+    parser.epilog = "example: flexarm publish quintic --to 1.57 --duration 3"
+    parser.add_argument("profile", choices=tuple(specs.FAMILIES), help="which motion")
+    parser.add_argument("--arm", default="R", help="arm file, for the joint names (default R)")
+    parser.add_argument(
+        "--from",
+        dest="start",
+        help="joint angles where the motion starts, comma separated [rad] (default: where the reference is)",
+    )
+    parser.add_argument(
+        "--to", help="joint angles where it ends, comma separated [rad] (default 90 deg)"
+    )
+    parser.add_argument("--tip", metavar="x,y,z", help="line, arc: where the tip ends [m]")
+    parser.add_argument("--via", metavar="x,y,z", help="arc: a point on the way [m]")
+    parser.add_argument("--duration", type=float, default=2.0, help="[s] (default 2)")
+    parser.add_argument(
+        "--smoothness",
+        type=int,
+        help="smooth, line, arc: derivatives that vanish at the ends, from 2 (default 3)",
+    )
+    parser.add_argument(
+        "--torque-limit",
+        help="least-exciting: largest slow torque, one or one per joint [N m] (default: the arm file's)",
+    )
+    parser.add_argument(
+        "--velocity-limit",
+        help="least-exciting: largest speed, one or one per joint [rad/s] (default: the arm file's)",
+    )
+    parser.add_argument("--shaper", choices=("zv", "zvd"), help="shape the motion; it gets longer")
+    parser.add_argument(
+        "--shape-modes",
+        type=int,
+        help=f"how many of the lowest modes the shaper is for (default {specs.SHAPE_MODES}, or all there are)",
+    )
+    parser.add_argument(
+        "--points",
+        type=int,
+        help=f"points of the message (default 101 for paper and quintic, else {specs.POINTS})",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="say what the motion is and excites, publish nothing; it starts at zero unless --from is given",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        help="write it to a .csv or .yaml file for later, publish nothing; starts as --dry-run does",
+    )
+    parser.add_argument("--json", action="store_true", help="say it as JSON")
+    parser.add_argument("--topic", default="joint_trajectory", help="topic to publish on")
+    parser.add_argument(
+        "--timeout", type=float, default=10.0, help="longest wait for a controller [s] (default 10)"
+    )
+
+
+def _list(text, count, name):
+    what, spread = _LISTS[name], count != 3 or _LISTS[name] != "coordinates"
+    try:
+        values = [float(v) for v in text.split(",")]
+    except ValueError:
+        raise TrajectoryError(f"--{name} {text!r}: write numbers, comma separated") from None
+    values = values * count if spread and len(values) == 1 else values
+    if len(values) != count or not all(map(math.isfinite, values)):
+        each = "x,y,z" if what == "coordinates" else "one per joint"
+        raise TrajectoryError(f"--{name} {text!r}: {count} finite {what} are wanted, {each}")
+    return values
+
+
+def settings_of(options, count):
+    """What the options set, as `specs.motion` takes it, for `count` joints."""
+    given = {key: getattr(options, key.replace("-", "_"), None) for key in (*_LISTS, *_PLAIN)}
+    given["from"] = options.start
+    out = {key: str(given[key]) for key in _PLAIN if given[key] is not None}
+    for key, what in _LISTS.items():
+        if given[key] is not None:
+            values = _list(given[key], 3 if what == "coordinates" else count, key)
+            out[key] = ";".join(map(repr, values))
+    return out
+
+
+def profile_of(options, reference, arm=None):
+    """The motion that the options describe, from `reference` unless they say from where.
+
+    Parameters
+    ----------
+    options : Namespace
+    reference : sequence of n float
+        [rad]
+    arm : ArmModel, optional
+        Built from the options where it is needed and not given.
+    """
+    settings = settings_of(options, len(reference))
+    if arm is None and specs.needs_model(options.profile, settings):
+        arm = model.build(arm_file.load(options.arm))
+    return specs.motion(options.profile, settings, arm, list(reference))
+
+
+def points_of(options):
+    """How many points the message has."""
+    return POINTS.get(options.profile, specs.POINTS) if options.points is None else options.points
+
+
+def prepare(options):
+    """Write the motion to a file, say what it is and excites, or both; without ROS.
+
+    Raises
+    ------
+    FlexarmError
+        When there is no such motion, or it is beyond the arm's limits.
+    """
+    arm = model.build(arm_file.load(options.arm))
+    profile = profile_of(options, np.zeros(arm.n_joints), arm)
+    trajectory = specs.sampled(profile, arm, points_of(options))
+    said = {"profile": options.profile, "duration_s": profile.duration}
+    if options.dry_run:
+        said |= effects(profile, arm)
+        if not options.json:
+            print(description(said))
+    if options.out:
+        files.write(options.out, trajectory)
+        said |= {"out": options.out, "points": len(trajectory.times_ns)}
+        if not options.json:
+            print(f"{options.out}: {said['points']} points, {profile.duration:g} s")
+    if options.json:
+        print(json.dumps(said, allow_nan=False))
+
+
+def effects(profile, arm):
+    """Peaks of a motion and of its slow torque, and the vibrations that it leaves without fast control; plain data."""
+    from flexarm_control.motions import excitation
+
+    excited = excitation.along(arm, profile)
+    speed = np.abs(profile.velocity(excited.times)).max(axis=0)
+    joints = [
+        {
+            "name": joint.name,
+            "from_rad": float(profile.start[i]),
+            "to_rad": float(profile.start[i] + profile.angle[i]),
+            "peak_speed_rad_s": float(speed[i]),
+            "speed_limit_rad_s": _limit(joint.limits.velocity),
+            "peak_slow_torque_Nm": float(excited.peak_torque[i]),
+            "torque_limit_Nm": _limit(joint.limits.torque),
+        }
+        for i, joint in enumerate(arm.arm.joints)
+    ]
+    if not arm.n_modes:
+        return {"joints": joints}
+    energies = {"mean": float(excited.transient), "left_at_the_end": float(excited.residual)}
+    return {"joints": joints, "vibration_energy_J": energies}
+
+
+def description(said):
+    """What `prepare` found, for people."""
+    lines = [f"{said['profile']}: {said['duration_s']:.6g} s"]
+    for joint in said["joints"]:
+        torque, limit = joint["peak_slow_torque_Nm"], joint["torque_limit_Nm"]
+        lines.append(
+            f"  {joint['name']}: {joint['from_rad']:.4g} to {joint['to_rad']:.4g} rad, at most"
+            f" {joint['peak_speed_rad_s']:.4g} rad/s{_of(joint['speed_limit_rad_s'])}, slow torque"
+            f" {torque:.4g} N m{_of(limit)}"
+        )
+        if limit is not None and torque > limit:
+            lines[-1] += ": it will be clipped; give it more time"
+    if "vibration_energy_J" in said:
+        energy = said["vibration_energy_J"]
+        lines.append(
+            f"  vibration about the quasi-steady state, without fast control: {energy['mean']:.3g} J on"
+            f" average, {energy['left_at_the_end']:.3g} J left at the end"
+        )
+    return "\n".join(lines)
+
+
+def _limit(value):
+    return float(value) if math.isfinite(value) else None
+
+
+def _of(limit):
+    return "" if limit is None else f" of {limit:g}"
+
+
+class _Conversation:
+    """A node that publishes trajectories and hears what the controller makes of them."""
+
+    def __init__(self, options, ros_args):
+        import rclpy
+        from trajectory_msgs.msg import JointTrajectory
+
+        from flexarm_msgs.msg import CompositeState
+        from flexarm_ros import qos
+
+        self.timeout = options.timeout
+        self.context = rclpy.Context()
+        rclpy.init(args=ros_args, context=self.context)
+        self.node = rclpy.create_node("publish_trajectory", context=self.context)
+        self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.publisher = self.node.create_publisher(JointTrajectory, options.topic, qos.COMMAND)
+        self.state = None
+        self.node.create_subscription(CompositeState, "controller/state", self._hear, qos.LINE)
+
+    def _hear(self, msg):
+        self.state = msg
+
+    def wait_for(self, condition, otherwise):
+        """Serve callbacks until `condition` holds; raise a FlexarmError with `otherwise` when it does not."""
+        end = time.monotonic() + self.timeout
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > end:
+                raise FlexarmError(otherwise)
+
+    def close(self):
+        import rclpy
+
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def publish(options, ros_args=None):
+    """Publish once, with stamp 0 (now), to a controller that is there; say what became of it.
+
+    With ``--dry-run`` or ``--out`` nothing is published: `prepare`.
+
+    `ros_args` go to rclpy as they are.
+
+    Raises
+    ------
+    FlexarmError
+        When there is no controller, or it refuses the trajectory.
+    """
+    if options.dry_run or options.out:
+        prepare(options)
+        return
+    from .running.lockstep import trajectory_message
+
+    arm = arm_file.load(options.arm)
+    names = arm.joint_names
+    settings = settings_of(options, len(names))
+    built = model.build(arm) if specs.needs_model(options.profile, settings) else None
+    if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
+        profile_of(options, [0.0] * len(names), built)  # wrong options are said before it waits
+    line = _Conversation(options, ros_args)
+    try:
+        line.wait_for(
+            lambda: line.state is not None and line.publisher.get_subscription_count(),
+            f"no controller answers on {line.publisher.topic_name} and controller/state for"
+            f" {options.timeout:g} s: start simulator, observer and controller, on this ROS_DOMAIN_ID",
+        )
+        before = line.state
+        profile = profile_of(options, before.reference_position, built)
+        message = trajectory_message(names, profile, points_of(options))
+        if options.profile == "quintic" and not options.start and not options.shaper:
+            # The controller's own quintic to the last point begins at its reference, moving or not.
+            message.points = message.points[-1:]
+        line.publisher.publish(message)
+
+        def answered():
+            now = line.state
+            refused = now.rejected_reason not in ("", before.rejected_reason)
+            return now.accepted_trajectory_id != before.accepted_trajectory_id or refused
+
+        last = f"; it last refused: {before.rejected_reason}" if before.rejected_reason else ""
+        line.wait_for(
+            answered, f"the controller took no notice: a repeat of what it follows?{last}"
+        )
+        if line.state.accepted_trajectory_id == before.accepted_trajectory_id:
+            raise FlexarmError(f"refused: {line.state.rejected_reason}")
+        said = {
+            "profile": options.profile,
+            "trajectory_id": line.state.accepted_trajectory_id,
+            "points": len(message.points),
+            "duration_s": profile.duration,
+        }
+        print(
+            json.dumps(said)
+            if options.json
+            else f"{options.profile}: accepted as trajectory {said['trajectory_id']}, {said['points']} points,"
+            f" {profile.duration:g} s"
+        )
+    finally:
+        line.close()
+
+
+def main(args=None):
+    """Entry point of the executable."""
+    words = list(sys.argv[1:] if args is None else args)
+    at = words.index("--ros-args") if "--ros-args" in words else len(words)
+    parser = argparse.ArgumentParser(
+        prog="publish_trajectory",
+        description="Publishes a motion on joint_trajectory once.",
+        epilog="example: ros2 run flexarm_bringup publish_trajectory paper --arm R",
+    )
+    add_arguments(parser)
+    try:
+        publish(parser.parse_args(words[:at]), words[at:])
+    except FlexarmError as error:
+        print(f"publish_trajectory: {error}", file=sys.stderr)
+        sys.exit(1)
+    sys.exit(0)
+
+
+def entry():
+    """Entry point of the process."""
+    from flexarm_ros.start import leave_after
+
+    leave_after(main)
+
+
+if __name__ == "__main__":
+    entry()

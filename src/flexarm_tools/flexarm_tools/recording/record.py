@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm record``: a bag of a running arm, of a driver or of the simulator alike.
+
+It listens to the line's topics and writes what comes, message by message, so that memory stays small however long it
+takes. The arm's name is asked of the nodes, and the text of its file goes into the bag.
+"""
+
+import datetime
+import json
+import sys
+import time
+from pathlib import Path
+
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+
+#: Wait for the first message [s].
+PATIENCE = 10.0
+#: Between two looks at the middleware's queues, and between two lines on a terminal [s].
+POLL_PERIOD, TELL_PERIOD = 0.005, 0.5
+#: Nodes that know the arm; the first one that answers is believed.
+ASKED = ("observer", "controller", "observer_controller", "simulator")
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Subscribes to the arm's topics and writes what comes to a rosbag2 bag (MCAP), with "
+        "the arm file in it; nothing of the running nodes changes."
+    )
+    parser.epilog = "example: flexarm record --out results/run1 --duration 20"
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="of the bag, a new one (results/bag-DATE-TIME if not given)"
+    )
+    parser.add_argument("--namespace", default="", metavar="NS", help="of the arm's topics")
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="seconds to record; until Ctrl-C if not given"
+    )
+    parser.add_argument(
+        "--arm", help="arm file that goes into the bag; asked of the nodes if not given"
+    )
+    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
+
+
+def record(options):
+    """Run ``record``; the bag's folder.
+
+    Raises
+    ------
+    FlexarmError
+        When nothing comes, or for a folder that exists.
+    """
+    duration = options.duration
+    if duration is not None and not duration > 0.0:
+        raise FlexarmError(f"--duration {duration}: a number greater than 0 is wanted")
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    out = Path(options.out or f"results/bag-{stamp}")
+    if out.exists():
+        raise FlexarmError(f"--out {out}: exists already; name another one or remove it")
+    if options.arm:
+        arm_file.load(options.arm)  # refused here, and not after the recording
+    with Listener(options.namespace) as listener:
+        listener.wait_for_first(PATIENCE)
+        _take(listener, out, options.arm, duration, options.json)
+    return out
+
+
+def _take(listener, out, arm, duration, as_json=False):
+    """Record until the duration is over, Ctrl-C or SIGTERM; what was counted."""
+    from .recorder import BagWriter
+
+    began, told, ended = time.monotonic(), 0.0, None
+    asked = None if arm else listener.ask_arm()
+    with BagWriter(out, arm or "", listener.namespace) as bag:
+        taken = Taken(bag, arm or "")
+        print(f"recording to {out}{'' if duration else '; Ctrl-C ends it'}", file=sys.stderr)
+        try:
+            while duration is None or time.monotonic() < began + duration:
+                taken.take(listener.poll(), time.time_ns())
+                if asked is not None and not taken.arm:
+                    taken.believe(asked())
+                if time.monotonic() > told + TELL_PERIOD:
+                    told = time.monotonic()
+                    taken.show(told - began)
+                time.sleep(POLL_PERIOD)
+        except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the way to end it; SIGTERM
+            ended = end
+        taken.take(listener.poll(), time.time_ns())
+    if sys.stderr.isatty():
+        print(file=sys.stderr)
+    taken.tell(out, as_json)
+    if isinstance(ended, SystemExit):
+        raise ended
+    return taken
+
+
+class Taken:
+    """What was recorded so far.
+
+    Parameters
+    ----------
+    bag : BagWriter
+    arm : str
+        What the bag already says.
+    """
+
+    def __init__(self, bag, arm=""):
+        from .recorder import TOPICS
+
+        self.bag, self.arm, self._unusable = bag, arm, None
+        self.counts = dict.fromkeys(TOPICS, 0)
+        self._from = self._to = None
+
+    def take(self, messages, now_ns):
+        """Write messages, topic to list of bytes."""
+        for topic, rows in messages.items():
+            for raw in rows:
+                self.bag.write(topic, now_ns, raw)
+            self.counts[topic] = self.counts.get(topic, 0) + len(rows)
+            if rows:
+                self._from, self._to = self._from or now_ns, now_ns
+
+    def believe(self, arm):
+        """Put the arm that a node has named into the bag, if its file is here."""
+        if not arm or arm == self._unusable:
+            return
+        try:
+            arm_file.load(arm)
+            self.bag.tell_arm(arm)
+            self.arm = arm
+        except FlexarmError as error:
+            self._unusable = arm
+            print(
+                f"the nodes' arm {arm} is not in the bag: {error}; --arm names it", file=sys.stderr
+            )
+
+    @property
+    def seconds(self):
+        """From the first message to the last [s]."""
+        return 0.0 if self._from is None else 1e-9 * (self._to - self._from)
+
+    def show(self, elapsed):
+        """A line that is written over, on a terminal."""
+        if sys.stderr.isatty():
+            n = self.counts["arm_state"]
+            sys.stderr.write(
+                f"\r\x1b[K{elapsed:7.1f} s  {n} states  {n / max(elapsed, 1e-3):.0f} Hz"
+            )
+            sys.stderr.flush()
+
+    def tell(self, out, as_json=False):
+        """The last lines: what is in the bag, and what to do with it."""
+        if as_json:
+            said = {"out": str(out), "arm": self.arm or None, "seconds": self.seconds}
+            print(json.dumps(said | {"messages": self.counts}))
+            return
+        there = [f"{count} {topic}" for topic, count in self.counts.items() if count]
+        missing = [topic for topic, count in self.counts.items() if not count]
+        print(f"{out}: {self.seconds:.1f} s; {', '.join(there)}")
+        if missing:
+            print(f"nothing came on {', '.join(missing)}")
+        without = "" if self.arm else " --arm ARM"
+        if not self.arm:
+            print("no node said which arm this is: give it to the report with --arm")
+        print(f"next: flexarm report {out}{without}")
+
+
+class Listener:
+    """Subscriptions to an arm's topics, and a way to ask its nodes for the arm; a context.
+
+    Parameters
+    ----------
+    namespace : str
+    """
+
+    def __init__(self, namespace=""):
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+
+        from .recorder import Recorder
+
+        self.namespace = namespace.strip("/")
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, args=[])
+        quiet = {"start_parameter_services": False, "enable_rosout": False}
+        quiet |= {"context": self._context, "namespace": self.namespace}
+        # The subscriptions' node is not in the executor: it would take their messages.
+        self._node, self._asking = Node("flexarm_record", **quiet), Node("flexarm_ask", **quiet)
+        self._recorder = Recorder(self._node)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._asking)
+        self._early = {}
+
+    def poll(self):
+        """What has come since the last call, topic to list of bytes."""
+        self._recorder.poll()
+        out, raw = self._early, self._recorder.raw
+        self._early = {}
+        for topic, messages in raw.items():
+            out.setdefault(topic, []).extend(map(bytes, messages))
+            messages.clear()
+        return out
+
+    def wait_for_first(self, seconds):
+        """Wait until something has come.
+
+        Raises
+        ------
+        FlexarmError
+            After so long, with the topics that there are.
+        """
+        end = time.monotonic() + seconds
+        while True:
+            messages = self.poll()
+            if any(messages.values()):
+                self._early = messages
+                return
+            if time.monotonic() > end:
+                raise FlexarmError(self._silence(seconds))
+            time.sleep(0.01)
+
+    def _silence(self, seconds):
+        there = [n for n, kinds in self._node.get_topic_names_and_types() if _ours(kinds)]
+        where = f"/{self.namespace}" if self.namespace else "no namespace"
+        others = [n for n in there if self._node.count_publishers(n)]
+        hint = f"; there are {', '.join(sorted(others))}: give their --namespace" if others else ""
+        return (
+            f"nothing came in {where} for {seconds:g} s: start the driver (or simulator), in the same"
+            f" ROS_DOMAIN_ID{hint}"
+        )
+
+    def ask_arm(self):
+        """Ask the nodes for their parameter ``arm``; a function that says it once it is known, else ''."""
+        from rcl_interfaces.srv import GetParameters
+
+        clients = [
+            self._asking.create_client(GetParameters, f"{name}/get_parameters") for name in ASKED
+        ]
+        futures = {}
+
+        def answer():
+            for client in clients:
+                if client not in futures and client.service_is_ready():
+                    futures[client] = client.call_async(GetParameters.Request(names=["arm"]))
+            self._executor.spin_once(timeout_sec=0.0)
+            for future in futures.values():
+                values = future.result().values if future.done() and future.result() else ()
+                if values and values[0].string_value:
+                    return values[0].string_value
+            return ""
+
+        return answer
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        import rclpy
+
+        self._executor.shutdown()
+        self._asking.destroy_node()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+def _ours(kinds):
+    return any(kind.startswith("flexarm_msgs/msg/") for kind in kinds)

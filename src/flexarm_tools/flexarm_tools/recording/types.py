@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What bags hold: message types of Jazzy and of flexarm, and the arm's file. No ROS."""
+
+import functools
+
+from ..running.processes import installed
+
+#: What is written into a bag's metadata (``custom_data``): the arm's name, and the text of its file.
+ARM_NAME, ARM_TEXT = "flexarm.arm", "flexarm.arm_file"
+
+
+@functools.cache
+def typestore():
+    """Jazzy's types with flexarm's beside them, for `rosbags`; the same one each time."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name in ("ArmState", "JointTorque", "CompositeState", "ObserverState"):
+        types.update(get_types_from_msg(_definition(name), f"flexarm_msgs/msg/{name}"))
+    store.register(types)
+    return store
+
+
+def _definition(name):
+    """Text of a message definition, from where colcon installed it."""
+    return installed("share", "flexarm_msgs", "msg", f"{name}.msg").read_text()

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm report``: what bags show, on one page of HTML."""
+
+import json
+import time
+import webbrowser
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.progress import Progress
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Reads bags of `flexarm record`, `flexarm simulate --bag`, `flexarm demo` or `ros2 "
+        "bag record`, and writes one page that needs no network."
+    )
+    parser.epilog = "example: flexarm report results/run1 results/run2 --out results/report.html"
+    parser.add_argument(
+        "bags",
+        nargs="+",
+        metavar="BAG",
+        help="folder of a rosbag2 bag, a folder with one in it, or a .mcap or .db3 file; several are compared",
+    )
+    parser.add_argument(
+        "--out",
+        default="results/report.html",
+        metavar="FILE.html",
+        help="the page (results/report.html)",
+    )
+    parser.add_argument(
+        "--arm", help="arm file: a shipped name or a path; not needed where the bag has its own"
+    )
+    parser.add_argument(
+        "--namespace",
+        metavar="NS",
+        help="of the one arm that is wanted; all in the bag if not given",
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="print the summary's numbers of each run as JSON"
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in a browser")
+
+
+def report(options):
+    """Run ``report``; the page's path."""
+    progress, out = Progress(), _page_file(options.out)
+    runs = read(options.bags, options.arm, options.namespace, progress)
+    made = _write(runs, out, progress)
+    if options.json:
+        from .analysis import summary
+
+        numbers = {run.label: {"bag": str(run.contents.path)} | summary(run) for run in runs}
+        print(json.dumps({"report": str(made), "runs": numbers}, allow_nan=False))
+    else:
+        print(f"report {made} ({made.stat().st_size / 1e6:.2f} MB): open it in a browser")
+    if options.open:
+        webbrowser.open(made.resolve().as_uri())
+    return made
+
+
+def make(bags, out, arm=None, namespace=None, progress=None):
+    """Write the report of some bags.
+
+    Parameters
+    ----------
+    bags : sequence of str or Path
+    out : str or Path
+        The page.
+    arm, namespace : str, optional
+        See `bag.read`.
+    progress : Progress, optional
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    FlexarmError
+        For a bag that tells nothing, and for a page that can't be written.
+    """
+    out = _page_file(out)
+    return _write(read(bags, arm, namespace, progress), out, progress)
+
+
+def _page_file(out):
+    out = Path(out)
+    if out.suffix not in (".html", ".htm"):
+        raise FlexarmError(f"--out {out}: a page ends in .html")
+    return out
+
+
+def _write(runs, out, progress):
+    if progress is not None:
+        progress.step("figures and page")
+    # matplotlib and jinja2 are loaded when there is something to draw.
+    from . import page
+
+    text = page.write(runs)
+    if progress is not None:
+        progress.done()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise FlexarmError(f"--out {out}: can't be written: {error.strerror or error}") from None
+    return out
+
+
+def read(bags, arm=None, namespace=None, progress=None):
+    """The runs in some bags, each under a name of its own, a list of `Run`."""
+    from ..recording import bag
+    from .run import Run
+
+    found = []
+    for path in bags:
+        if progress is not None:
+            progress.step(f"read {path}")
+        told = time.monotonic()
+
+        def fraction(done):
+            nonlocal told
+            if progress is not None and time.monotonic() > told + 0.1:
+                told = time.monotonic()
+                progress.fraction(done)
+
+        for contents in bag.read(path, arm, namespace, fraction):
+            found.append((contents, str(path)))
+    names = labels([p for _, p in found], [c.namespace for c, _ in found])
+    return [Run(c, name) for (c, _), name in zip(found, names, strict=True)]
+
+
+def labels(paths, namespaces):
+    """What runs are called: the last parts of their paths that tell them apart, the namespace where that does not."""
+    parts = []
+    for path in paths:
+        path = Path(path).resolve()
+        path = path.with_suffix("") if path.suffix in (".mcap", ".db3") else path
+        pieces = [p for p in path.parts if p != path.anchor] or [str(path)]
+        # The demo's bags are called `bag`, a file in a bag as the bag.
+        if len(pieces) > 1 and pieces[-1] == "bag":
+            pieces = pieces[:-1]
+        parts.append(pieces)
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(p[-depth:]) for p in parts]
+        if len(set(names)) == len({tuple(p) for p in parts}):
+            break
+    names = [
+        f"{name} {space}" if names.count(name) > 1 and space else name
+        for name, space in zip(names, namespaces, strict=True)
+    ]
+    again = [f"{n} ({names[: i + 1].count(n)})" for i, n in enumerate(names)]
+    return [a if names.count(n) > 1 else n for n, a in zip(names, again, strict=True)]

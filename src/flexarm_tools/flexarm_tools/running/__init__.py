@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes as processes: started, run in lockstep, ended."""

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The installed executables as processes, on a DDS domain of their own."""
+
+import argparse
+import contextlib
+import fcntl
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_ros.start import PARENT
+
+#: Package of each node's executable.
+NODES = {
+    "simulator": "flexarm_sim",
+    "observer": "flexarm_control",
+    "controller": "flexarm_control",
+    "observer_controller": "flexarm_control",
+}
+
+
+class ProcessError(FlexarmError):
+    """A process that did not start, died, or did not do what it was started for."""
+
+
+def installed(*parts):
+    """Path of an installed file, looked for in every sourced prefix.
+
+    The `parts` are of its path below the prefix.
+
+    Raises
+    ------
+    ProcessError
+        When it is not installed.
+    """
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        path = Path(prefix, *parts)
+        if prefix and path.is_file():
+            return path
+    raise ProcessError(
+        f"{'/'.join(parts)} is not installed: run `make build`, then source install/setup.bash"
+    )
+
+
+def executable(package, name):
+    """Path of an executable as ``ros2 run`` finds it."""
+    return str(installed("lib", package, name))
+
+
+@contextlib.contextmanager
+def own_domain():
+    """A ROS_DOMAIN_ID that no other flexarm run on this machine has, as a context.
+
+    The domain is held by a file lock, so that it is free again however the process ends.
+    """
+    numbers = list(range(1, 101))
+    random.Random(os.getpid()).shuffle(numbers)
+    folder = Path(tempfile.gettempdir()) / f"flexarm-domains-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    for number in numbers:
+        with open(folder / str(number), "w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield number
+            return
+    raise ProcessError("all of 100 DDS domains are taken by other flexarm runs")
+
+
+def environment(domain):
+    """Environment of a process on `domain`, this machine only."""
+    env = dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    env.setdefault("RCUTILS_LOGGING_USE_STDOUT", "0")
+    # One thread each: small matrices, and the other processes need the other cores.
+    env.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    env[PARENT] = str(os.getpid())  # nothing is left behind, even by kill -9
+    return env
+
+
+def arguments(parameters=None, file=None, remaps=()):
+    """The ``--ros-args`` part of a command line.
+
+    Parameters
+    ----------
+    parameters : mapping, optional
+        Name to value.
+    file : path, optional
+        Parameter file, before the single parameters.
+    remaps : sequence of str
+        ``from:=to``.
+    """
+    words = ["--ros-args"]
+    if file is not None:
+        words += ["--params-file", str(file)]
+    for name, value in (parameters or {}).items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        # Quoted, or YAML would read a name such as "1e3" or "none" as something else.
+        words += ["-p", f'{name}:="{text}"' if isinstance(value, str) else f"{name}:={text}"]
+    for remap in remaps:
+        words += ["-r", remap]
+    return words
+
+
+class Processes:
+    """Child processes that end with the context, however it ends; nodes and modules with this process, too.
+
+    Parameters
+    ----------
+    domain : int
+        ROS_DOMAIN_ID of all of them.
+    log_directory : Path
+        One log file each.
+    """
+
+    #: After SIGINT a process has this long before it is killed [s].
+    PATIENCE = 10.0
+
+    def __init__(self, domain, log_directory):
+        self.domain = domain
+        self.logs = Path(log_directory)
+        self.logs.mkdir(parents=True, exist_ok=True)
+        self.running = {}
+
+    def start(self, name, command):
+        """Start a command; its output goes to ``<log_directory>/<name>.log``."""
+        with open(self.logs / f"{name}.log", "wb") as log:
+            process = subprocess.Popen(
+                command,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                env=environment(self.domain),
+                start_new_session=True,
+            )
+        self.running[name] = process
+        return process
+
+    def start_node(self, name, parameters=None, file=None, remaps=()):
+        """Start one of `NODES` by its installed executable."""
+        command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
+        return self.start(name, command)
+
+    def start_module(self, name, module, *words):
+        """Start a module of this environment."""
+        return self.start(name, [sys.executable, "-m", module, *words])
+
+    def log(self, name):
+        """What a process has printed so far."""
+        return (self.logs / f"{name}.log").read_text(errors="replace")
+
+    def check(self):
+        """Raise with the end of its log if a process has ended."""
+        for name, process in self.running.items():
+            if process.poll() is not None:
+                tail = "\n".join(self.log(name).splitlines()[-15:])
+                raise ProcessError(f"{name} ended with code {process.returncode}:\n{tail}")
+
+    def stop(self, number=signal.SIGINT):
+        """Signal all, wait, and kill what does not end; exit codes by name."""
+        for process in self.running.values():
+            if process.poll() is None:
+                process.send_signal(number)
+        codes = {}
+        for name, process in self.running.items():
+            try:
+                codes[name] = process.wait(self.PATIENCE)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                codes[name] = process.wait()
+        self.running = {}
+        return codes
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop()
+
+
+def add_arguments(parser):
+    """Arguments of ``flexarm run``."""
+    parser.description = (
+        "Starts an installed executable of the workspace; what follows it is passed on."
+    )
+    parser.epilog = "example: flexarm run flexarm_sim simulator --ros-args -p arm:=R"
+    parser.add_argument("package")
+    parser.add_argument("executable")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER)
+
+
+def run(options):
+    """``flexarm run``: start one installed executable in this process's place."""
+    path = executable(options.package, options.executable)
+    os.execv(path, [path, *options.arguments])

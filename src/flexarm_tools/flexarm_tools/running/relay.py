@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bare relay of the line's messages through as many processes: what the middleware alone costs.
+
+Each of three plain nodes answers the message it gets with a ready-made one of the same type and size, and
+sends the same side messages; nothing is computed. ``python -m flexarm_tools.running.relay ROLE ARM [COUNT|SPIN]``: of a
+source the round trips, of the others how they are served: ``executor``, by rclpy's, or ``line``, as the nodes are.
+"""
+
+import statistics
+import sys
+import time
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
+from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+from flexarm_ros import qos
+from flexarm_ros.messages import (
+    CompositeStateWriter,
+    ObserverStateWriter,
+    StateWriter,
+    TorqueWriter,
+    set_stamp,
+)
+from flexarm_ros.spin import Line, spin
+from flexarm_sim.simulator import Simulator
+
+from .processes import Processes, own_domain
+
+
+def filled_state(arm):
+    """An `ArmState` of the size that the line has."""
+    writer = StateWriter(arm)
+    for field in ("joint_position", "joint_velocity", "joint_torque"):
+        writer.write(field, [0.0] * len(arm.joints))
+    writer.write("strain", [0.0] * len(arm.gauges))
+    for field in ("modal_amplitude", "modal_rate"):
+        writer.write(field, [0.0] * len(arm.observed_modes))
+    return writer.message
+
+
+def _answer(incoming, outgoing):
+    outgoing.header.stamp = incoming.header.stamp
+    outgoing.session = incoming.session
+    outgoing.sequence = incoming.sequence
+
+
+def observer(arm):
+    """Node in the observer's place."""
+    node = Node("relay_observer")
+    estimate, state = filled_state(arm), ObserverStateWriter(arm).message
+    state.gauge_health = bytes(len(arm.gauges))
+    estimate_pub = node.create_publisher(ArmState, "arm_state_estimate", qos.LINE)
+    state_pub = node.create_publisher(ObserverState, "observer/state", qos.LINE)
+
+    def relay(msg):
+        _answer(msg, estimate)
+        estimate_pub.publish(estimate)
+        if state_pub.get_subscription_count():
+            _answer(msg, state)
+            state_pub.publish(state)
+
+    node.line = Line(node.create_subscription(ArmState, "arm_state", relay, qos.LINE))
+    return node
+
+
+def controller(arm):
+    """Node in the controller's place."""
+    node = Node("relay_controller")
+    torque, state = TorqueWriter(arm, 0).message, CompositeStateWriter(model.build(arm)).message
+    torque_pub = node.create_publisher(JointTorque, "joint_torque", qos.LINE)
+    state_pub = node.create_publisher(CompositeState, "controller/state", qos.LINE)
+
+    def relay(msg):
+        _answer(msg, torque)
+        torque_pub.publish(torque)
+        if state_pub.get_subscription_count():
+            _answer(msg, state)
+            state_pub.publish(state)
+
+    node.line = Line(node.create_subscription(ArmState, "arm_state_estimate", relay, qos.LINE))
+    return node
+
+
+class Source(Node):
+    """Node in the simulator's place; prints the median and mean round trip when done [s]."""
+
+    def __init__(self, arm, count):
+        super().__init__("relay_source")
+        self.count, self.times = count, []
+        self.state = filled_state(arm)
+        self._ns = Simulator.START_NS
+        self.pub = self.create_publisher(ArmState, "arm_state", qos.LINE)
+        self.create_subscription(JointTorque, "joint_torque", self.relay, qos.LINE)
+        self.create_timer(0.1, self.resend)
+
+    def resend(self):
+        """Until the others are there."""
+        if not self.times:
+            self.pub.publish(self.state)
+
+    def relay(self, msg):
+        """Next message."""
+        if msg.sequence != self.state.sequence:
+            return
+        self.times.append(time.perf_counter())
+        if len(self.times) > self.count:
+            gaps = [b - a for a, b in zip(self.times, self.times[1:], strict=False)]
+            print(statistics.median(gaps), statistics.fmean(gaps), flush=True)
+            raise SystemExit
+        self._ns += 1_000_000
+        set_stamp(self.state.header.stamp, self._ns)
+        self.state.sequence += 1
+        self.pub.publish(self.state)
+
+
+def main():
+    """Entry point of one relay process."""
+    role, arm = sys.argv[1], arm_file.load(sys.argv[2])
+    rclpy.init()
+    try:
+        if role == "source":
+            node = Source(arm, int(sys.argv[3]))
+        else:
+            node = {"observer": observer, "controller": controller}[role](arm)
+        if sys.argv[3:] == ["line"]:
+            spin([node], [])
+        else:
+            rclpy.spin(node)
+    except (SystemExit, KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+def measure(arm, log_directory, count=3000, recorder=None):
+    """Mean wall time per round trip of a bare relay [s].
+
+    Parameters
+    ----------
+    arm : str
+        Arm file, for the sizes of the messages.
+    log_directory : Path
+    count : int
+        Round trips.
+    recorder : callable, optional
+        ``recorder(processes)``, a context manager with `poll`: what else listens, as in the run compared.
+
+    Returns
+    -------
+    float
+    """
+    with own_domain() as domain, Processes(domain, log_directory) as processes:
+        for role in ("observer", "controller"):
+            processes.start_module(f"relay_{role}", "flexarm_tools.running.relay", role, arm)
+        if recorder is None:
+            source = processes.start_module("relay_source", __name__, "source", arm, str(count))
+            source.wait(120)
+        else:
+            with recorder(processes) as listener:
+                source = processes.start_module("relay_source", __name__, "source", arm, str(count))
+                while source.poll() is None:
+                    time.sleep(listener.POLL_PERIOD)
+                    listener.recorder.poll()
+        del processes.running["relay_source"]
+        return float(processes.log("relay_source").split()[-1])
+
+
+if __name__ == "__main__":
+    from flexarm_ros.start import leave_after
+
+    leave_after(main)

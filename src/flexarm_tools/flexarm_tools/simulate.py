@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm simulate``: the command of `flexarm_studies`, and the bag that ``--bag`` asks for, which needs ROS."""
+
+from functools import partial
+
+from flexarm_studies.commands import simulate as without_bag
+from flexarm_studies.commands.simulate import add_arguments
+
+__all__ = ["add_arguments", "simulate"]
+
+
+def simulate(options):
+    """Run the sub-command."""
+    recorder = None
+    if options.bag is not None:
+        from .recording.loop_bag import LoopBag
+
+        recorder = partial(LoopBag, options.bag)
+    without_bag.simulate(options, recorder)

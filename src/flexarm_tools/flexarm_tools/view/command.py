@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm view``: an arm in the browser, live, of nodes that it starts or that run."""
+
+import contextlib
+import os
+import tempfile
+import time
+
+import numpy as np
+
+from flexarm_control.composite.priority import step_back
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
+from flexarm_dynamics.models import model
+from flexarm_studies.loop import parameter_files
+
+#: Pictures per second, and the most of them.
+RATE, MOST = 30.0, 100.0
+#: Points of the tip's way.
+TRAIL = 300
+#: The page's process, beside the nodes'.
+NICENESS = 10
+#: How far the first target is from where the arm is [rad].
+STEP = 1.0
+#: Without a state for so long the page says so [s].
+SILENCE = 2.0
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Starts simulator, observer and controller in real time, and a page on this machine "
+        "that shows and handles them; with --attach, the page alone, of nodes that run."
+    )
+    parser.epilog = "examples:\n  flexarm view two_link\n  flexarm view R --attach --namespace left"
+    add = parser.add_argument
+    add(
+        "arm",
+        metavar="ARM",
+        nargs="?",
+        help="arm file: a shipped name or a path (default: that of the controller, or two_link)",
+    )
+    add(
+        "--controller",
+        metavar="FILE",
+        help="parameter file of the nodes: a shipped name or a path (default: the arm's own, or composite)",
+    )
+    add(
+        "--attach",
+        action="store_true",
+        help="start nothing: show the nodes that run on this ROS_DOMAIN_ID",
+    )
+    add(
+        "--lockstep",
+        action="store_true",
+        help="the simulator waits for each torque: for a machine too busy for real time",
+    )
+    add("--namespace", default="", help="with --attach: of the nodes that run")
+    add(
+        "--port",
+        type=int,
+        default=8080,
+        help="of the page, on 127.0.0.1 (default 8080; 0: a free one)",
+    )
+    add("--rate", type=float, default=RATE, help=f"pictures per second (default {RATE:g}) [Hz]")
+    add("--no-open", action="store_true", help="open no browser, only say where the page is")
+
+
+def view(options):
+    """Run the sub-command until it is stopped.
+
+    Raises
+    ------
+    FlexarmError
+        When there is no such arm or controller file, or a node that was started ends.
+    """
+    check(options)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    with contextlib.ExitStack() as stack:
+        domain, processes = None, None
+        if not options.attach:
+            domain, processes = start(options, stack)
+        step_back(NICENESS)  # after the nodes, which would inherit it
+        from .link import Link
+
+        link = Link(options.namespace, domain)
+        stack.callback(link.close)
+        with contextlib.suppress(KeyboardInterrupt):
+            View(link, processes, options, stack).run()
+
+
+def check(options):
+    """Refuse options that don't go together, and find the files of those that do.
+
+    Raises
+    ------
+    FlexarmError
+    """
+    if not 0.1 <= options.rate <= MOST:
+        raise ParameterError(f"--rate {options.rate:g}: from 0.1 to {MOST:g} pictures per second")
+    if options.attach:
+        for name in ("controller", "lockstep"):
+            if getattr(options, name):
+                raise ParameterError(f"--{name}: not with --attach, where the nodes run already")
+        return
+    if options.namespace:
+        raise ParameterError("--namespace: only with --attach")
+    options.controller, options.arm = files(options.controller, options.arm)
+    arm_file.load(options.arm)
+
+
+def files(controller, arm):
+    """Controller file and arm of the nodes to start, where one or both are not given.
+
+    Returns
+    -------
+    Path, str
+
+    Raises
+    ------
+    ParameterError
+        When there is no such controller file.
+    """
+    if controller is None:
+        arm = arm or "two_link"
+        shipped = parameter_files.directory() / f"{arm}.yaml"
+        return parameter_files.find(arm if shipped.is_file() else "composite"), arm
+    path = parameter_files.find(controller)
+    return path, arm or parameter_files.load(path)["controller"].get("arm", "two_link")
+
+
+def start(options, stack):
+    """Start the three nodes, on the user's domain or, without one, on a free one."""
+    from ..running.processes import Processes, own_domain  # here: other commands need no ROS
+
+    given = os.environ.get("ROS_DOMAIN_ID", "")
+    domain = int(given) if given.isdigit() else stack.enter_context(own_domain())
+    logs = stack.enter_context(tempfile.TemporaryDirectory(prefix="flexarm-view-"))
+    processes = stack.enter_context(Processes(domain, logs))
+    for name, own in (
+        ("simulator", {"lockstep": options.lockstep, "pause_at": -1.0}),
+        ("observer", {}),
+        ("controller", {}),
+    ):
+        processes.start_node(name, {"arm": options.arm, **own}, file=options.controller)
+    return domain, processes
+
+
+class View:
+    """Hears the nodes, shows them, and does what is done on the page, in one thread.
+
+    Parameters
+    ----------
+    link : Link
+    processes : Processes or None
+        What was started.
+    options : Namespace
+    stack : ExitStack
+    """
+
+    def __init__(self, link, processes, options, stack):
+        self.link, self.processes, self.options, self.stack = link, processes, options, stack
+        self.page = None
+        self.home = None
+        self._heard_at = 0.0
+
+    def run(self):
+        """Serve until it is interrupted."""
+        if self.options.arm:
+            self._open(self.options.arm)
+        else:
+            print("flexarm view: asking the controller for its arm", flush=True)
+            self.link.find_arm(self._open)
+        while True:
+            self.link.serve(1.0 / self.options.rate)
+            if self.processes is not None:
+                self.processes.check()
+            if self.page is not None:
+                self._turn()
+
+    def _open(self, name):
+        from ..shape.drawing import Drawer, Trail
+
+        arm_model = model.build(arm_file.load(name))
+        self.drawer = Drawer(arm_model)
+        self.trail = Trail(TRAIL, 0.002 * self.drawer.reach)
+        self.link.watch(arm_model.arm)
+        try:
+            from .page import Page
+
+            self.page = page = Page(arm_model.arm, self.drawer.reach, self.options.port)
+        except ModuleNotFoundError as error:
+            raise FlexarmError(
+                f"{error.name} is missing: pip install viser, or make build"
+            ) from None
+        self.stack.callback(page.close)
+        self.link.say, self.link.on_values = page.say, page.take_values
+        self.link.find_gains(page.offer_gains)
+        print(f"flexarm view: {arm_model.arm.name} at {page.url}, until Ctrl-C", flush=True)
+        if not self.options.no_open:
+            import webbrowser
+
+            webbrowser.open(page.url)
+
+    def _turn(self):
+        """What was done on the page, and what was heard since the last turn."""
+        now, page = time.monotonic(), self.page
+        while not page.done.empty():
+            name, *words = page.done.get()
+            (getattr(self, f"_do_{name}", None) or getattr(self.link, name))(*words)
+        try:
+            heard = self.link.take()
+        except MessageError as error:
+            page.say(str(error), True)
+            return
+        if heard is None:
+            if now > self._heard_at + SILENCE:
+                page.silence(now - self._heard_at if self._heard_at else 0.0)
+            return
+        self._heard_at = now
+        if self.home is None:
+            self.home = heard.q
+            page.aim(first_target(self.drawer.arm, heard.q))
+        picture = self.drawer.picture(
+            heard.q, heard.delta, heard.slow, heard.fast, page.exaggeration
+        )
+        self.trail.add(picture.tip, heard.session)
+        error = self.drawer.tip_error(heard.q, heard.delta, heard.reference)
+        page.show(heard, picture, self.trail.points, error)
+        page.plot(now)
+
+    def _do_back(self, duration):
+        if self.home is not None:
+            self.link.move(self.home, duration)
+
+    def _do_clear_trail(self):
+        self.trail.clear()
+
+
+def first_target(arm, q):
+    """Where the page proposes to move: every joint of an arm without weight, the first one of others."""
+    heavy = np.linalg.norm(arm.gravity) > 0.0
+    step = np.zeros(len(q))
+    step[: 1 if heavy else None] = STEP
+    return q + step

@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page hears of the nodes and tells them, in one thread, without a callback per sample."""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import rclpy
+from rcl_interfaces.msg import Log, ParameterEvent
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParametersAtomically,
+)
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.loop.supervisor import State
+from flexarm_dynamics import registry
+from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_msgs.msg import ArmState, CompositeState
+from flexarm_ros import qos
+from flexarm_ros.messages import set_stamp, stamp_ns
+
+from ..shape.latest import Amplitudes, Latest
+from . import gains
+
+#: A service that has not answered for so long is asked again: a server that has not found the client drops it [s].
+ASK_AGAIN = 3.0
+#: Gains that are turned are sent once they have rested for so long [s].
+REST = 0.25
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What the topics said last; arrays in the arm's order, SI."""
+
+    time: float
+    session: int
+    q: np.ndarray
+    delta: np.ndarray
+    state: str
+    reason: str
+    trajectory: int
+    saturated: bool
+    reference: np.ndarray
+    slow: np.ndarray
+    fast: np.ndarray
+
+
+class Link:
+    """A node that looks on, and speaks for the page.
+
+    Parameters
+    ----------
+    namespace : str
+        Of the loop's nodes.
+    domain : int, optional
+        ROS_DOMAIN_ID; not given: that of the environment.
+    say : callable
+        Takes what a person should read: (text, whether it is bad news).
+    """
+
+    def __init__(self, namespace="", domain=None, say=lambda text, bad: None):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node(
+            "view",
+            context=self.context,
+            namespace=namespace,
+            start_parameter_services=False,
+            enable_rosout=False,
+            use_global_arguments=False,
+        )
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.say, self.on_values = say, lambda values: None
+        create = self.node.create_subscription
+        self._states = Latest(create, ArmState, "arm_state_estimate")
+        self._controls = Latest(create, CompositeState, "controller/state")
+        self._trajectories = self.node.create_publisher(
+            JointTrajectory, "joint_trajectory", qos.COMMAND
+        )
+        self._controller = self.node.resolve_service_name("controller")
+        create(ParameterEvent, "/parameter_events", self._on_event, 100)
+        create(Log, "/rosout", self._on_log, 100)
+        self._clients, self._asked = {}, []
+        self._turned, self._turned_at, self._setting = {}, 0.0, False
+        self.values = {}
+        self.control = None
+        self._arm = None
+
+    # Listening -------------------------------------------------------------------------------
+
+    def watch(self, arm):
+        """Expect states of this arm."""
+        self._arm = arm
+        self._amplitudes = Amplitudes(arm)
+        self._sample = ArmSample(len(arm.joints), len(arm.modes))
+
+    def take(self):
+        """The newest state and what the controller made of one; None without a new state.
+
+        Raises
+        ------
+        MessageError
+            When they are of another arm.
+        """
+        control, msg = self._controls.take(), self._states.take()
+        if control is not None:
+            if list(control.joint_names) != list(self._arm.joint_names):
+                raise MessageError(
+                    f"controller/state is of joints {list(control.joint_names)}, not of {self._arm.name}"
+                )
+            self.control = control
+        if msg is None or self.control is None:
+            return None
+        delta = self._amplitudes.read(msg, self._sample).copy()
+        c = self.control
+        return Heard(
+            time=1e-9 * stamp_ns(msg.header.stamp),
+            session=msg.session,
+            q=self._sample.position.copy(),
+            delta=delta,
+            state=State(c.supervisor_state).name,
+            reason=c.rejected_reason,
+            trajectory=c.accepted_trajectory_id,
+            saturated=c.saturated,
+            reference=np.array(c.reference_position),
+            slow=np.array(c.slow_torque),
+            fast=np.array(c.fast_torque),
+        )
+
+    def serve(self, seconds):
+        """Serve services and slow topics for so long; send what has been turned."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self.executor.spin_once(timeout_sec=left)
+        self._ask_again()
+        if self._turned and not self._setting and time.monotonic() > self._turned_at + REST:
+            self._send_turned()
+
+    def _on_event(self, event):
+        if event.node == self._controller:
+            names = [p for p in event.changed_parameters if p.name in self.values]
+            self._take_values({p.name: plain(p.value) for p in names})
+
+    def _on_log(self, msg):
+        if msg.name == self._controller.strip("/").replace("/", ".") and msg.level >= 30:
+            self.say(f"controller: {msg.msg}", True)
+
+    # Speaking --------------------------------------------------------------------------------
+
+    def move(self, target, duration):
+        """Publish a motion from where the reference is to joint angles [rad] in so many seconds."""
+        message = JointTrajectory(joint_names=list(self._arm.joint_names))
+        zero = [0.0] * len(target)
+        point = JointTrajectoryPoint(
+            positions=[float(v) for v in target], velocities=zero, accelerations=list(zero)
+        )
+        set_stamp(point.time_from_start, round(duration * 1e9))
+        message.points = [point]
+        if not self._trajectories.get_subscription_count():
+            self.say("no controller listens to joint_trajectory", True)
+            return
+        self._trajectories.publish(message)
+        self.say("a motion was sent", False)
+
+    def stop(self):
+        """Call ~/stop."""
+        self._ask(Trigger, "stop", self._say_answer)
+
+    def recover(self):
+        """Call ~/recover."""
+        self._ask(Trigger, "recover", self._say_answer)
+
+    def enable_fast(self, on):
+        """Call ~/enable_fast."""
+        self._ask(SetBool, "enable_fast", self._say_answer, data=bool(on))
+
+    def turn(self, name, index, value):
+        """A gain was turned to a value; sent when it rests."""
+        self._turned[name, index] = value
+        self._turned_at = time.monotonic()
+
+    def _say_answer(self, answer):
+        self.say(answer.message, not answer.success)
+
+    def _send_turned(self):
+        self._setting = True
+        wanted = gains.changed(self.values, self._turned)
+        self._turned = {}
+        messages = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in wanted.items()
+        ]
+
+        def done(answer):
+            self._setting = False
+            if answer.result.successful:
+                self._take_values(wanted)
+                shown = ", ".join(f"{name} = {show(value)}" for name, value in wanted.items())
+                self.say(f"set: {shown}", False)
+            else:
+                self.say(f"refused: {answer.result.reason}", True)
+                self.on_values(self.values)
+
+        self._ask(SetParametersAtomically, "set_parameters_atomically", done, parameters=messages)
+
+    def _take_values(self, values):
+        self.values.update(values)
+        if values:
+            self.on_values(values)
+
+    # Questions -------------------------------------------------------------------------------
+
+    def find_arm(self, then):
+        """Ask the controller for its arm; ``then(name)``."""
+        self._ask(
+            GetParameters,
+            "get_parameters",
+            lambda answer: then(plain(answer.values[0])),
+            names=["arm"],
+        )
+
+    def find_gains(self, then):
+        """Ask the controller what can be turned; ``then(list of Gain)``."""
+
+        def listed(answer):
+            names = sorted(answer.result.names)
+            self._ask(
+                DescribeParameters,
+                "describe_parameters",
+                lambda described: self._ask(
+                    GetParameters,
+                    "get_parameters",
+                    lambda got: self._gains(names, described.descriptors, got.values, then),
+                    names=names,
+                ),
+                names=names,
+            )
+
+        prefixes = [prefix.strip(".") for prefix in gains.LAWS]
+        self._ask(ListParameters, "list_parameters", listed, prefixes=prefixes, depth=0)
+
+    def _gains(self, names, descriptors, values, then):
+        given = dict(zip(names, map(plain, values), strict=True))
+        ranges, hints = {}, {}
+        for d in descriptors:
+            hints[d.name] = d.description
+            found = gains.range_of(d.additional_constraints)
+            if d.floating_point_range:
+                r = d.floating_point_range[0]
+                found = r.from_value, r.to_value
+            if found and not d.read_only:
+                ranges[d.name] = found
+        out = gains.of_parameters(given, ranges, hints, laws_in_use(given))
+        self.values = {gain.name: given[gain.name] for gain in out}
+        then(out)
+
+    def _ask(self, kind, name, then, **request):
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f"controller/{name}")
+        question = [self._clients[name], kind.Request(**request), then, None, 0.0]
+        self._asked.append(question)
+        self._ask_again()
+
+    def _ask_again(self):
+        """Questions that wait for their server, or for an answer for too long."""
+        now = time.monotonic()
+        for question in list(self._asked):
+            client, request, then, future, at = question
+            if future is not None and future.done():
+                self._asked.remove(question)
+                then(future.result())
+            elif (future is None or now > at + ASK_AGAIN) and client.service_is_ready():
+                if future is not None:
+                    client.remove_pending_request(future)
+                question[3:] = client.call_async(request), now
+
+    def close(self):
+        """Leave the graph."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+def plain(value):
+    """A `ParameterValue` as Python has it, arrays as lists."""
+    found = parameter_value_to_python(value)
+    return found.tolist() if hasattr(found, "tolist") else found
+
+
+def show(value):
+    """A number, or several, for reading."""
+    many = isinstance(value, list)
+    return "[" + ", ".join(f"{v:.6g}" for v in value) + "]" if many else f"{value:.6g}"
+
+
+def laws_in_use(values):
+    """Names of the parameters that the laws in use declare, by prefix; nothing of one that is not installed here."""
+    out = {}
+    for prefix, group in gains.LAWS.items():
+        try:
+            law = registry.find(group, values[f"{prefix}type"])
+        except (FlexarmError, KeyError):
+            continue
+        out[prefix] = {parameter.name for parameter in law.PARAMETERS}
+    return out

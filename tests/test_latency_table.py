@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `flexarm latency` makes of the windows that it measured."""
+
+import argparse
+import itertools
+
+import numpy as np
+import pytest
+
+from benchmarks.latency import command as latency
+from benchmarks.latency import measure
+from benchmarks.latency import redesign as latency_redesign
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.loop import scenario
+from flexarm_studies.loop.scenario import parameters
+
+CASE = measure.CASES[1]
+
+
+def window(milliseconds, missed=0, enabled=None):
+    times = [1e-3 * t for t in milliseconds]
+    enabled = len(times) if enabled is None else enabled
+    return {"latencies": times, "enabled": enabled, "missed": missed, "lost": 0}
+
+
+def test_ratios_are_taken_round_by_round():
+    # The machine slows down threefold in the second round: the loop costs 1.5 of the relay in each.
+    relay = {"windows": [window([1.0, 1.0, 2.0]), window([3.0, 3.0, 6.0]), window([1.0, 1.0, 2.0])]}
+    loop = {"windows": [window([1.5, 1.5, 3.0]), window([4.5, 4.5, 9.0]), window([1.5, 1.5, 3.0])]}
+    loop["mathematics"] = {"controller": 1e-4, "law": 4e-5}
+    bare, row = measure.summary(CASE, {"relay": relay, "three processes": loop})
+    assert bare["latency_ms"]["p50"] == pytest.approx(1.0)
+    assert row["latency_ms"]["p50"] == pytest.approx(1.5)
+    assert row["ratio"]["p50"] == pytest.approx(1.5)
+    assert row["ratio"]["p99"] == pytest.approx(1.5)
+    assert row["controller_share"] == pytest.approx(0.1)
+    cells = measure.table([bare, row]).splitlines()[-1].split(" | ")
+    assert cells[1:3] == ["three processes", "1.50"]
+    assert cells[-4:] == ["0.100", "10 %", "0.040", "4 % |"]
+
+
+def test_redesigning_is_compared_within_each_round():
+    found = {
+        latency_redesign.NOTHING: [window([1.0]), window([3.0]), window([1.0])],
+        latency_redesign.ALPHA: [window([1.1]), window([3.3]), window([5.0])],
+    }
+    rows = latency_redesign.summary(CASE, found)
+    assert rows[0]["ratio"] == pytest.approx({"p50": 1.0, "p95": 1.0, "p99": 1.0})
+    assert rows[1]["latency_ms"]["p99"] == pytest.approx(3.3)
+    assert rows[1]["ratio"]["p99"] == pytest.approx(1.1)
+    text = latency_redesign.table(rows).splitlines()
+    assert text[-1] == "| R, 500 Hz | `fast.alpha` set | 3.30 | 3.30 | 3.30 | 1.10 | 1.10 | 1.10 |"
+    assert all(line.count("|") == text[0].count("|") for line in text)
+
+
+def test_redesigning_needs_a_case_at_500_hz():
+    with pytest.raises(FlexarmError, match="at 500 Hz: have it among the --rates"):
+        latency.latency(options("--redesign", "--rates", "200", "--arms", "R"))
+
+
+@pytest.mark.parametrize("name", latency_redesign.REDESIGNS)
+def test_what_is_set_meanwhile_are_designs_that_are_accepted(name):
+    case = next(c for c in measure.CASES if c.arm == name and c.rate == 500.0)
+    given = parameters(case.file) if case.file else {}
+    for values in itertools.chain(*latency_redesign.values_of(case).values()):
+        scenario.loop_of(scenario.Scenario(name, {**given, **values}, rate=case.rate))
+
+
+def test_missed_samples_count_with_those_answered():
+    found = {"relay": {"windows": [window([1.0] * 6, missed=2), window([1.0] * 2, 0, enabled=0)]}}
+    (row,) = measure.summary(CASE, found)
+    assert row["missed"] == pytest.approx(0.2)
+    assert row["enabled"] == pytest.approx(0.75)
+
+
+def test_a_window_without_an_answer_is_an_error_that_names_it():
+    found = {"relay": {"windows": [window([1.0]), window([])]}}
+    with pytest.raises(FlexarmError, match="R, 500 Hz: no torque came back in a window of relay"):
+        measure.summary(CASE, found)
+
+
+def options(*words):
+    parser = argparse.ArgumentParser()
+    latency.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def test_options_choose_the_cases():
+    assert [c.name for c in latency.chosen(options())] == [
+        *(f"R, {rate} Hz" for rate in (200, 500, 1000)),
+        "long_reach, 500 Hz x 0.25",
+    ]
+    quick = latency.chosen(options("--quick", "--arms", "R"))
+    assert [c.rate for c in quick] == [500.0]
+    with pytest.raises(FlexarmError, match="there are R, 200 Hz"):
+        latency.chosen(options("--arms", "two_link"))
+
+
+def test_the_table_goes_between_the_markers_alone(tmp_path):
+    file = tmp_path / "page.md"
+    file.write_text(f"above\n{latency.BEGIN}\nold\n{latency.END}\nbelow\n")
+    latency.write(file, "new")
+    assert file.read_text() == f"above\n{latency.BEGIN}\nnew\n{latency.END}\nbelow\n"
+    file.write_text("none")
+    with pytest.raises(FlexarmError, match="no lines"):
+        latency.write(file, "new")
+
+
+def test_motions_of_the_cases_are_those_of_their_arms():
+    from flexarm_dynamics.arm import arm_file
+
+    for case in measure.CASES:
+        joints = arm_file.load(case.arm).joints
+        for ends in (case.begin, case.end):
+            assert len(ends) == len(joints)
+            for joint, angle in zip(joints, ends, strict=True):
+                low, high = joint.limits.position
+                assert low <= angle <= high
+        assert np.abs(np.subtract(case.end, case.begin)).max() > 0.5
