@@ -1,21 +1,82 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors that flexarm raises; every one of them is a `FlexarmError`.
 
-A message names the joint, mode, parameter or field, the value, the limit, and what to do.
+An error carries what a program or a test wants to know (`field`, `value`, `limit`, `hint`), and there is one way in
+which it is written out for people: ``field: value problem (limit); hint``, without the parts that are not given.
 """
+
+from .shown import show
+
+
+class _NotGiven:
+    def __repr__(self):
+        return "NOT_GIVEN"
+
+    def __reduce__(self):
+        return "NOT_GIVEN"  # the same object in every process
+
+
+#: Stands for a value that was not given; None may be a value.
+NOT_GIVEN = _NotGiven()
 
 
 class FlexarmError(Exception):
-    """Base of all errors that flexarm raises on purpose."""
+    """Base of all errors that flexarm raises on purpose.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong. With a `value`, the words that follow it: "is not finite".
+    field : str, optional
+        The parameter, field of a file or message, joint or mode that it is about, by its full name.
+    value : object, optional
+        What was found there.
+    limit : object, optional
+        What would have been allowed: a number, a range or a list of names.
+    hint : str, optional
+        What the user can do.
+
+    Attributes
+    ----------
+    problem, field, value, limit, hint
+        As given; empty strings, `NOT_GIVEN` for the value and None for the limit where nothing was.
+
+    Examples
+    --------
+    >>> str(FlexarmError("is too large", field="slow.kp[0]", value=7.0, limit="at most 5", hint="write 5.0"))
+    'slow.kp[0]: 7.0 is too large (at most 5); write 5.0'
+    """
+
+    def __init__(self, problem="", *, field="", value=NOT_GIVEN, limit=None, hint=""):
+        super().__init__(problem)
+        self.problem, self.field, self.value = problem, field, value
+        self.limit, self.hint = limit, hint
+
+    def __str__(self):
+        text = f"{self.field}: " if self.field else ""
+        if self.value is not NOT_GIVEN:
+            text += f"{show(self.value)} "
+        text += self.problem
+        if self.limit is not None:
+            text += f" ({self.limit})"
+        return f"{text}; {self.hint}" if self.hint else text
+
+    def __reduce__(self):
+        """Errors travel between processes with all that they carry."""
+        return _again, (type(self), vars(self))
+
+
+def _again(kind, fields):
+    error = kind.__new__(kind)
+    vars(error).update(fields)
+    return error
 
 
 class ArmFileError(FlexarmError):
-    """An arm file that can't be used; the message starts with the field's path."""
+    """An arm file that can't be used; `field` is the path of the entry, as ``links[0].length``."""
 
-    def __init__(self, path, reason):
-        super().__init__(f"{path}: {reason}")
-        self.path = path
-        self.reason = reason
+    def __init__(self, field, problem, *, value=NOT_GIVEN, limit=None, hint=""):
+        super().__init__(problem, field=field, value=value, limit=limit, hint=hint)
 
 
 class ParameterError(FlexarmError):

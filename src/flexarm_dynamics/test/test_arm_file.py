@@ -91,7 +91,7 @@ def refused(text):
     """Message of the error that this text must give; it starts with the path."""
     with pytest.raises(ArmFileError) as error:
         arm_file.parse(text)
-    assert str(error.value) == f"{error.value.path}: {error.value.reason}"
+    assert str(error.value) == f"{error.value.field}: {error.value.problem}"
     return str(error.value)
 
 
@@ -763,8 +763,8 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
     try:
         arm = arm_file.parse(text)
     except ArmFileError as error:
-        assert str(error) == f"{error.path}: {error.reason}"
-        assert error.path and error.reason
+        assert str(error) == f"{error.field}: {error.problem}"
+        assert error.field and error.problem
     else:
         assert isinstance(arm, Arm)
         for path, value in leaves(arm):
@@ -784,7 +784,7 @@ def test_a_file_with_damaged_characters_gives_an_arm_or_an_arm_file_error(data):
     try:
         assert isinstance(arm_file.parse("".join(text)), Arm)
     except ArmFileError as error:
-        assert error.path and error.reason
+        assert error.field and error.problem
 
 
 @settings(max_examples=300, deadline=None, derandomize=True, database=None)

@@ -56,8 +56,8 @@ def test_what_is_given_is_read():
 def test_what_can_not_be_is_refused_by_path(field, value, reason):
     with pytest.raises(ArmFileError) as error:
         gauge(**{field: value})
-    assert error.value.path == f"gauges[0].{field}"
-    assert reason in error.value.reason
+    assert error.value.field == f"gauges[0].{field}"
+    assert reason in error.value.problem
 
 
 @settings(
@@ -83,7 +83,7 @@ def test_a_gauge_is_whole_or_refused(fields):
     try:
         g = gauge(**fields)
     except ArmFileError as error:
-        assert error.path.startswith("gauges[0]")
+        assert error.field.startswith("gauges[0]")
         return
     low, high = g.range
     assert 0 <= g.bits <= 32 and g.drift >= 0.0 and 0.0 < g.full_scale <= 0.1

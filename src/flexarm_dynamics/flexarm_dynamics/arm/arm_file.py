@@ -607,4 +607,4 @@ def load(name):
     try:
         return parse(text, path.name)
     except ArmFileError as error:
-        raise ArmFileError(f"{path.name}: {error.path}", error.reason) from None
+        raise ArmFileError(f"{path.name}: {error.field}", error.problem) from None
