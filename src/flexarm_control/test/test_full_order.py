@@ -44,7 +44,7 @@ def test_the_linear_plant_is_the_arms_own_motion(name):
 def test_fast_sampling_gives_the_continuous_poles_of_the_papers_design(arm_r):
     law = design(arm_r, SLOW, PAPER)
     terms = arm_r.terms(np.zeros(1), np.zeros(1))
-    A = full_order_matrix(terms, [6.25], [5.0], law.slow.B_inverse(terms), -law.fast.K_f)
+    A = full_order_matrix(terms, [6.25], [5.0], law.slow.B_inverse(terms), law.fast.K_f)
     expected = np.sort_complex(np.linalg.eigvals(A))
     found = np.sort_complex(full_order.poles(law, np.zeros(1), 1e-5))
     assert_allclose(found, expected, rtol=2e-3)

@@ -194,7 +194,7 @@ class TimeScales:
         return float("inf") if self.mu == 0.0 else 1.0 / self.mu
 
 
-def time_scales(terms, kp=None, kv=None, K_fast=None):
+def time_scales(terms, kp=None, kv=None, K_f=None):
     """Eigenvalues of the slow and of the fast subsystem, open or closed.
 
     Parameters
@@ -203,8 +203,8 @@ def time_scales(terms, kp=None, kv=None, K_fast=None):
         Without deflections.
     kp, kv : ndarray, shape (n,), optional
         Gains of the decoupled slow loop, s^2 + kv s + kp = 0; not given: the open loop's double integrators.
-    K_fast : ndarray, shape (n, 2m), optional
-        u_f = -K_fast z_f; not given: open loop.
+    K_f : ndarray, shape (n, 2m), optional
+        Gain of (15), u_f = K_f z_f; not given: open loop.
 
     Returns
     -------
@@ -215,8 +215,8 @@ def time_scales(terms, kp=None, kv=None, K_fast=None):
     kv = np.zeros(n) if kv is None else np.broadcast_to(kv, n)
     slow = np.concatenate([np.roots([1.0, v, p]) for p, v in zip(kp, kv, strict=True)])
     A2, B2 = fast_subsystem(terms)
-    if K_fast is not None:
-        A2 = A2 - B2 @ K_fast
+    if K_f is not None:
+        A2 = A2 + B2 @ K_f
     return TimeScales(slow, np.linalg.eigvals(A2))
 
 
@@ -245,10 +245,10 @@ def perturbation_parameter(slow_frequency, terms_along):
     return float(slow_frequency / smallest)
 
 
-def full_order_matrix(terms, kp, kv, B_inverse, K_fast):
+def full_order_matrix(terms, kp, kv, B_inverse, K_f):
     r"""Closed-loop matrix of the full order system (2) at rest under the composite control (12).
 
-    With :math:`\bar u = B^\dagger(-k_p q - k_v\dot q)`, :math:`u_f = -K_f(z - \bar z)` and :math:`\bar z` by (9),
+    With :math:`\bar u = B^\dagger(-k_p q - k_v\dot q)`, :math:`u_f = K_f(z - \bar z)` and :math:`\bar z` by (9),
     the state is (q, delta, qd, delta_d).
 
     Parameters
@@ -259,8 +259,8 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_fast):
         Slow gains [1/s^2], [1/s].
     B_inverse : ndarray, shape (n, n)
         What the slow law multiplies by: the inverse of B, or 1/h11 as print has it [kg m^2].
-    K_fast : ndarray, shape (n, 2m)
-        Zero for slow control alone.
+    K_f : ndarray, shape (n, 2m)
+        Gain of (15), u_f = K_f z_f; zero for slow control alone.
 
     Returns
     -------
@@ -274,9 +274,9 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_fast):
         [-B_inverse @ np.diag(np.broadcast_to(kp, n)), np.zeros((n, m)),
          -B_inverse @ np.diag(np.broadcast_to(kv, n)), np.zeros((n, m))]
     )  # fmt: skip
-    K_delta, K_rate = K_fast[:, :m], K_fast[:, m:]
+    K_delta, K_rate = K_f[:, :m], K_f[:, m:]
     zero = np.zeros((n, n))
-    fast = np.hstack([zero, -K_delta, zero, -K_rate]) + K_delta @ steady @ slow
+    fast = np.hstack([zero, K_delta, zero, K_rate]) - K_delta @ steady @ slow
     force = np.vstack([slow + fast, np.zeros((m, 2 * (n + m)))])
     force[:, n : n + m] -= np.vstack([terms.K1, terms.K2])
     force[:, 2 * n + m :] -= np.vstack([terms.C1, terms.C2])

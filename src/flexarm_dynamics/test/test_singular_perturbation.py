@@ -264,8 +264,8 @@ def test_time_scales_of_the_case_study(shipped, errata):
 
 def test_time_scales_of_the_closed_fast_loop(shipped):
     t = shipped("R").terms(REST, REST)
-    K = POUND_FORCE * np.array([[-127.04, -7283.8, -16.998, -183.31]])
-    closed = sp.time_scales(t, kp=[6.25], kv=[5.0], K_fast=K)
+    K = POUND_FORCE * np.array([[127.04, 7283.8, 16.998, 183.31]])
+    closed = sp.time_scales(t, kp=[6.25], kv=[5.0], K_f=K)
     omega, zeta = sp.frequencies_and_damping(closed.fast)
     np.testing.assert_allclose(omega, [18.578, 90.402], rtol=1e-4)
     np.testing.assert_allclose(zeta, [0.7755, 0.4052], rtol=1e-3)
@@ -303,7 +303,7 @@ def gains(arm_model, errata):
     Q = np.diag([float(q) for q in design["q_diagonal"]])
     shifted = A2 + float(design["alpha_1_per_s"]) * np.eye(4)
     B2 = B2 * POUND_FORCE
-    K = B2.T @ solve_continuous_are(shifted, B2, Q, np.eye(1) * float(design["r"]))
+    K = -B2.T @ solve_continuous_are(shifted, B2, Q, np.eye(1) * float(design["r"]))
     return K * POUND_FORCE, float(design["kp_1_per_s2"]), float(design["kv_1_per_s"])
 
 
@@ -366,7 +366,7 @@ def test_full_order_matrix_is_the_linearisation_of_the_nonlinear_closed_loop(nam
         q, delta, qd, delta_d = np.split(state, [1, 1 + m, 2 + m])
         slow = B_inverse @ (-kp * q - kv * qd)  # no gravity, no friction
         bar = sp.quasi_steady_state(arm_model.terms(q, qd), slow)
-        fast = -K @ np.concatenate([delta - bar, delta_d])
+        fast = K @ np.concatenate([delta - bar, delta_d])
         return arm_model.derivative(state, slow + fast)
 
     h = 1e-5
@@ -389,7 +389,7 @@ def test_full_order_matrix_takes_the_couplings_of_many_joints():
         q, delta, qd, delta_d = np.split(state, [2, 5, 7])
         slow = B_inverse @ (-kp * q - kv * qd)
         bar = sp.quasi_steady_state(still, slow)
-        u = slow - K @ np.concatenate([delta - bar, delta_d])
+        u = slow + K @ np.concatenate([delta - bar, delta_d])
         force = np.concatenate([u - t.C1 @ delta_d - t.K1 @ delta, -t.C2 @ delta_d - t.K2 @ delta])
         return np.concatenate([qd, delta_d, np.linalg.solve(t.M, force)])
 

@@ -140,7 +140,7 @@ def spectra(subject, slow):
     model, q = subject.model, subject.q
     terms, K = model.terms(q, np.zeros(model.n_joints)), subject.law.fast.gain(q)
     opened = time_scales(terms).fast
-    closed = None if K is None else time_scales(terms, K_fast=-K).fast
+    closed = None if K is None else time_scales(terms, K_f=K).fast
     smallest = None if closed is None else np.abs(closed).min()
     return {
         "at_rad": q.tolist(),

@@ -278,7 +278,7 @@ def linear_metrics(model, law, q):
     Returns
     -------
     dict
-        Keys as in ``summary.json``; k_f in the paper's units, u_f = -k z_f.
+        Keys as in ``summary.json``; k_f in the paper's units and with its sign, u_f = -k_f z_f.
     """
     from flexarm_dynamics import singular_perturbation as sp
     from flexarm_dynamics.arm.units import POUND_FORCE
@@ -286,15 +286,15 @@ def linear_metrics(model, law, q):
     terms = model.terms(q, np.zeros(model.n_joints))
     A2, B2 = sp.fast_subsystem(terms)
     open_loop, _ = sp.frequencies_and_damping(np.linalg.eigvals(A2))
-    K = -law.fast.K_f
-    closed, damping = sp.frequencies_and_damping(np.linalg.eigvals(A2 - B2 @ K))
+    K_f = law.fast.K_f
+    closed, damping = sp.frequencies_and_damping(np.linalg.eigvals(A2 + B2 @ K_f))
     poles = np.linalg.eigvals(
-        sp.full_order_matrix(terms, law.slow.kp, law.slow.kv, law.slow.B_inverse(terms), K)
+        sp.full_order_matrix(terms, law.slow.kp, law.slow.kv, law.slow.B_inverse(terms), K_f)
     )
     poles = sorted(poles, key=lambda p: (abs(p), p.imag))
     return {
         "open_loop_frequencies_rad_s": open_loop.tolist(),
-        "k_f": (K[0] / POUND_FORCE).tolist(),
+        "k_f": (-K_f[0] / POUND_FORCE).tolist(),
         "closed_loop_frequencies_rad_s": closed.tolist(),
         "closed_loop_damping": damping.tolist(),
         "full_order_poles": [[float(p.real), float(p.imag)] for p in poles],
