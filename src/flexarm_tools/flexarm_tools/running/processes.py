@@ -125,10 +125,11 @@ class Processes:
         self.domain = domain
         self.logs = Path(log_directory)
         self.logs.mkdir(parents=True, exist_ok=True)
-        self.running = {}
+        self.running, self._ending = {}, set()
 
     def start(self, name, command):
         """Start a command; its output goes to ``<log_directory>/<name>.log``."""
+        self._ending.discard(name)
         with open(self.logs / f"{name}.log", "wb") as log:
             process = subprocess.Popen(
                 command,
@@ -154,11 +155,22 @@ class Processes:
         """What a process has printed so far."""
         return (self.logs / f"{name}.log").read_text(errors="replace")
 
+    def tails(self, lines=8):
+        """The last lines of each log."""
+        return "\n".join(
+            f"--- {path.stem}\n{_tail(path, lines)}" for path in sorted(self.logs.glob("*.log"))
+        )
+
+    def expect_end(self, name):
+        """From now on `check` accepts that this process ends; return the process."""
+        self._ending.add(name)
+        return self.running[name]
+
     def check(self):
-        """Raise with the end of its log if a process has ended."""
+        """Raise with the end of its log if a process has ended unexpectedly."""
         for name, process in self.running.items():
-            if process.poll() is not None:
-                tail = "\n".join(self.log(name).splitlines()[-15:])
+            if name not in self._ending and process.poll() is not None:
+                tail = _tail(self.logs / f"{name}.log", 15)
                 raise ProcessError(f"{name} ended with code {process.returncode}:\n{tail}")
 
     def stop(self, number=signal.SIGINT):
@@ -173,7 +185,7 @@ class Processes:
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 codes[name] = process.wait()
-        self.running = {}
+        self.running, self._ending = {}, set()
         return codes
 
     def __enter__(self):
@@ -181,6 +193,10 @@ class Processes:
 
     def __exit__(self, *_):
         self.stop()
+
+
+def _tail(path, lines):
+    return "\n".join(path.read_text(errors="replace").splitlines()[-lines:])
 
 
 def add_arguments(parser):
