@@ -24,7 +24,7 @@ help:
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
 	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
-	@echo 'make compare    build, then tune rivals on the same arms, and compare; COMPARE_ARGS=--quick'
+	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
 	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
 	@echo 'make fuzz       build, then malformed input for every reader and node; FUZZ_ARGS="--inputs 10000"'
 	@echo 'make soak       build, then random motions, parameters and faults; SOAK_ARGS="--minutes 5"'

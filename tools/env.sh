@@ -1,12 +1,12 @@
 # Source this to work with flexarm in a shell: . tools/env.sh   (sh, bash, dash, zsh)
-# It puts .venv, the workspace and, without a ROS of the system, the wheels' ROS on the paths.
+# It adds .venv, the workspace and, unless the system has ROS, the wheels' ROS to the paths.
 
 if [ -n "${BASH_VERSION:-}" ]; then
   FLEXARM_ROOT=$(CDPATH='' cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)
 elif [ -n "${ZSH_VERSION:-}" ]; then
   eval 'FLEXARM_ROOT=${${(%):-%x}:A:h:h}'
 elif [ -z "${FLEXARM_ROOT:-}" ]; then
-  FLEXARM_ROOT=$(pwd -P) # other shells do not say where a sourced file is
+  FLEXARM_ROOT=$(pwd -P) # other shells do not report where a sourced file is
 fi
 
 if [ ! -f "$FLEXARM_ROOT/install/local_setup.sh" ] || [ ! -f "$FLEXARM_ROOT/.venv/flexarm.mode" ]; then
@@ -17,7 +17,7 @@ export FLEXARM_ROOT
 
 _flexarm_mode=$(cat "$FLEXARM_ROOT/.venv/flexarm.mode")
 if [ "$_flexarm_mode" = wheels ]; then
-  if [ -n "${ROS_DISTRO:-}" ]; then # another ROS, overridden by FLEXARM_ROS=wheels: its libraries do not mix with ours
+  if [ -n "${ROS_DISTRO:-}" ]; then # another ROS, overridden by FLEXARM_ROS=wheels: the two must not be mixed
     unset ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION PYTHONPATH LD_LIBRARY_PATH
     unset AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH
   fi
@@ -29,9 +29,9 @@ if [ "$_flexarm_mode" = wheels ]; then
     *":$FLEXARM_ROOT/.venv:"*) ;;
     *) export CMAKE_PREFIX_PATH="$FLEXARM_ROOT/.venv${CMAKE_PREFIX_PATH:+:$CMAKE_PREFIX_PATH}" ;;
   esac
-  # Set by the Python of another environment, it would keep ours from finding its libraries.
+  # If another environment's Python has set it, ours would not find its libraries.
   unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
-  _flexarm_setup=local_setup.sh # there is no setup.sh below us to chain to
+  _flexarm_setup=local_setup.sh # there is no underlying workspace whose setup.sh to chain
 else
   _flexarm_setup=setup.sh
 fi
@@ -50,6 +50,6 @@ unset COLCON_CURRENT_PREFIX
 case $_flexarm_flags in *u*) set -u ;; esac
 
 export PYTHONNOUSERSITE=1
-# Stay on this machine unless told otherwise: an arm's topics have no business on the network by default.
+# By default an arm's topics stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
 unset _flexarm_mode _flexarm_setup _flexarm_flags

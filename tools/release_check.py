@@ -138,7 +138,7 @@ def main():
         wrong += [f"{python}: {error}"] if error else []
     for text in wrong:
         print(text)
-    print("ready for a release" if not wrong else f"{len(wrong)} things to mend first")
+    print("ready for a release" if not wrong else f"{len(wrong)} things to fix first")
     return 1 if wrong else 0
 
 
