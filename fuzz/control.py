@@ -4,7 +4,7 @@
 import numpy as np
 
 from flexarm_control import trajectory
-from flexarm_control.composite import law as composite
+from flexarm_control.component import sizes
 from flexarm_control.composite.law import FAST, MANIFOLD, SLOW, design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
@@ -225,7 +225,7 @@ class Controllers(_Path):
         slow, fast, manifold = law
         made = design(arm_model, slow, fast, manifold, {"feedforward": feedforward})
         limits = {"torque_limit": [2.0], "torque_rate_limit": [500.0]}
-        settings = check_all(PARAMETERS, limits, composite.sizes(arm_model))
+        settings = check_all(PARAMETERS, limits, sizes(arm_model))
         core = ArmController(arm_model, made, settings)
         return core, CompositeStateWriter(arm_model)
 
@@ -310,7 +310,7 @@ class Designs(Reader):
         return arm, chosen, rng.choice((None, settings, settings))
 
     def _values(self, rng, group, arm):
-        sizes, out = composite.sizes(self.models[arm]), {}
+        lengths, out = sizes(self.models[arm]), {}
         for parameter in rng.sample(group, min(len(group), rng.choice((0, 1, 2)))):
             if parameter.name == "grid":
                 continue  # many designs: slow, and no other code
@@ -318,7 +318,7 @@ class Designs(Reader):
             if isinstance(value, list) and parameter.length and rng.random() < 0.8:
                 value = value[:1] or [1.0]
             try:
-                check_all([parameter], {parameter.name: value}, sizes)
+                check_all([parameter], {parameter.name: value}, lengths)
             except FlexarmError:
                 if rng.random() < 0.9:
                     continue
@@ -332,7 +332,7 @@ class Designs(Reader):
     def check(self, given, result):
         arm = self.models[given[0]]
         n, m = arm.n_joints, arm.n_modes
-        limits = check_all(PARAMETERS, {"torque_limit": [1.0]}, composite.sizes(arm))
+        limits = check_all(PARAMETERS, {"torque_limit": [1.0]}, sizes(arm))
         core = ArmController(arm, result, limits)
         for k in range(4):
             sample = ArmSample(n, m)

@@ -11,6 +11,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.parameters import Parameter, check_all
 
+from ..component import make
 from ..feedforward.base import Settings
 from ..manifold.quasi_steady import QuasiSteady
 from . import full_order
@@ -211,11 +212,6 @@ class CompositeControl:
         return self._nominal[1]
 
 
-def sizes(model):
-    """Lengths by the names that parameter declarations use."""
-    return {"joints": model.n_joints, "modes": model.n_modes, "z": 2 * model.n_modes}
-
-
 def design_law(group, name, model, values, *known):
     """Find a law by name, check its parameters and design it.
 
@@ -239,8 +235,7 @@ def design_law(group, name, model, values, *known):
     ------
     UnknownComponentError, ParameterError, DesignError
     """
-    law = registry.find(group, name)
-    return law(model, *known, check_all(law.PARAMETERS, values, sizes(model), PREFIX[group]))
+    return make(group, name, model, values, PREFIX[group], *known)
 
 
 def design(model, slow, fast, manifold=None, settings=None):

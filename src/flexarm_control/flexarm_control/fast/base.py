@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fast control law is."""
+"""Base class of fast laws."""
 
 from abc import ABC, abstractmethod
 
 import numpy as np
 
+from ..component import Law
 
-class FastLaw(ABC):
+
+class FastLaw(Law, ABC):
     """Fast control u_fast of (12) and (15), designed on the boundary layer (11).
 
-    A law is registered by name in the entry-point group ``flexarm.fast_laws``. Riccati equations are solved
-    in the constructor; `torque` runs on the control path. u_fast is zero where z_f is: the constraint of (12).
+    Registered by name in the entry-point group ``flexarm.fast_laws``; its parameters are ``fast.<name>`` in the
+    controller node. Riccati equations are solved in the constructor; `torque` runs on the control path. u_fast is zero
+    where z_f is: the constraint of (12).
 
     Parameters
     ----------
@@ -20,41 +23,13 @@ class FastLaw(ABC):
         Checked values of `PARAMETERS`, arrays at full length.
     """
 
-    #: Declared parameters, named ``fast.<name>`` in the controller node.
-    PARAMETERS = ()
-
-    def __init__(self, model, parameters):
-        self.model = model
-        self.parameters = dict(parameters)
+    #: False for a law that uses the amplitudes alone: it runs without an observer.
+    needs_rates = True
 
     @property
     def configuration(self):
         """Joint configuration that the law is made for, shape (n,) [rad]: the full-order loop is checked there."""
         return np.array(self.parameters.get("configuration", np.zeros(self.model.n_joints)))
-
-    def warnings(self):
-        """What a person should know of this law on this arm; each a sentence."""
-        return ()
-
-    #: False for a law that uses the amplitudes alone: it runs without an observer.
-    needs_rates = True
-
-    def reset(self):
-        """A new session begins: forget the states that the last one left."""
-
-    def resume(self, other):
-        """Go on from another law's states, which may be of another kind: a redesign does not begin anew."""
-
-    def advance(self, dt):
-        """Move the law's own states, if it has any, by the time since the last sample.
-
-        Called before `torque`, once for every new sample but the first; a repeated sample moves nothing.
-
-        Parameters
-        ----------
-        dt : float
-            True time since the last sample [s].
-        """
 
     @abstractmethod
     def torque(self, z_f, q):

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a feed-forward is."""
+"""Base class of feed-forwards."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+
+from ..component import Component
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Settings:
     configuration: np.ndarray
 
 
-class Feedforward(ABC):
+class Feedforward(Component, ABC):
     """A motion of the whole arm, bending included, near the reference, and the torque that makes it.
 
     Registered by name in the entry-point group ``flexarm.feedforwards``. The composite control holds the arm
@@ -51,8 +53,9 @@ class Feedforward(ABC):
     plans = False
 
     def __init__(self, model, manifold, settings):
+        super().__init__(model)
         n, m = model.n_joints, model.n_modes
-        self.model, self.manifold, self.settings = model, manifold, settings
+        self.manifold, self.settings = manifold, settings
         self.position, self.velocity, self.acceleration = np.zeros(n), np.zeros(n), np.zeros(n)
         self.amplitude, self.rate, self.torque = np.zeros(m), np.zeros(m), np.zeros(n)
         self.limit = np.full(n, np.inf)
@@ -64,12 +67,6 @@ class Feedforward(ABC):
         out[1] = self.velocity + offset * self.acceleration
         out[2] = self.acceleration
         return out
-
-    def reset(self):
-        """A new session begins: the next sample is the first."""
-
-    def resume(self, other):
-        """Go on from another feed-forward's motion: a redesign does not begin anew."""
 
     def take(self, plan, trajectory_id):
         """Follow what `prepare` made, or nothing, None, as soon as the reference follows its trajectory."""
@@ -104,7 +101,3 @@ class Feedforward(ABC):
             Of the motion then, as far as can be foreseen; or None.
         """
         return None
-
-    def warnings(self):
-        """What a person should know of it on this arm; each a sentence."""
-        return ()

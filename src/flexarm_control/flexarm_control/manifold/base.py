@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a slow manifold is."""
+"""Base class of slow manifolds."""
 
 from abc import ABC, abstractmethod
 from types import SimpleNamespace
 
 import numpy as np
 
+from ..component import Component
 from .expansion import Point, expand, reach, step
 
 #: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
 SMALL = 1e-5
 
 
-class Manifold(ABC):
+class Manifold(Component, ABC):
     """Deflections z_bar that go with the slow motion, and the torque that goes with them beyond the slow law's.
 
     A manifold is registered by name in the entry-point group ``flexarm.manifolds``. The fast control acts on
@@ -35,14 +36,12 @@ class Manifold(ABC):
         Torque beyond the slow law's [N m].
     """
 
-    #: Declared parameters, named ``manifold.<name>`` in the controller node.
-    PARAMETERS = ()
     #: Order in mu to which the deflections follow the motion.
     order = 0
 
     def __init__(self, model, slow, parameters):
-        self.model, self.slow = slow.model, slow
-        self.parameters = dict(parameters)
+        super().__init__(slow.model, parameters)
+        self.slow = slow
         m, n = model.n_modes, model.n_joints
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self.feedforward = np.zeros(n)

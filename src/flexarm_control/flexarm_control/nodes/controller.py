@@ -33,6 +33,7 @@ from flexarm_ros.start import leave
 from flexarm_ros.statistics import Latency
 
 from .. import trajectory
+from ..component import sizes
 from ..composite import law as composite
 from ..composite.design_process import AwayError, DesignProcess
 from ..composite.law import FAST, MANIFOLD, PREFIX, SLOW
@@ -123,7 +124,7 @@ class ControllerNode(ArmNode):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
-        parameters.resolve(composite.sizes(self.model))
+        parameters.resolve(sizes(self.model))
         self._design_process = None
         if parameters["design_process"]:
             self._design_process = DesignProcess(self.model, cpus=scheduling.spare())

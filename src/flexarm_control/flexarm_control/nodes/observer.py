@@ -21,7 +21,7 @@ from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
 from flexarm_ros.statistics import Gaps, Latency, Percentiles
 
-from ..composite import law as composite
+from ..component import sizes
 from ..loop.samples import ArmSample
 from ..observers import arm_observer, gauge_health
 
@@ -55,7 +55,7 @@ class ObserverNode(ArmNode):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
-        parameters.resolve(composite.sizes(self.model))
+        parameters.resolve(sizes(self.model))
         arm_observer.ArmObserver(self.model, self._design(), **self._common()).rehearse()
         self.core = arm_observer.ArmObserver(self.model, self._design(), **self._common())
         parameters.on_change(self._changed)

@@ -3,12 +3,11 @@
 
 import numpy as np
 
-from flexarm_dynamics import registry
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import Parameter, check_all
 
-from ..composite.law import sizes
+from ..component import make
 from ..loop.samples import ArmSample, SampleOrder
 from . import gauge_health
 from .motion import Motion
@@ -52,8 +51,7 @@ def design_observer(name, model, values):
     ------
     UnknownComponentError, ParameterError, DesignError
     """
-    law = registry.find(OBSERVERS, name)
-    return law(model, check_all(law.PARAMETERS, values, sizes(model), "observer."))
+    return make(OBSERVERS, name, model, values, "observer.")
 
 
 def observe(model, name, values):

@@ -5,8 +5,10 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from ..component import Component
 
-class Observer(ABC):
+
+class Observer(Component, ABC):
     """Reconstructs modal rates (and may smooth amplitudes) from samples of modal amplitudes.
 
     Registered by name in the entry-point group ``flexarm.observers``. Design work is done in the
@@ -42,16 +44,12 @@ class Observer(ABC):
         What the observer estimates of the arm itself; the name has the unit.
     """
 
-    #: Declared parameters, named ``observer.<name>`` in the observer node.
-    PARAMETERS = ()
-
     joint_position = joint_velocity = None
     innovation_squared = float("nan")
     consistent = True
 
     def __init__(self, model, parameters):
-        self.model = model
-        self.parameters = dict(parameters)
+        super().__init__(model, parameters)
         m = model.n_modes
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self.innovation = np.zeros(0)

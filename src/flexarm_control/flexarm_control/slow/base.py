@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a slow control law is."""
+"""Base class of slow laws."""
 
 from abc import ABC, abstractmethod
 
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
+
+from ..component import Law
 
 KP = Parameter(
     "kp",
@@ -28,11 +30,11 @@ KV = Parameter(
 )
 
 
-class SlowLaw(ABC):
+class SlowLaw(Law, ABC):
     """Slow control u_slow of (12), designed on the slow subsystem (10).
 
-    A law is registered by name in the entry-point group ``flexarm.slow_laws``. All design work is done in
-    the constructor; `torque` runs on the control path.
+    Registered by name in the entry-point group ``flexarm.slow_laws``; its parameters are ``slow.<name>`` in the
+    controller node. `torque` runs on the control path.
 
     Parameters
     ----------
@@ -43,21 +45,11 @@ class SlowLaw(ABC):
         Checked values of `PARAMETERS`, arrays at full length.
     """
 
-    #: Declared parameters, named ``slow.<name>`` in the controller node.
-    PARAMETERS = ()
     #: True for a law that leaves the joints free.
     drifts = False
     #: True for a law whose `model` changes with what it learns: the slow manifold follows it, a simulation of the
     #: arm file's arm would not, so that such a law goes without feed-forward.
     learns = False
-
-    def __init__(self, model, parameters):
-        self.model = model
-        self.parameters = dict(parameters)
-
-    def warnings(self):
-        """What a person should know of this law on this arm; each a sentence."""
-        return ()
 
     def error_gains(self):
         """Gains (kp, kv) of the tracking error's dynamics, e'' = -kv e' - kp e, each (n,); None for another law.
@@ -77,23 +69,6 @@ class SlowLaw(ABC):
             The reference's [rad/s^2].
         """
         return slow_torque(terms, acceleration)
-
-    def reset(self):
-        """A new session begins: forget what was learnt from the samples of the last one."""
-
-    def resume(self, other):
-        """Go on from another law's states, which may be of another kind: a redesign does not begin anew."""
-
-    def advance(self, dt):
-        """Move the law's own states, if it has any, by the time since the last sample.
-
-        Called before `torque`, once for every new sample but the first; a repeated sample moves nothing.
-
-        Parameters
-        ----------
-        dt : float
-            True time since the last sample [s].
-        """
 
     @abstractmethod
     def torque(self, q, qd, reference, terms):

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What slow laws, fast laws, manifolds, feed-forwards and observers have in common, and how one is made by name."""
+
+from flexarm_dynamics import registry
+from flexarm_dynamics.parameters import check_all
+
+
+class Component:
+    """A part of the control that is found by name, designed once, and called once per sample.
+
+    All design work is done in the constructor. A session begins with `reset`; after a redesign the new component
+    goes on by `resume`. A component without states of its own has nothing to do in either.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The arm.
+    parameters : mapping, optional
+        Checked values of `PARAMETERS`, arrays at full length.
+    """
+
+    #: Declared parameters; their names in a node begin with the component's prefix, such as ``slow.``.
+    PARAMETERS = ()
+
+    def __init__(self, model, parameters=()):
+        self.model = model
+        self.parameters = dict(parameters)
+
+    def warnings(self):
+        """What a user should know about this component on this arm; each a sentence."""
+        return ()
+
+    def reset(self):
+        """A new session begins: forget the states that the last one left."""
+
+    def resume(self, other):
+        """Go on from the states of another component, which may be of another kind: a redesign does not start over."""
+
+
+class Law(Component):
+    """A component whose states, if it has any, advance apart from its output."""
+
+    def advance(self, dt):
+        """Advance the law's own states by the time since the last sample.
+
+        Called before `torque`, once for every new sample but the first; a repeated sample advances nothing.
+
+        Parameters
+        ----------
+        dt : float
+            True time since the last sample [s].
+        """
+
+
+def sizes(model):
+    """Lengths of array parameters by the names that their declarations use."""
+    return {"joints": model.n_joints, "modes": model.n_modes, "z": 2 * model.n_modes}
+
+
+def make(group, name, model, values, prefix, *known):
+    """Find a component by name, check its parameters and design it.
+
+    Parameters
+    ----------
+    group : str
+        Entry-point group, such as ``flexarm.slow_laws``.
+    name : str
+        As registered there.
+    model : ArmModel
+    values : mapping
+        Parameter values without prefix, of this component alone.
+    prefix : str
+        Put before parameter names in errors.
+    *known
+        What the component is designed for besides the model: the slow law, for a manifold.
+
+    Returns
+    -------
+    Component
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError
+    """
+    kind = registry.find(group, name)
+    return kind(model, *known, check_all(kind.PARAMETERS, values, sizes(model), prefix))
