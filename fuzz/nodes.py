@@ -67,11 +67,10 @@ class Nodes:
         """Wait for a condition; messages that nobody will look at are forgotten."""
 
         def holds():
-            for tap in self.bench._taps.values():
+            for tap in self.bench.taps.values():
                 del tap.messages[:-50]
             return condition()
 
-        self.bench.processes.check()
         return self.bench.wait_for(what, holds)
 
     def alive(self, *nodes):
@@ -99,7 +98,7 @@ class Nodes:
             key, tries = (msg.session, msg.sequence), [time.monotonic()]
 
             def answered(key=key, tries=tries, msg=msg):
-                if self.arm.torques.answers(*key) or len(tries) > MOST_TRIES:
+                if harness.answers(self.arm.torques, *key) or len(tries) > MOST_TRIES:
                     return True
                 if time.monotonic() > tries[-1] + 0.5:  # overtaken: the line keeps the newest alone
                     tries.append(time.monotonic())
@@ -109,7 +108,7 @@ class Nodes:
             self.wait(f"an answer to {topic} {k}", answered)
             if k % AT_ONCE == 0 and self.arm.state.supervisor_state == CompositeState.FAULT:
                 self.bench.call(Trigger, "controller/recover")
-            answers = self.arm.torques.answers(*key)
+            answers = harness.answers(self.arm.torques, *key)
             tally.inputs += 1
             if not answers:
                 tally.failures += 1
@@ -282,7 +281,7 @@ def fuzz(count, seed, say, patience=180.0):
     """
     tallies = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, harness.Bench(folder) as bench:
-        bench.PATIENCE = max(bench.PATIENCE, patience)
+        bench.patience = max(bench.patience, patience)
         nodes = Nodes(bench, seed)
 
         def part(name, share, action):

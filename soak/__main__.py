@@ -6,7 +6,7 @@ import sys
 import tempfile
 import time
 
-from flexarm_tools.running.processes import ProcessError
+from flexarm_dynamics.errors import FlexarmError
 
 #: Growth of a process's memory that is none: the allocator's own coming and going [MiB].
 FLAT = 8.0
@@ -36,7 +36,7 @@ def soak(options, say):
     from . import run
 
     with tempfile.TemporaryDirectory(prefix="soak-") as folder, run.harness.Bench(folder) as bench:
-        bench.PATIENCE = max(bench.PATIENCE, PATIENCE)
+        bench.patience = max(bench.patience, PATIENCE)
         life = run.Soak(bench, options.seed, options.arm, not options.without_faults)
         begun = reported = time.monotonic()
         end, trouble = begun + 60.0 * options.minutes, ""
@@ -48,7 +48,7 @@ def soak(options, say):
                     reported = time.monotonic()
                     life.look()
                     say(progress(life, reported - begun))
-        except (AssertionError, ProcessError) as error:
+        except (AssertionError, FlexarmError) as error:
             trouble = str(error)
         life.drain()
         return life, trouble

@@ -143,7 +143,6 @@ class Soak:
 
     def wait(self, what, condition, patience=None):
         """Judge messages until a condition holds."""
-        self.bench.processes.check()
         return self.bench.wait_for(what, lambda: self.drain() and condition(), patience)
 
     def running(self):

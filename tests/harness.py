@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bench for the nodes: processes on a DDS domain of their own, and what a user's programs do beside them.
 
-Nothing here sleeps: every wait serves an executor until a condition holds, for a bounded time, and then
-fails saying what it waited for and what the nodes' logs end with.
+Nothing here sleeps: every wait is `Session.wait_for`, which ends when its condition holds, fails at once when a process
+has died, and fails after a bounded time with what it waited for and the end of the nodes' logs.
 """
 
 import contextlib
@@ -12,31 +12,22 @@ import time
 from pathlib import Path
 
 import numpy as np
-import rclpy
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from flexarm_dynamics.parameters import check_all
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
-from flexarm_ros import qos
 from flexarm_ros.messages import SECOND, StateWriter, set_stamp, stamp_ns
+from flexarm_ros.session import Session, WaitError, parameter_messages, plain
 from flexarm_sim import simulator
 from flexarm_tools.running.processes import NODES, Processes, arguments, executable, own_domain
 
 SHM = Path("/dev/shm")
-#: Deep enough for a reader that falls behind for seconds.
-DEEP = QoSProfile(
-    history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
-)
 #: Of a controller that a loaded machine may hold up for seconds; in real time, too.
 PATIENT = {"state_timeout": 60.0, "max_gap": 60.0}
 #: Number of each transition, and the state it leads to.
@@ -48,32 +39,13 @@ TRANSITIONS = {
 }
 
 
-class Tap:
-    """Keeps what comes on a topic, in order, without waking an executor per message."""
-
-    def __init__(self, node, kind, topic):
-        self.messages = []
-        self._subscription = node.create_subscription(kind, topic, lambda message: None, DEEP)
-
-    def poll(self):
-        """Take what has come since the last call."""
-        handle, kind = self._subscription.handle, self._subscription.msg_type
-        with handle:
-            while (taken := handle.take_message(kind, False)) is not None:
-                self.messages.append(taken[0])
-
-    @property
-    def newest(self):
-        """The last message; None before the first."""
-        return self.messages[-1] if self.messages else None
-
-    def answers(self, session, sequence):
-        """The messages of one sample."""
-        return [m for m in self.messages if (m.session, m.sequence) == (session, sequence)]
+def answers(tap, session, sequence):
+    """The messages of a tap that belong to one sample."""
+    return [m for m in tap.messages if (m.session, m.sequence) == (session, sequence)]
 
 
-class Bench:
-    """Processes, and a node of this process beside them.
+class Bench(Session):
+    """Processes, and a session of this process beside them.
 
     Parameters
     ----------
@@ -81,22 +53,20 @@ class Bench:
         For log files.
     """
 
-    #: Longest wait for any one thing [s]; generous, so that a loaded machine fails no test.
+    #: Timeout of one wait [s]; generous, so that a loaded machine fails no test.
     PATIENCE = float(os.environ.get("FLEXARM_TEST_PATIENCE", "60"))
 
     def __init__(self, directory):
         self._stack = contextlib.ExitStack()
-        self.directory = Path(directory)
         self.domain = self._stack.enter_context(own_domain())
         self.processes = self._stack.enter_context(Processes(self.domain, directory))
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=self.domain)
-        quiet = {"start_parameter_services": False, "enable_rosout": False}
-        self.node = Node("bench", context=self.context, **quiet)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self._taps, self._clients, self._publishers = {}, {}, {}
-        self._tapping = Node("taps", context=self.context, **quiet)
+        super().__init__(
+            "bench",
+            domain=self.domain,
+            processes=self.processes,
+            patience=self.PATIENCE,
+            period=0.002,
+        )
         self._killed = set()
 
     # Processes -------------------------------------------------------------------------------
@@ -126,55 +96,23 @@ class Bench:
         process.kill()
         process.wait()
 
-    def stop(self, key, number):
-        """Signal one process and wait for its end; its exit code."""
-        process = self.processes.running.pop(key)
-        process.send_signal(number)
-        self.wait_for(f"{key} to end", lambda: process.poll() is not None)
+    def end_of(self, key, patience=None):
+        """Wait until a process has ended by itself; its exit code."""
+        process = self.processes.expect_end(key)
+        self.wait_for(f"{key} to end", lambda: process.poll() is not None, patience)
+        del self.processes.running[key]
         return process.returncode
 
-    # Waiting ---------------------------------------------------------------------------------
-
-    def wait_for(self, what, condition, patience=None):
-        """Serve the executor and the taps until `condition` holds; return its value."""
-        end = time.monotonic() + (patience or self.PATIENCE)
-        while True:
-            for tap in self._taps.values():
-                tap.poll()
-            if value := condition():
-                return value
-            if time.monotonic() > end:
-                logs = "\n".join(
-                    f"--- {path.stem}\n" + "\n".join(path.read_text().splitlines()[-8:])
-                    for path in sorted(self.directory.glob("*.log"))
-                )
-                raise AssertionError(
-                    f"waited {patience or self.PATIENCE:g} s in vain for {what}\n{logs}"
-                )
-            self.executor.spin_once(timeout_sec=0.002)
-
-    def spin_for(self, seconds):
-        """Serve the executor for a while, where nothing is to happen."""
-        end = time.monotonic() + seconds
-        self.wait_for("the time to pass", lambda: time.monotonic() > end, seconds + 1.0)
+    def stop(self, key, number):
+        """Signal one process and wait for its end; its exit code."""
+        self.processes.expect_end(key).send_signal(number)
+        return self.end_of(key)
 
     # Topics ----------------------------------------------------------------------------------
 
-    def tap(self, kind, topic):
-        """The `Tap` of a topic."""
-        if topic not in self._taps:
-            self._taps[topic] = Tap(self._tapping, kind, topic)
-        return self._taps[topic]
-
     def publisher(self, kind, topic, readers=1):
-        """A publisher (reliable, volatile, as ``ros2 topic pub``) that `readers` have found."""
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(kind, topic, qos.COMMAND)
-        publisher = self._publishers[topic]
-        self.wait_for(
-            f"{readers} reader of {topic}", lambda: publisher.get_subscription_count() >= readers
-        )
-        return publisher
+        """A publisher (reliable, volatile, as ``ros2 topic pub``) that `readers` have discovered."""
+        return super().publisher(kind, topic, readers)
 
     def diagnostics(self, name):
         """What a node says on /diagnostics, newest last."""
@@ -182,26 +120,6 @@ class Bench:
         return [s for a in arrays for s in a.status if s.name == name]
 
     # Services --------------------------------------------------------------------------------
-
-    #: An answer is asked for again after so long [s]: a server that has not found the client yet drops it.
-    ASK_AGAIN = 3.0
-
-    def call(self, kind, name, **request):
-        """Call a service."""
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, name)
-        client = self._clients[name]
-        self.wait_for(f"the service {name}", client.service_is_ready)
-        futures, again = [], 0.0
-
-        def answered():
-            nonlocal again
-            if time.monotonic() > again:
-                again = time.monotonic() + self.ASK_AGAIN
-                futures.append(client.call_async(kind.Request(**request)))
-            return next((f for f in futures if f.done()), None)
-
-        return self.wait_for(f"an answer of {name}", answered).result()
 
     def set(self, node, **values):
         """Set parameters one by one; dots as double underscores. The results, in order."""
@@ -219,8 +137,7 @@ class Bench:
         answer = self.call(GetParameters, f"{node}/get_parameters", names=[name])
         if not answer.values:
             return None
-        value = parameter_value_to_python(answer.values[0])
-        return value.tolist() if hasattr(value, "tolist") else value
+        return plain(answer.values[0])
 
     def change(self, node, transition):
         """Call a lifecycle transition; whether the node is where it leads."""
@@ -237,26 +154,14 @@ class Bench:
     def close(self):
         """End all processes; remove what killed ones left behind."""
         self.processes.stop()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self._tapping.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        super().close()
         self._stack.close()
         for path in abandoned(self._killed):
             path.unlink(missing_ok=True)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
-
 
 def _messages(values):
-    return [
-        Parameter(name.replace("__", "."), value=value).to_parameter_msg()
-        for name, value in values.items()
-    ]
+    return parameter_messages({name.replace("__", "."): v for name, v in values.items()})
 
 
 class Arm:
@@ -376,7 +281,7 @@ class Arm:
 
         try:
             self.bench.wait_for("the trajectory to be accepted", accepted)
-        except AssertionError as error:
+        except WaitError as error:
             raise AssertionError(f"refused: {self.state.rejected_reason}\n{error}") from None
         return self.state.accepted_trajectory_id
 

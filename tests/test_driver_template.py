@@ -39,10 +39,8 @@ def start_template(bench, port, *options, **parameters):
 def check_driver(bench, *options):
     """Run ``flexarm check_driver R --allow-motion``; exit code and what it said."""
     words = ["check_driver", "R", "--allow-motion", *EASY, *options]
-    process = bench.processes.start("check", [executable("flexarm_bringup", "flexarm"), *words])
-    bench.wait_for("the check to end", lambda: process.poll() is not None, 3 * bench.PATIENCE)
-    bench.processes.running.pop("check")
-    return process.returncode, bench.log("check")
+    bench.processes.start("check", [executable("flexarm_bringup", "flexarm"), *words])
+    return bench.end_of("check", 3 * bench.PATIENCE), bench.log("check")
 
 
 def test_stamps_are_the_devices_times_however_late_a_frame_comes(monkeypatch):

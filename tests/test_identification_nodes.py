@@ -28,10 +28,8 @@ def excite(bench, arm, bag, *words):
         str(bag),
         *words,
     ]
-    process = bench.processes.start("excite", command)
-    bench.wait_for("the excitation to end", lambda: process.poll() is not None, 2 * bench.PATIENCE)
-    bench.processes.running.pop("excite")
-    return process.returncode, bench.log("excite")
+    bench.processes.start("excite", command)
+    return bench.end_of("excite", 2 * bench.PATIENCE), bench.log("excite")
 
 
 @pytest.fixture

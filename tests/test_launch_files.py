@@ -40,14 +40,13 @@ def test_arm_launch_starts_a_loop_that_answers_and_ends_whole_with_sigint(bench)
     children = descendants(launched.pid)
     assert len(children) == 3
     # To the whole group, as Ctrl-C in a terminal does.
+    bench.processes.expect_end("launch")
     os.killpg(launched.pid, signal.SIGINT)
-    bench.wait_for("launch to end", lambda: launched.poll() is not None)
-    assert launched.returncode == 0
+    assert bench.end_of("launch") == 0
     assert not [pid for pid in children if os.path.exists(f"/proc/{pid}")]
     log = bench.log("launch")
     assert log.count("process has finished cleanly") == 3, log
     assert "Traceback" not in log
-    bench.processes.running.pop("launch")
 
 
 def descendants(pid):

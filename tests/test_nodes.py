@@ -149,12 +149,9 @@ def refusals(tmp_path_factory):
                 path.write_text(given["arm"])
                 given["arm"] = str(path)
             bench.start(node, given, key=case)
-        running = dict(bench.processes.running)
-        bench.wait_for(
-            "all to end",
-            lambda: all(process.poll() is not None for process in running.values()),
-        )
-        codes = {case: process.returncode for case, process in running.items()}
+        for case in REFUSALS:
+            bench.processes.expect_end(case)
+        codes = {case: bench.end_of(case) for case in REFUSALS}
         return codes, {case: bench.log(case) for case in REFUSALS}
 
 
@@ -171,9 +168,8 @@ def test_the_other_nodes_go_on_when_one_refuses_to_start(bench):
     bench.start("observer", {"arm": "R"})
     arm = Arm(bench)
     bench.wait_for("estimates", lambda: arm.estimated.newest)
-    refused = bench.start("controller", {"arm": "R", "fast.alpha": -1.0})
-    bench.wait_for("the controller to end", lambda: refused.poll() is not None)
-    assert refused.returncode == 1
+    bench.start("controller", {"arm": "R", "fast.alpha": -1.0})
+    assert bench.end_of("controller") == 1
     seen = len(arm.estimated.messages)
     bench.wait_for("more estimates", lambda: len(arm.estimated.messages) > seen + 20)
     assert [bench.processes.running[n].poll() for n in ("simulator", "observer")] == [None, None]
@@ -490,10 +486,9 @@ def broken_law(tmp_path, monkeypatch):
 
 def test_a_users_law_that_fails_in_its_design_is_refused_with_its_own_words(broken_law, bench):
     common = {"arm": "R", "fast.type": "none"}
-    refused = bench.start("controller", {**common, "slow.type": "broken"}, key="refused")
+    bench.start("controller", {**common, "slow.type": "broken"}, key="refused")
     bench.start("controller", {**common, "slow.kp": [4.0]})
-    bench.wait_for("the first to end", lambda: refused.poll() is not None)
-    assert refused.returncode == 1
+    assert bench.end_of("refused") == 1
     assert "not configured" in bench.log("refused")
     assert "ValueError: my law has a mistake" in bench.log("refused")
     assert bench.set("controller", slow__type="broken")[0].successful
