@@ -6,6 +6,7 @@ COMPARE_ARGS ?=
 FUZZ_ARGS ?= --inputs 1000000 --dds 10000
 SOAK_ARGS ?= --minutes 30
 LATENCY_ARGS ?=
+MUTANTS_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
 ifneq ($(origin PYTHON),file)
@@ -15,13 +16,15 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo test docs bench compare latency fuzz soak lint release-check clean distclean
+.PHONY: help build demo check test mutants docs bench compare latency fuzz soak lint release-check clean distclean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make build      set up .venv and build the workspace; again: only what changed'
 	@echo 'make demo       build, then run the case study'
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
+	@echo 'make check      build, then style, imports and the quick unit tests: about a minute'
+	@echo 'make mutants    build, then put in errors one at a time: a test must fail for each; MUTANTS_ARGS="-k chain"'
 	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
@@ -43,13 +46,24 @@ build:
 demo: build
 	@./flexarm demo
 
-# Those without processes two files at a time; the others one by one: two real-time loops are too much for two cores.
-# pytest's 5 means that PYTEST_ARGS selects nothing there.
+# Two at a time, but those in real time one by one and after the others: two real-time loops are too much for two
+# cores. pytest's 5 means that PYTEST_ARGS selects nothing there.
+TESTS := $(wildcard src/*/test) tests
 test: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; \
-	python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS) $(wildcard src/*/test); units=$$?; \
-	python -m pytest -q $(PYTEST_ARGS) tests; nodes=$$?; \
-	case $$units$$nodes in 00|05|50) ;; *) exit 1 ;; esac
+	python -m pytest -q -n 2 --dist loadgroup -m "not real_time" $(PYTEST_ARGS) $(TESTS); others=$$?; \
+	python -m pytest -q -m real_time $(PYTEST_ARGS) $(TESTS); real_time=$$?; \
+	case $$others$$real_time in 00|05|50) ;; *) exit 1 ;; esac
+
+# The inner loop: style, imports, and the unit tests that are over quickly.
+check: build
+	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; ruff check && ruff format --check -q && \
+	python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
+	$(wildcard src/*/test) tests/test_architecture.py
+
+# Wrong signs, factors and limits, put in one at a time: a test must fail for each.
+mutants: build
+	@. tools/env.sh && python tools/mutants.py $(MUTANTS_ARGS)
 
 # In a directory of its own: what Sphinx needs does not go with what colcon needs.
 DOCS_TOOLS := results/docs/tools

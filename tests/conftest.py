@@ -13,14 +13,6 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 sys.path.insert(0, str(Path(__file__).parent))  # --import-mode=importlib does not
 
 
-def pytest_collection_modifyitems(items):
-    """What runs processes is at the mercy of the machine's scheduler: it has further tries, which the summary shows."""
-    here = Path(__file__).parent
-    for item in items:
-        if here in item.path.parents:
-            item.add_marker(pytest.mark.flaky(reruns=2))
-
-
 @pytest.fixture
 def bench(tmp_path):
     """A `harness.Bench` of this test alone."""

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm check_driver`` on running drivers: the simulator in real time passes, a drive without power does not."""
 
+import pytest
 from test_driver_template import RATE, TIMEOUT, check_driver, start_template
 
 from flexarm_msgs.msg import JointTorque
 
 
+@pytest.mark.real_time
 def test_the_simulator_in_real_time_passes(bench):
     bench.start("simulator", {"arm": "R", "rate": RATE, "torque_timeout": TIMEOUT})
     code, said = check_driver(bench)
@@ -16,6 +18,7 @@ def test_the_simulator_in_real_time_passes(bench):
     assert code == 1 and "a controller sends joint_torque: stop it" in said
 
 
+@pytest.mark.real_time
 def test_a_drive_that_ignores_torque_fails_and_is_told_so(bench, tmp_path):
     start_template(bench, tmp_path / "arm", "--ignore-torque")
     code, said = check_driver(bench)

@@ -90,6 +90,7 @@ def line(tmp_path_factory):
         yield bench
 
 
+@pytest.mark.real_time
 def test_the_template_passes_the_check(line):
     code, said = check_driver(line, "--rate", str(RATE))
     assert code == 0, said
@@ -104,6 +105,7 @@ def send(publisher, state, torque, controller_id=1):
     publisher.publish(JointTorque(**fields, **names))
 
 
+@pytest.mark.real_time
 def test_two_controllers_in_turn_bring_the_safe_action_and_a_torque_is_clipped(line):
     states = line.tap(ArmState, "arm_state")
     publisher = line.publisher(JointTorque, "joint_torque")
@@ -129,6 +131,7 @@ def test_two_controllers_in_turn_bring_the_safe_action_and_a_torque_is_clipped(l
     apply([1], 0.5, lambda u: abs(u - 0.5) < 1e-6)
 
 
+@pytest.mark.real_time
 def test_observer_and_controller_run_on_it_unchanged(line):
     # Soft fast gains and an observer with a model: they bear torques that come late.
     line.start("observer", {"arm": "R", "observer.type": "kalman"})

@@ -480,6 +480,7 @@ def in_motion(arm):
     arm.bench.wait_for("the motion", lambda: arm.measured.newest.joint_velocity[0] > 0.5)
 
 
+@pytest.mark.real_time
 def test_when_the_controller_is_killed_the_safe_action_brings_the_joint_to_rest(real_time):
     bench, measured = real_time.bench, real_time.measured
     in_motion(real_time)
@@ -512,6 +513,7 @@ def test_when_the_controller_is_killed_the_safe_action_brings_the_joint_to_rest(
     assert levels(bench, "simulator", since)[-1] == (DiagnosticStatus.OK, "ok")
 
 
+@pytest.mark.real_time
 def test_when_the_observer_is_killed_the_controller_disables_after_state_timeout(real_time):
     bench = real_time.bench
     in_motion(real_time)
@@ -530,6 +532,7 @@ def test_when_the_observer_is_killed_the_controller_disables_after_state_timeout
     works(real_time)
 
 
+@pytest.mark.real_time
 def test_a_simulator_that_is_killed_and_restarted_is_a_new_session_and_the_loop_works(real_time):
     bench, session = real_time.bench, real_time.state.session
     in_motion(real_time)
@@ -553,6 +556,7 @@ def test_a_simulator_that_is_killed_and_restarted_is_a_new_session_and_the_loop_
         assert "Traceback" not in bench.log(name)
 
 
+@pytest.mark.real_time
 def test_a_controller_that_is_stopped_for_a_while_brings_the_safe_action_and_then_goes_on(
     real_time,
 ):

@@ -85,6 +85,7 @@ def test_ten_runs_give_the_same_samples_bit_for_bit_with_one_cpu_loaded(tmp_path
                 assert again[topic] == messages, f"run {i}, {topic}"
 
 
+@pytest.mark.real_time
 def test_lockstep_costs_at_most_1_6_of_a_bare_relay(tmp_path):
     # Interleaved, medians; a noisy machine gets three chances, a slow product none.
     ratios = []

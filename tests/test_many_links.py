@@ -27,6 +27,7 @@ def bench(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["two_link", "long_reach", "rigid"])
+@pytest.mark.real_time
 def test_the_simulator_runs_each_shipped_arm(bench, name):
     arm = arm_file.load(name)
     bench.start("simulator", {"arm": name})

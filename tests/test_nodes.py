@@ -163,6 +163,7 @@ def test_what_a_node_cannot_start_with_ends_it_with_one_error_that_names_it(refu
     assert re.search(REFUSALS[case][2], logs[case]), logs[case]
 
 
+@pytest.mark.real_time
 def test_the_other_nodes_go_on_when_one_refuses_to_start(bench):
     bench.start("simulator", {"arm": "R", "rate": 100.0})
     bench.start("observer", {"arm": "R"})
@@ -605,6 +606,7 @@ def test_paused_in_lockstep_the_same_state_comes_again_and_torques_advance_nothi
     assert drive.step(1.0).sequence == state.sequence + 1
 
 
+@pytest.mark.real_time
 def test_pause_and_reset_in_real_time(bench):
     bench.start("simulator", {"arm": "R", "rate": 200.0, "resend_period": 0.02})
     arm = Arm(bench)
@@ -631,6 +633,7 @@ def test_pause_and_reset_in_real_time(bench):
 # Two arms --------------------------------------------------------------------------------------
 
 
+@pytest.mark.real_time
 def test_two_arms_side_by_side_one_killed_the_other_unaffected_topics_remapped(bench):
     common = {"arm": "R", "fast.type": "none", "rate": 100.0}
     remaps = {

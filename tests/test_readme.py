@@ -143,6 +143,7 @@ def message_from_yaml(text):
 
 
 @pytest.mark.parametrize("command", starting("ros2", "topic", "pub"))
+@pytest.mark.real_time
 def test_topic_pub_example_moves_the_arm_with_stamp_0(arm, command):
     topic, kind, text = [w for w in words_of(command)[3:] if not w.startswith("--")]
     assert kind == "trajectory_msgs/msg/JointTrajectory"
@@ -173,6 +174,7 @@ def test_topic_pub_example_moves_the_arm_with_stamp_0(arm, command):
 
 
 @pytest.mark.parametrize("command", starting("ros2", "param", "set"))
+@pytest.mark.real_time
 def test_param_set_example_is_taken(arm, command):
     node, name, value = words_of(command)[3:]
     client = arm.node.create_client(SetParameters, f"{node}/set_parameters")
@@ -200,12 +202,14 @@ def publish(line, command):
     line.wait_for("acceptance", lambda: line.accepted() > before)
 
 
+@pytest.mark.real_time
 def test_publish_command_reaches_the_controller_even_while_the_arm_moves(arm):
     command = starting("./flexarm", "publish")[0]
     publish(arm, command)
     publish(arm, command.replace("1.57", "0.3"))
 
 
+@pytest.mark.real_time
 def test_commands_of_the_two_link_arm_move_it(tmp_path):
     commands = [c for c in starting("./flexarm", "run") if "two_link" in c]
     with started(commands, tmp_path) as line:
@@ -240,6 +244,7 @@ def test_commands_without_ros_do_what_they_say(tmp_path, command):
             assert (tmp_path / word).stat().st_size > 1000
 
 
+@pytest.mark.real_time
 def test_commands_of_your_own_arm_move_it(tmp_path):
     commands = [c for c in starting("./flexarm", "run") if "--params-file" not in c]
     with started(commands, tmp_path) as line:

@@ -104,12 +104,14 @@ def loop(started):
     return started
 
 
+@pytest.mark.real_time
 def test_a_trajectory_from_the_other_host_is_tracked(loop):
     loop.move()
     assert loop.arm.count("joint_torque") > 0
     assert loop.desk.count("arm_state") > 0
 
 
+@pytest.mark.real_time
 def test_a_cut_of_50_ms_is_bridged_or_stops_the_arm_and_it_recovers(loop):
     loop.set_in_motion()
     cut = loop.cut_for(0.05)
@@ -124,6 +126,7 @@ def test_a_cut_of_50_ms_is_bridged_or_stops_the_arm_and_it_recovers(loop):
     loop.move()
 
 
+@pytest.mark.real_time
 def test_a_cut_of_500_ms_is_safe_on_both_hosts_and_the_arm_moves_again_after_recovery(loop):
     loop.set_in_motion()
     # The arm and the controller know by themselves: nothing reaches either of them.
@@ -140,6 +143,7 @@ def test_a_cut_of_500_ms_is_safe_on_both_hosts_and_the_arm_moves_again_after_rec
     assert loop.state in RUNNING
 
 
+@pytest.mark.real_time
 def test_a_cable_that_is_pulled_for_good_is_said_on_both_hosts_and_all_end_cleanly(loop):
     loop.set_in_motion()
     since = {host: loop.witness[host].count("/diagnostics") for host in ADDRESSES}
@@ -160,6 +164,7 @@ def test_a_cable_that_is_pulled_for_good_is_said_on_both_hosts_and_all_end_clean
     assert codes == {"simulator": 0, "observer": 0, "controller": 0}
 
 
+@pytest.mark.real_time
 def test_hosts_find_each_other_by_static_peers_where_there_is_no_multicast(tmp_path):
     def settings(host):
         (other,) = set(ADDRESSES) - {host}

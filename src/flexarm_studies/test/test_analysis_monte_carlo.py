@@ -3,6 +3,7 @@
 
 import builtins
 import json
+import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -144,7 +145,11 @@ def test_without_dask_it_is_said_what_to_install(spec, monkeypatch):
         mc.run(spec, 1, scheduler="tcp://127.0.0.1:1")
 
 
-def test_dask_gives_the_same(spec, results):
+def test_two_dask_worker_processes_give_the_same(spec, results):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False) as cluster:
-        assert mc.run(spec, 2, scheduler=cluster.scheduler_address) == results[:2]
+    own = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    with distributed.LocalCluster(**own) as cluster:
+        with distributed.Client(cluster) as client:
+            pids = set(client.run(os.getpid).values())
+        assert len(pids) == 2 and os.getpid() not in pids
+        assert mc.run(spec, COUNT, scheduler=cluster.scheduler_address) == results
