@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite import full_order
 from flexarm_control.composite.law import design
+from flexarm_dynamics import linear
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import build
@@ -28,9 +29,9 @@ def test_the_linear_plant_is_the_arms_own_motion(name):
     model = build(arm_file.load(name))
     n, m = model.n_joints, model.n_modes
     q = 0.2 + 0.1 * np.arange(n)
-    _, Gamma = full_order.sampled(*full_order.linear_plant(model, q), 1e-3)
+    _, Gamma = linear.sampled(*linear.linear_plant(model, q), 1e-3)
     rest = np.concatenate([q, model.static_deflection(q), np.zeros(n + m)])
-    hold, push = full_order.static_torque(model, q), 1e-4 * np.ones(n)
+    hold, push = linear.static_torque(model, q), 1e-4 * np.ones(n)
     from scipy.integrate import solve_ivp
 
     end = solve_ivp(
@@ -88,7 +89,7 @@ def test_delays_are_those_of_the_loop_that_runs(arm_r, delay):
     """The slowest decay of a linear loop simulated step by step with a queue of torques."""
     law = design(arm_r, SLOW, PAPER)
     F = full_order.closed_loop(law, np.zeros(1), 1e-3, delay)
-    A, B = full_order.linear_plant(arm_r, np.zeros(1))
+    A, B = linear.linear_plant(arm_r, np.zeros(1))
     U, Z = full_order.linear_law(law, np.zeros(1))
     K = U + law.fast.K_f @ Z
     from scipy.linalg import expm
@@ -101,11 +102,8 @@ def test_delays_are_those_of_the_loop_that_runs(arm_r, delay):
         way.append(K @ state)
         older, newer = way[-2 - whole], way[-1 - whole]
         if part > 1e-9:
-            state = (
-                full_order.sampled(A, B, part)[0] @ state
-                + full_order.sampled(A, B, part)[1] @ older
-            )
-        state = expm(A * (1e-3 - part)) @ state + full_order.sampled(A, B, 1e-3 - part)[1] @ newer
+            state = linear.sampled(A, B, part)[0] @ state + linear.sampled(A, B, part)[1] @ older
+        state = expm(A * (1e-3 - part)) @ state + linear.sampled(A, B, 1e-3 - part)[1] @ newer
         start = F @ start
     assert_allclose(start[:6], state, rtol=1e-9, atol=1e-15)
 

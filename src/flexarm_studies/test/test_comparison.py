@@ -10,9 +10,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexarm_bringup import cli
-from flexarm_control.composite.full_order import at_rest, linear_plant, sampled, static_torque
+from flexarm_control.composite.full_order import at_rest
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, FlexarmError
+from flexarm_dynamics.linear import linear_plant, sampled, static_torque
 from flexarm_studies.comparison import combinations, command, contenders, report, subjects, trial
 from flexarm_studies.comparison.rivals import FullStateLqr, JointPid, lqr_gain
 from flexarm_studies.comparison.tuning import Free, tune

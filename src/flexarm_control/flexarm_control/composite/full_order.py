@@ -14,74 +14,12 @@ under way. Poles are given as those of continuous time, s = ln(z) / T.
 from types import SimpleNamespace
 
 import numpy as np
-from scipy.linalg import expm
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import jacobian, linear_plant, sampled, state_at_rest
 
-#: Steps of the central differences: joints and deflections [rad], [m], and their rates.
-STEP = 1e-6
 #: A pole may grow this fast [1/s] before a design counts as unstable where no margin is asked for: rounding.
 ROUNDING = 1e-6
-
-
-def linear_plant(model, q, coulomb=True):
-    """The arm linearised at rest, held against gravity.
-
-    Parameters
-    ----------
-    model : ArmModel
-    q : ndarray, shape (n,)
-        [rad]
-    coulomb : bool
-        With Coulomb friction as steep as its smoothing makes it at rest, as a law that compensates it believes it
-        to be; False: without, as when the arm moves.
-
-    Returns
-    -------
-    A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
-        Of s = (q, delta, qd, delta_d) and the joint torque.
-    """
-    n, m = model.n_joints, model.n_modes
-    size = 2 * (n + m)
-    rest = np.zeros(size)
-    rest[:n], rest[n : n + m] = q, model.static_deflection(q)
-    hold = static_torque(model, q)
-    viscous = model.friction_table()[:, 0]
-
-    def slope(s, u):
-        if not coulomb:  # the model's friction taken out, and the viscous part put back
-            qd = s[n + m : 2 * n + m]
-            u = u + model.friction(qd) - viscous * qd
-        return model.derivative(s, hold + u)
-
-    A, B = np.zeros((size, size)), np.zeros((size, n))
-    for i in range(size):
-        change = np.zeros(size)
-        change[i] = STEP
-        A[:, i] = (slope(rest + change, 0.0) - slope(rest - change, 0.0)) / (2.0 * STEP)
-    A[: n + m] = np.hstack([np.zeros((n + m, n + m)), np.eye(n + m)])
-    for i in range(n):  # exactly linear in the torque: a step of one
-        unit = np.zeros(n)
-        unit[i] = 1.0
-        B[:, i] = 0.5 * (slope(rest, unit) - slope(rest, -unit))
-    return A, B
-
-
-def static_torque(model, q):
-    """Joint torque that holds the arm at rest under its weight, shape (n,) [N m]."""
-    n, m = model.n_joints, model.n_modes
-    delta = model.static_deflection(q)
-    t = model.terms(q, np.zeros(n), delta, np.zeros(m))
-    return t.f1 + t.K1 @ delta
-
-
-def sampled(A, B, period):
-    """Exact transition of a plant over one period of constant input: Phi and Gamma."""
-    size, inputs = B.shape
-    big = np.zeros((size + inputs, size + inputs))
-    big[:size, :size], big[:size, size:] = A, B
-    flow = expm(big * period)
-    return flow[:size, :size], flow[:size, size:]
 
 
 def at_rest(q):
@@ -114,22 +52,15 @@ def linear_law(law, q):
     """
     model = law.model
     n, m = model.n_joints, model.n_modes
-    size, reference = 2 * (n + m), at_rest(q)
-    U, Z = np.zeros((n, size)), np.zeros((2 * m, size))
-    rest = np.zeros(size)
-    rest[:n], rest[n : n + m] = q, model.static_deflection(q)
-    plain = type(law)(model, law.slow, _NoFast(n), law.manifold)
-    for i in range(size):
-        ends = []
-        for sign in (1.0, -1.0):
-            s = rest.copy()
-            s[i] += sign * STEP
-            a, delta, ad, delta_d = np.split(s, [n, n + m, 2 * n + m])
-            plain.step(a, ad, delta, delta_d, reference)
-            ends.append((plain.slow_torque.copy(), plain.deviation.copy()))
-        U[:, i] = (ends[0][0] - ends[1][0]) / (2.0 * STEP)
-        Z[:, i] = (ends[0][1] - ends[1][1]) / (2.0 * STEP)
-    return U, Z
+    reference, plain = at_rest(q), type(law)(model, law.slow, _NoFast(n), law.manifold)
+
+    def response(s):
+        a, delta, ad, delta_d = np.split(s, [n, n + m, 2 * n + m])
+        plain.step(a, ad, delta, delta_d, reference)
+        return np.concatenate([plain.slow_torque, plain.deviation])
+
+    both = jacobian(response, state_at_rest(model, q))
+    return both[:n], both[n:]
 
 
 class _NoFast:
@@ -169,7 +100,7 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     model = law.model
     A, B = linear_plant(plant or model, np.asarray(q, float))
     B = gain * B
-    Phi, n = expm(A * period), B.shape[1]
+    n = B.shape[1]
     U, Z = linear_law(law, q)
     compensator = law.fast.state_space(period)
     K = law.fast.gain(np.asarray(q, float)) if compensator is None else compensator[3]
@@ -178,12 +109,12 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     size, whole = A.shape[0], int(delay / period + 1e-9)
     late = delay - whole * period
     # u_{k-whole-1} acts until `late`, then u_{k-whole}.
-    begin = expm(A * (period - late)) @ sampled(A, B, late)[1] if late > 1e-12 else 0.0 * B
-    end = sampled(A, B, period - late)[1]
+    later, end = sampled(A, B, period - late)
+    begin = later @ sampled(A, B, late)[1] if late > 1e-12 else 0.0 * B
     under_way = whole + (1 if late > 1e-12 else 0)
     total = size + w + n * under_way
     F = np.zeros((total, total))
-    F[:size, :size] = Phi
+    F[:size, :size] = sampled(A, B, period)[0]
     command = np.zeros((n, total))
     command[:, :size] = out
     if w:

@@ -33,9 +33,9 @@ of more than 0.9 of that, as lost samples make it, the law predicts and does not
 """
 
 import numpy as np
-from scipy.linalg import expm
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import sampled
 from flexarm_dynamics.parameters import Parameter
 
 from .base import FastLaw
@@ -90,10 +90,7 @@ class OutputFeedback(FastLaw):
         q = np.array(self.parameters["configuration"])
         self._design = regulator(model, q, self.parameters)
         self.A2, self.B2, self._K_f = self._design.A2, self._design.B2, self._design.K_f
-        n, m = model.n_joints, model.n_modes
-        # Augmented by constant torques: its exponential holds Phi and Gamma.
-        self._held = np.zeros((2 * m + n, 2 * m + n))
-        self._held[: 2 * m, : 2 * m], self._held[: 2 * m, 2 * m :] = self.A2, self.B2
+        m = model.n_modes
         poles, vectors = np.linalg.eig(self.A2) if m else (np.zeros(1), np.zeros((0, 1)))
         self._longest = self.LONGEST * np.pi / max(poles.imag.max(), 1e-300)
         self._fastest = dominant_mode(model, vectors[:, np.argmax(poles.imag)]) if m else ""
@@ -130,8 +127,7 @@ class OutputFeedback(FastLaw):
         if found is not None:
             return found
         m = self.model.n_modes
-        flow = expm(self._held * dt)
-        Phi, Gamma = flow[: 2 * m, : 2 * m], flow[: 2 * m, 2 * m :]
+        Phi, Gamma = sampled(self.A2, self.B2, dt)
         L = np.zeros((2 * m, m))
         if dt <= self._longest:
             rho = np.exp(-self.parameters["observer_pole"] * dt)

@@ -28,11 +28,11 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import build
 
 from ..arrays import clip
-from ..composite.full_order import linear_plant, sampled
 from ..trajectory.path import Path
 from ..trajectory.values import SECOND
 from .base import Feedforward

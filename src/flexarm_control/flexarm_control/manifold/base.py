@@ -6,6 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from flexarm_dynamics.linear import jacobian
+
 from ..component import Component
 from .expansion import Point, expand, reach, step
 
@@ -111,16 +113,12 @@ class Manifold(Component, ABC):
         reference = SimpleNamespace(
             position=q, velocity=np.zeros(n), acceleration=np.zeros(n), near=lambda _: state.copy()
         )
-        L, U = np.zeros((2 * m, 2 * n)), np.zeros((n, 2 * n))
-        for i in range(2 * n):
-            ends = []
-            for sign in (1.0, -1.0):
-                x = np.concatenate([q, np.zeros(n)])
-                x[i] += sign * SMALL
-                terms = self.model.terms(x[:n], x[n:])
-                torque = self.slow.torque(x[:n], x[n:], reference, terms)
-                self.update(x[:n], x[n:], reference, terms, torque)
-                ends.append(np.concatenate([self.amplitude, self.rate, self.feedforward]))
-            slope = (ends[0] - ends[1]) / (2.0 * SMALL)
-            L[:, i], U[:, i] = slope[: 2 * m], slope[2 * m :]
-        return L, U
+
+        def response(x):
+            terms = self.model.terms(x[:n], x[n:])
+            torque = self.slow.torque(x[:n], x[n:], reference, terms)
+            self.update(x[:n], x[n:], reference, terms, torque)
+            return np.concatenate([self.amplitude, self.rate, self.feedforward])
+
+        both = jacobian(response, np.concatenate([q, np.zeros(n)]), SMALL)
+        return both[: 2 * m], both[2 * m :]

@@ -15,9 +15,9 @@ counts metres and radians of all modes alike. The fast control is taken as absen
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import sampled
 from flexarm_dynamics.singular_perturbation import (
     fast_subsystem,
     quasi_steady_state,
@@ -130,25 +130,22 @@ class FastResponse:
             return
         # Half way through each step; one that stands for all stays.
         q, qd = (0.5 * (x[1:] + x[:-1]) if len(x) > 1 else x for x in (q, qd))
-        block = np.zeros((len(q), 4 * m, 4 * m))
-        block[:, : 2 * m, 2 * m :] = np.eye(2 * m)
+        A2 = np.zeros((len(q), 2 * m, 2 * m))
         self.root = np.zeros((len(q), 2 * m, 2 * m))  # E = |root z|^2 / 2
         self.root[:, :m, :m] = np.linalg.cholesky(model.stiffness_matrix()).T
         for k, state in enumerate(zip(q, qd, strict=True)):
             terms = model.terms(*state)
-            block[k, : 2 * m, : 2 * m] = fast_subsystem(terms)[0]
+            A2[k] = fast_subsystem(terms)[0]
             H22 = terms.partition()[3]
             self.root[k, m:, m:] = np.linalg.cholesky(np.linalg.inv(0.5 * (H22 + H22.T))).T
-        # e^{A h} and its integral over the step, from one exponential.
         with np.errstate(all="ignore"):
-            both = expm(block * step)
-        if not np.isfinite(both).all():
+            self.propagate, integral = sampled(A2, np.eye(2 * m), step)
+        if not (np.isfinite(self.propagate).all() and np.isfinite(integral).all()):
             raise DesignError(
                 f"{model.arm.name}: on this motion the joints get so fast that the links lose their stiffness in"
                 " this model: take a longer duration"
             )
-        self.propagate = both[:, : 2 * m, : 2 * m]
-        self.drive = -both[:, : 2 * m, 2 * m : 3 * m] / step
+        self.drive = -integral[:, :, :m] / step
 
     def deviation(self, steady):
         """Return z_f at the grid's points.

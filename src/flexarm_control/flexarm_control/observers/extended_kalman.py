@@ -25,10 +25,11 @@ costs milliseconds per linearisation: for records, and for arms sampled slowly; 
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import jacobian
 from flexarm_dynamics.parameters import Parameter
 
 from .kalman import NOISE, Kalman
-from .motion import discretise, force_density, jacobian, mass_matrix
+from .motion import DIFFERENCE, discretise, force_density, mass_matrix
 
 
 def _flag(name, default, what):
@@ -76,9 +77,6 @@ class ExtendedKalman(Kalman):
             high=1.0,
         ),
     )  # fmt: skip
-
-    #: Steps of the central differences in the parameters, which enter smoothly.
-    DIFFERENCE = 1e-5
 
     def _prepare(self):
         model, values, n = self.model, self.parameters, self._n
@@ -178,7 +176,7 @@ class ExtendedKalman(Kalman):
         density = np.zeros((x.size, x.size))
         density[:N, :N] = force_density(self.model, x[:N], self.density)
         np.fill_diagonal(density[N:, N:], self._drift**2)
-        A = jacobian(lambda at: self.slope(at, torque), x)
+        A = jacobian(lambda at: self.slope(at, torque), x, DIFFERENCE)
         return discretise(A, dt, density)
 
 

@@ -24,9 +24,9 @@ with it: u stands for (u - f1, f2) at the sample's joint position and velocity, 
 """
 
 import numpy as np
-from scipy.linalg import expm
 
 from flexarm_dynamics.errors import MessageError
+from flexarm_dynamics.linear import sampled
 from flexarm_dynamics.parameters import Parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
@@ -73,11 +73,8 @@ class Luenberger(Observer):
         m, n = self.model.n_modes, self.model.n_joints
         terms = self.model.terms(q, np.zeros(n))
         _, _, H21, H22 = terms.partition()
-        big = np.zeros((3 * m + n, 3 * m + n))
-        big[: 2 * m, : 2 * m] = fast_subsystem(terms)[0]
-        big[m : 2 * m, 2 * m :] = np.hstack([H21, -H22])
-        flow = expm(big * dt)
-        Phi, Gamma = flow[: 2 * m, : 2 * m], flow[: 2 * m, 2 * m :]
+        forces = np.vstack([np.zeros((m, n + m)), np.hstack([H21, -H22])])
+        Phi, Gamma = sampled(fast_subsystem(terms)[0], forces, dt)
         decay = np.exp(-self.pole * dt)
         if dt > self._longest:
             return Phi, Gamma, np.zeros((m, m))

@@ -12,8 +12,8 @@ gravity's curvature) is held over the step. Forces of spectral density S on join
 
 .. math:: Q = \int_0^h e^{As}\,B S B^T e^{A^Ts}ds, \qquad B = \begin{bmatrix}0\\ M^{-1}\end{bmatrix}
 
-to the covariance (Van Loan 1978). A and B are taken at the straight arm at rest, with viscous friction: the slope
-of Coulomb friction at rest holds for no moving joint.
+to the covariance (Van Loan 1978). A and B are taken at the straight arm at rest, with viscous friction only: the
+steepness of Coulomb friction at rest holds for no moving joint.
 
 Designs are kept per time step to 10 us and configuration to 0.1 rad, so that which one is taken does not depend on
 the past. What is left of the time step, at most 5 us, is made up for by the second-order term of the linear motion.
@@ -22,7 +22,8 @@ the past. What is left of the time step, at most 5 us, is made up for by the sec
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+
+from flexarm_dynamics.linear import sampled, sampled_noise, state_matrix
 
 #: Steps of the central differences: sizes of a joint angle, a deflection and their rates [rad, m, rad/s, m/s].
 DIFFERENCE = 1e-5
@@ -51,16 +52,6 @@ class Step:
     Q: np.ndarray | None
 
 
-def jacobian(function, x, step=DIFFERENCE):
-    """Central differences of ``function(x)`` -> (N,), shape (N, x.size)."""
-    columns = []
-    for i in range(x.size):
-        move = np.zeros(x.size)
-        move[i] = step
-        columns.append((function(x + move) - function(x - move)) / (2.0 * step))
-    return np.stack(columns, axis=1)
-
-
 def mass_matrix(model, q, delta):
     """M of (2) with deflections, shape (n + m, n + m)."""
     if hasattr(model, "mass_matrix"):  # of a chain: much cheaper than all terms
@@ -79,30 +70,9 @@ def force_density(model, x, density):
 
 def discretise(A, length, density=None):
     """The `Step` of a linearisation over `length`; `density` (N, N) of the noise on the state's rates."""
-    N = A.shape[0]
-    big = np.zeros((2 * N, 2 * N))
-    big[:N, :N], big[:N, N:] = A, np.eye(N)
-    flow = expm(big * length)
-    Phi, Gamma, Q = flow[:N, :N], flow[:N, N:], None
-    if density is not None:
-        Q = _noise(A, length, density)
+    Phi, Gamma = sampled(A, np.eye(len(A)), length)
+    Q = None if density is None else sampled_noise(A, density, length)
     return Step(length, A, Phi, Gamma, Q)
-
-
-def _noise(A, length, density):
-    """Integral of the noise, from a step that no mode decays in, doubled: e^(-At) must not grow."""
-    N = A.shape[0]
-    fastest = np.abs(np.linalg.eigvals(A)).max()
-    doublings = max(0, int(np.ceil(np.log2(max(fastest * length, 1.0)))))
-    big = np.zeros((2 * N, 2 * N))
-    big[:N, :N], big[:N, N:], big[N:, N:] = -A, density, A.T
-    flow = expm(big * length / 2**doublings)
-    Phi = flow[N:, N:].T
-    Q = Phi @ flow[:N, N:]
-    for _ in range(doublings):
-        Q = Q + Phi @ Q @ Phi.T
-        Phi = Phi @ Phi
-    return 0.5 * (Q + Q.T)
 
 
 class Motion:
@@ -118,22 +88,12 @@ class Motion:
     def __init__(self, model, density=None):
         self.model, self.density = model, density
         self._n, self._size = model.n_joints, model.n_joints + model.n_modes
-        self._viscous = model.friction_table()[:, 0]
         self._designs = {}
 
     def linearisation(self, q):
         """A at rest in configuration q, shape (N, N)."""
-        n, size = self._n, self._size
-
-        def slope(x):
-            speed = x[size : size + n]
-            # The model's own friction is taken out, but for what is viscous.
-            return self.model.derivative(x, self.model.friction(speed) - self._viscous * speed)
-
-        A = jacobian(slope, np.concatenate([q, np.zeros(2 * size - n)]))
-        A[:size] = 0.0  # known exactly
-        A[:size, size:] = np.eye(size)
-        return A
+        rest = np.concatenate([q, np.zeros(2 * self._size - self._n)])
+        return state_matrix(self.model, rest, coulomb=False, step=DIFFERENCE)
 
     def design(self, dt, q):
         """The `Step` over dt [s] in configuration q (n,) [rad]."""

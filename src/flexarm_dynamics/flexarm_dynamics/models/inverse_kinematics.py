@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ModelError, ShapeError
+from ..linear import jacobian
 from .chain import Chain
 
 #: A tip nearer than this has arrived [m].
@@ -25,7 +26,6 @@ TOLERANCE = 1e-10
 #: No joint turns farther in one step of the search [rad].
 LONGEST_STEP = 0.5
 _STEPS = 100
-_DIFFERENCE = 1e-6
 #: How far from the start further searches begin [rad]: out of singular configurations, and around limits.
 _SPREADS = (0.05, 0.3, 1.0, 2.0, 3.0)
 
@@ -76,14 +76,14 @@ class TipKinematics:
     def jacobian(self, q, delta=None):
         """Derivative of `tip` by the joints, (3, n) [m/rad]; good to some nine digits."""
         delta = self.deflection(q) if delta is None else delta
-        J = _differences(lambda x: self.model.tip_position(x, delta), q)
+        J = jacobian(lambda x: self.model.tip_position(x, delta), q)
         if not self.bent:
             return J
         give = np.linalg.solve(
-            _differences(lambda x: self._modal_forces(q, x), delta),
-            _differences(lambda x: self._modal_forces(x, delta), q),
+            jacobian(lambda x: self._modal_forces(q, x), delta),
+            jacobian(lambda x: self._modal_forces(x, delta), q),
         )
-        return J - _differences(lambda x: self.model.tip_position(q, x), delta) @ give
+        return J - jacobian(lambda x: self.model.tip_position(q, x), delta) @ give
 
     def _modal_forces(self, q, delta):
         """Forces on the modes at rest, (m,): zero at the deflections of `deflection`."""
@@ -122,16 +122,6 @@ class TipKinematics:
             else:
                 damping *= 10.0
         return Solution(q, tip, float(np.linalg.norm(error)))
-
-
-def _differences(function, x):
-    """Derivative of a function by central differences, (k, len(x))."""
-    out = []
-    for i in range(x.size):
-        h = np.zeros(x.size)
-        h[i] = _DIFFERENCE
-        out.append((function(x + h) - function(x - h)) / (2.0 * _DIFFERENCE))
-    return np.array(out).T
 
 
 def solve(model, target, start=None, bent=True) -> Solution:

@@ -34,6 +34,7 @@ from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_triang
 from scipy.optimize import minimize
 
 from flexarm_control.composite import full_order
+from flexarm_dynamics import linear
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
@@ -79,7 +80,7 @@ def blocks(subject):
         raise DesignError(
             "the fast law has states of its own: the theorem is applied to K_f z_f only"
         )
-    A, B = full_order.linear_plant(model, q)
+    A, B = linear.linear_plant(model, q)
     U, Z = full_order.linear_law(law, q)
     joints = np.zeros((2 * n, A.shape[0]))
     joints[:n, :n] = joints[n:, n + m : 2 * n + m] = np.eye(n)

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexarm_control.composite.full_order import linear_plant, sampled
 from flexarm_control.motions import shapers
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 
 from . import subjects, trial

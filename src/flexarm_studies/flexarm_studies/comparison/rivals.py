@@ -21,8 +21,8 @@ the rigid arm's inverse dynamics.
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from flexarm_control.composite.full_order import linear_plant, sampled
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexarm_dynamics.linear import jacobian
+
 from .run import ENABLED, FAULT, HOLDING, READY, STATES, STOPPING, TRACKING
 from .timeline import stretches
 
@@ -168,18 +170,13 @@ def residual(run, window):
     bent = run.deflections(window)
     bent = bent[np.isfinite(bent).all(axis=1)]
     q = np.nanmean(run.positions(window), axis=0)
-    jacobian = tip_jacobian(run.model, q)
-    return np.linalg.norm((bent - bent.mean(axis=0)) @ jacobian.T, axis=1)
+    J = tip_jacobian(run.model, q)
+    return np.linalg.norm((bent - bent.mean(axis=0)) @ J.T, axis=1)
 
 
-def tip_jacobian(model, q, step=1e-6):
+def tip_jacobian(model, q):
     """Derivative of the tip's position by the modal amplitudes of the straight arm, shape (3, m)."""
-    m = model.n_modes
-    columns = [
-        (model.tip_position(q, step * e) - model.tip_position(q, -step * e)) / (2.0 * step)
-        for e in np.eye(m)
-    ]
-    return np.array(columns).reshape(m, 3).T
+    return jacobian(lambda delta: model.tip_position(q, delta), np.zeros(model.n_modes))
 
 
 def tip_rows(model):

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Linear systems: Jacobians by central differences, the arm linearised at rest, and exact sampling.
+
+A system :math:`\dot s = As + Bu` whose input is held over a period T (zero-order hold) moves exactly by
+
+.. math::
+    s_{k+1} = \Phi s_k + \Gamma u_k, \qquad
+    \begin{bmatrix}\Phi & \Gamma\\ 0 & I\end{bmatrix}
+    = \exp\Bigl(\begin{bmatrix}A & B\\ 0 & 0\end{bmatrix}T\Bigr),
+
+and white noise of spectral density S on :math:`\dot s` adds the covariance (Van Loan 1978)
+
+.. math:: Q = \int_0^T e^{At}\,S\,e^{A^Tt}dt .
+"""
+
+import numpy as np
+from scipy.linalg import expm
+
+#: Step of the central differences by joint angles, deflections and their rates [rad, m, rad/s, m/s].
+STEP = 1e-6
+
+
+def jacobian(function, x, step=STEP):
+    """Derivative of a vector by a vector, by central differences; exact for polynomials of second degree.
+
+    Parameters
+    ----------
+    function : callable
+        Takes an array like `x`, returns an array of shape (N,).
+    x : array_like, shape (k,)
+    step : float
+        Half the distance of the two points of a difference, the same for every place of `x`.
+
+    Returns
+    -------
+    ndarray, shape (N, k)
+    """
+    x = np.asarray(x, float)
+    columns = []
+    for i in range(x.size):
+        move = np.zeros(x.size)
+        move[i] = step
+        ahead = np.array(
+            function(x + move)
+        )  # a copy: a function may return its own array, used again
+        columns.append((ahead - function(x - move)) / (2.0 * step))
+    return np.stack(columns, axis=1) if columns else np.zeros((np.size(function(x)), 0))
+
+
+def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
+    """A of the arm (2) linearised at rest, of the state (q, delta, qd, delta_d).
+
+    Parameters
+    ----------
+    model : ArmModel
+    state : ndarray, shape (2 (n + m),)
+        Its rates are zero.
+    torque : ndarray, shape (n,), or 0.0
+        That holds the arm there [N m].
+    coulomb : bool
+        With Coulomb friction as steep as its smoothing makes it at rest, as a law that compensates it takes it to
+        be; False: with viscous friction only, as when the arm moves.
+    step : float
+        Of the differences.
+
+    Returns
+    -------
+    ndarray, shape (2 (n + m), 2 (n + m))
+    """
+    n, half = model.n_joints, state.size // 2
+    viscous = model.friction_table()[:, 0]
+
+    def derivative(s):
+        u = torque
+        if not coulomb:  # the model's friction taken out, and its viscous part put back
+            qd = s[half : half + n]
+            u = u + model.friction(qd) - viscous * qd
+        return model.derivative(s, u)
+
+    A = jacobian(derivative, state, step)
+    A[:half] = np.hstack([np.zeros((half, half)), np.eye(half)])  # known exactly
+    return A
+
+
+def linear_plant(model, q, coulomb=True):
+    """The arm (2) linearised at rest, held by its torque against gravity.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q : ndarray, shape (n,)
+        [rad]
+    coulomb : bool
+        As in `state_matrix`.
+
+    Returns
+    -------
+    A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
+        Of the state (q, delta, qd, delta_d) and the joint torque.
+    """
+    n, rest, hold = model.n_joints, state_at_rest(model, q), static_torque(model, q)
+    A = state_matrix(model, rest, hold, coulomb)
+    # The arm is exactly linear in the torque: a step of one.
+    B = jacobian(lambda u: model.derivative(rest, hold + u), np.zeros(n), step=1.0)
+    return A, B
+
+
+def state_at_rest(model, q):
+    """State (q, delta, qd, delta_d) of the arm at rest, bent by its weight, shape (2 (n + m),)."""
+    n, m = model.n_joints, model.n_modes
+    rest = np.zeros(2 * (n + m))
+    rest[:n], rest[n : n + m] = q, model.static_deflection(q)
+    return rest
+
+
+def static_torque(model, q):
+    """Joint torque that holds the arm at rest against its weight, shape (n,) [N m]."""
+    n, m = model.n_joints, model.n_modes
+    delta = model.static_deflection(q)
+    t = model.terms(q, np.zeros(n), delta, np.zeros(m))
+    return t.f1 + t.K1 @ delta
+
+
+def sampled(A, B, period):
+    r"""Phi = :math:`e^{AT}` and Gamma = :math:`\int_0^T e^{At}B\,dt`: the exact transition under constant input.
+
+    Parameters
+    ----------
+    A : ndarray, shape (..., N, N)
+        One system, or a stack of them.
+    B : ndarray, shape (..., N, k) or (N, k)
+    period : float
+        T [s].
+
+    Returns
+    -------
+    Phi : ndarray, shape (..., N, N)
+    Gamma : ndarray, shape (..., N, k)
+    """
+    N, k = B.shape[-2:]
+    big = np.zeros((*A.shape[:-2], N + k, N + k))
+    big[..., :N, :N], big[..., :N, N:] = A, B
+    flow = expm(big * period)
+    return flow[..., :N, :N], flow[..., :N, N:]
+
+
+def sampled_noise(A, density, period):
+    r"""Covariance :math:`\int_0^T e^{At}\,S\,e^{A^Tt}dt` that white noise on the state's derivative adds.
+
+    Parameters
+    ----------
+    A : ndarray, shape (N, N)
+    density : ndarray, shape (N, N)
+        Spectral density S.
+    period : float
+        T [s].
+
+    Returns
+    -------
+    ndarray, shape (N, N)
+        Symmetric.
+    """
+    # Van Loan's exponential holds e^(-At), which grows: over a step in which no mode decays much, then doubled.
+    N = A.shape[0]
+    fastest = np.abs(np.linalg.eigvals(A)).max()
+    doublings = max(0, int(np.ceil(np.log2(max(fastest * period, 1.0)))))
+    big = np.zeros((2 * N, 2 * N))
+    big[:N, :N], big[:N, N:], big[N:, N:] = -A, density, A.T
+    flow = expm(big * period / 2**doublings)
+    Phi = flow[N:, N:].T
+    Q = Phi @ flow[:N, N:]
+    for _ in range(doublings):
+        Q = Q + Phi @ Q @ Phi.T
+        Phi = Phi @ Phi
+    return 0.5 * (Q + Q.T)
