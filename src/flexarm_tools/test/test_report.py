@@ -43,7 +43,7 @@ def recorded(tmp_path_factory):
             scenario.parameters(file),
             "quintic:to=0.3,duration=0.5",
             rate=500.0,
-            duration=1.5,
+            duration=2.5,
         )
         record, _, loop = scenario.run_loop(of, partial(LoopBag, folder / name))
         out[name] = folder / name, record, loop
@@ -128,17 +128,59 @@ def test_the_summary_is_what_the_record_gives(recorded, runs, name):
     assert got["compute_time_s"] is None  # nothing has measured it
 
 
-def test_residual_vibration_is_the_tips_about_its_mean(recorded, runs):
+def test_residual_vibration_is_the_tips_about_its_mean_once_the_joints_have_settled(recorded, runs):
     _, record, loop = recorded["slow"]
-    rest = record.state == HOLDING
+    rest = (record.state == HOLDING) & (record.time >= 0.5 + metrics.SETTLE - 1e-9)
     tip = metrics._path(loop.model, record.position, record.amplitude)[rest]
     rigid = metrics._path(loop.model, record.position, 0.0 * record.amplitude)[rest]
     away = tip - rigid
     wanted = np.sqrt(np.mean(np.linalg.norm(away - away.mean(0), axis=1) ** 2))
     got = analysis.summary(runs["slow"])
     assert got["residual_windows"] == 1
+    assert got["residual_window_s"] == pytest.approx([1.0, 2.0], abs=0.01)
     assert got["residual_m"] == pytest.approx(wanted, rel=0.01)
     assert got["residual_m"] > 1e-4
+
+
+def test_the_report_and_the_case_study_have_one_residual_and_one_peak_error(recorded, runs):
+    _, record, loop = recorded["slow"]
+    got, wanted = (
+        analysis.summary(runs["slow"]),
+        metrics.case_study_metrics(record, loop.model, 1.5, 2.5),
+    )
+    assert 1e3 * got["residual_m"] == pytest.approx(304.8 * wanted["residual_tip_rms_ft"], rel=0.05)
+    assert np.degrees(got["peak_error_rad"][0]) == pytest.approx(
+        wanted["peak_joint_error_deg"], rel=1e-6
+    )
+
+
+def test_slow_settling_right_after_a_motion_is_no_vibration():
+    """Rests of 3 s, 1 s and 2 s: the short one, which holds the settling, does not count beside longer ones."""
+    time = np.arange(0.0, 10.0, 0.01)
+    run = SimpleNamespace(time=time)
+    moves = [
+        analysis.Motion(0, 100, 400),
+        analysis.Motion(500, 600, 700),
+        analysis.Motion(700, 750, 950),
+    ]
+    span, windows = analysis.residual_windows(run, moves)
+    assert span == pytest.approx((1.0, 2.99))
+    assert windows == [slice(200, 400), slice(850, 950)]
+    span, windows = analysis.residual_windows(run, moves[1:2])
+    assert span == pytest.approx((0.0, 0.99)) and windows == [slice(600, 700)]
+    assert analysis.residual_windows(run, []) == ((0.0, 0.0), [])
+
+
+def test_a_page_may_open_with_words_and_name_its_runs(tmp_path):
+    path = _made_up(tmp_path / "bag", 50)
+    made = command.make(
+        [path], tmp_path / "x.html", names=["slow control alone"], opening="See <the> tip."
+    )
+    text = made.read_text(encoding="utf-8")
+    assert "Report of slow control alone" in text
+    assert text.index("See &lt;the&gt; tip.") < text.index("slow control alone: 0.2")
+    with pytest.raises(ValueError):
+        command.make([path], tmp_path / "x.html", names=["one", "too many"])
 
 
 def test_a_spectrum_shows_the_frequencies_of_an_arm_that_rings(tmp_path):
@@ -257,7 +299,11 @@ def test_two_runs_stand_side_by_side(compared, runs):
     ratio = slow["residual_m"] / composite["residual_m"]
     better, worse = ("composite", "slow") if ratio > 1.0 else ("slow", "composite")
     factor = page.digits(max(ratio, 1.0 / ratio))
-    assert f"Residual vibration: {better} has {factor} times less than {worse}." in compared
+    window = "1 to 2 s after the motion"
+    assert (
+        f"Residual vibration, {window}: {better} has {factor} times less than {worse}." in compared
+    )
+    assert compared.count(f"({window})") == 2
     film = json.loads(re.search(r'id="film">(.*?)</script>', compared, re.DOTALL).group(1))
     assert [r["label"] for r in film["runs"]] == ["composite", "slow"]
     assert film["start"] < 0.0 < film["end"]
@@ -294,12 +340,14 @@ def test_a_large_figure_becomes_a_picture_and_a_large_page_is_refused(runs, monk
     assert len(made.times) == 2 and all(0.0 < left < right < 1.0 for left, right, *_ in made.times)
     asked = []
     monkeypatch.setattr(page.figures, "draw", lambda *args: asked.append(args[-1]) or [])
-    monkeypatch.setattr(page, "LARGEST", 10_000)
-    with pytest.raises(FlexarmError, match=r"larger than 10000"):
+    monkeypatch.setattr(page, "MAX_SIZE", 10_000)
+    with pytest.raises(FlexarmError) as refused:
         page.write([runs["slow"]])
+    assert (refused.value.field, refused.value.limit) == ("page", "at most 10000 bytes")
     assert asked == [False, True]  # pictures are tried first
-    with pytest.raises(FlexarmError, match=r"at most 8"):
+    with pytest.raises(FlexarmError) as refused:
         page.write([runs["slow"]] * 9)
+    assert (refused.value.value, refused.value.limit) == (9, "at most 8")
 
 
 # Bags of every kind ----------------------------------------------------------------------------

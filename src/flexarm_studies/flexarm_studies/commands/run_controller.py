@@ -190,7 +190,9 @@ def _of_the_tip(scenario, m):
     if "static_sag_mm" in m:
         yield "static sag at the end [mm]", digits(m["static_sag_mm"])
         yield "tip from the bent arm's, peak and rms [mm]", _pair(m, "tip_error_about_sag_mm")
-    yield "deflection about rest after it, rms [mm]", digits(m["residual_tip_rms_mm"])
+    start, end = m["residual_window_s"] or (0.0, 0.0)
+    window = f" {start:.3g} to {end:.3g} s after it" if end else ""
+    yield f"tip vibration{window}, rms [mm]", digits(m["residual_tip_rms_mm"])
     yield "tip's greatest error in the last 0.5 s [mm]", digits(m["final_tip_error_mm"])
     label = f"settled within {1e3 * scenario.tolerance:g} mm after [s]"
     settled = m["settling_time_s"]

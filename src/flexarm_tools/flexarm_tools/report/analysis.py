@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is told of a run: tracking, vibration after motions, torque, losses, spectra. Plain numbers, no drawing."""
+"""Numbers of a recorded run: tracking, vibration after motions, torque, losses, spectra. No drawing.
+
+Peak error and residual vibration are defined in `flexarm_studies.loop.metrics`.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -7,32 +10,37 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexarm_dynamics.linear import jacobian
+from flexarm_studies.loop.metrics import (
+    MAX_REST,
+    MIN_WINDOW,
+    joint_error,
+    residual_vibration,
+    residual_window,
+)
 
 from .run import ENABLED, FAULT, HOLDING, READY, STATES, STOPPING, TRACKING
 from .timeline import stretches
 
-#: The vibration that a motion leaves is judged over so long after it, if the arm rests for at least so long [s].
-WINDOW, SHORTEST = 3.0, 0.5
-#: A spectrum is taken of so long at a time, and of nothing shorter [s].
-SEGMENT, SHORTEST_SEGMENT = 8.0, 1.0
-#: Spectra are padded to so many times their length: that draws a line between the frequencies they resolve.
+#: Length of the pieces that a spectrum averages over, and of the shortest piece that is used [s].
+SEGMENT, MIN_SEGMENT = 8.0, 1.0
+#: Spectra are padded to this multiple of their length, to interpolate between the frequencies they resolve.
 PADDED = 4
-#: So many natural frequencies count.
-LOWEST = 6
-#: A measured frequency is told when it stands out of its neighbourhood by this factor of power.
+#: Number of natural frequencies that are shown, from the lowest on.
+MAX_FREQUENCIES = 6
+#: A measured frequency is reported when its power exceeds its neighbourhood's by this factor.
 OUTSTANDING = 10.0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A stretch of samples in which a reference moved, and the rest that followed.
+    """Samples in which the reference moved, and the rest that followed.
 
     Attributes
     ----------
     start, end : int
-        Samples: the first one of the motion, and the first one after it.
+        First sample of the motion, and first one after it.
     rest : int
-        The first one that does not belong to the rest; `end` where there was none.
+        First sample after the rest; `end` where there was none.
     """
 
     start: int
@@ -41,16 +49,16 @@ class Motion:
 
 
 def motions(run):
-    """The motions of a run: the supervisor TRACKING or STOPPING; rests: HOLDING or READY, for `WINDOW` at most."""
+    """The motions of a run: supervisor TRACKING or STOPPING; each rest: HOLDING or READY, for `MAX_REST` at most."""
     moving = (run.state == TRACKING) | (run.state == STOPPING)
     resting = (run.state == HOLDING) | (run.state == READY)
     resting[1:] &= run.timeline.epoch[1:] == run.timeline.epoch[:-1]
     found = []
     for start, end in zip(*stretches(moving), strict=True):
-        most = end + int(np.searchsorted(run.time[end:], run.time[end - 1] + WINDOW, "right"))
-        stops = np.flatnonzero(~resting[end:most])
-        rest = end + int(stops[0]) if stops.size else int(most)
-        if rest > end and run.time[rest - 1] - run.time[end] < SHORTEST:
+        last = end + int(np.searchsorted(run.time[end:], run.time[end - 1] + MAX_REST, "right"))
+        stops = np.flatnonzero(~resting[end:last])
+        rest = end + int(stops[0]) if stops.size else int(last)
+        if rest > end and run.time[rest - 1] - run.time[end] < MIN_WINDOW:
             rest = end
         found.append(Motion(int(start), int(end), rest))
     return found
@@ -67,7 +75,7 @@ def summary(run, moves=None):
     Returns
     -------
     dict
-        Numbers in SI, lists with one number per joint or link; None for what the bag does not tell.
+        Numbers in SI, lists with one number per joint or link; None for what the bag does not hold.
     """
     moves = motions(run) if moves is None else moves
     found = {
@@ -87,7 +95,7 @@ def summary(run, moves=None):
 
 
 def _lost_by_recorder(run):
-    """Samples of which the bag has the answering torque alone: the recorder missed them, not the line."""
+    """Samples of which the bag holds only the answering torque: the recorder missed them, the controller did not."""
     table, base = run.contents.tables.get("joint_torque"), run.contents.tables[run.base]
     if table is None or not run.timeline.lost:
         return 0
@@ -107,19 +115,23 @@ def _supervision(run):
         )
     took = run.column("controller/state", "compute_time")
     took = None if took is None else took[took > 0.0]  # 0: an answer repeated without a new sample
-    share = None
+    times = None
     if took is not None and took.size:
-        share = np.percentile(took, [50.0, 99.0, 100.0]).tolist()
-    return {"faults": int(entered.size), "first_fault": first, "compute_time_s": share}
+        times = np.percentile(took, [50.0, 99.0, 100.0]).tolist()
+    return {"faults": int(entered.size), "first_fault": first, "compute_time_s": times}
 
 
 def _entered(run, state):
-    """Samples at which the supervisor went into a state."""
+    """Samples at which the supervisor entered a state."""
     return stretches(run.state == state)[0]
 
 
 def followed(run):
-    """Samples over which tracking is judged, shape (k,) bool: a motion or the end of one; else what was held."""
+    """Samples over which tracking is judged, shape (k,) bool.
+
+    From the first motion's start on, while the supervisor is TRACKING, HOLDING or STOPPING; READY in a run that has
+    none of these.
+    """
     judged = (run.state >= TRACKING) & (run.state <= STOPPING)
     return judged if judged.any() else run.state == READY
 
@@ -130,15 +142,20 @@ def _tracking(run):
         return {"peak_error_rad": None, "rms_error_rad": None}
     peak, rms = [], []
     for j in range(len(run.joint_names)):
-        error = run.error(j)[judged]
+        error = joint_error(run.reference(j), run.position(j))[judged]
         error = error[np.isfinite(error)]
-        peak.append(float(np.abs(error).max()) if error.size else None)
+        peak.append(float(error.max()) if error.size else None)
         rms.append(float(np.sqrt(np.mean(error**2))) if error.size else None)
     return {"peak_error_rad": peak, "rms_error_rad": rms}
 
 
 def _vibration(run, moves):
-    found = {"residual_m": None, "residual_windows": 0, "peak_deflection_m": None}
+    found = {
+        "residual_m": None,
+        "residual_windows": 0,
+        "residual_window_s": None,
+        "peak_deflection_m": None,
+    }
     if not run.amplitude_source or run.model is None:
         return found
     rows, names = tip_rows(run.model)
@@ -148,39 +165,62 @@ def _vibration(run, moves):
             bent = run.deflections(part) @ rows.T
             peaks = np.fmax(peaks, np.fmax.reduce(np.abs(bent), axis=0))
         found["peak_deflection_m"] = dict(zip(names, peaks.tolist(), strict=True))
-    squares, count, windows = 0.0, 0, 0
-    for move in moves:
-        if move.rest == move.end:
-            continue
-        window = slice(move.end, move.rest)
-        moved = residual(run, window)
-        if not moved.size:
-            continue
-        squares, count, windows = squares + (moved**2).sum(), count + moved.size, windows + 1
-    if windows:
-        found |= {"residual_m": float(np.sqrt(squares / count)), "residual_windows": windows}
+    span, windows = residual_windows(run, moves)
+    known = [bending for bending in (tip_bending(run, w) for w in windows) if len(bending)]
+    if known:
+        squares = sum(len(bending) * residual_vibration(bending) ** 2 for bending in known)
+        found["residual_m"] = float(np.sqrt(squares / sum(map(len, known))))
+        found["residual_windows"], found["residual_window_s"] = (
+            len(known),
+            [round(s, 6) for s in span],
+        )
     return found
 
 
-def residual(run, window):
-    """Distance of the tip from its mean place that bending alone makes, over a rest, shape (known samples,) [m].
+def residual_windows(run, moves):
+    """Where residual vibration is judged: see `flexarm_studies.loop.metrics.residual_window`.
 
-    The rest lasts over `window`. With the tip's Jacobian with respect to the amplitudes at the mean joint angles.
+    Rests that are too short to leave out the slow settling count only in a run that has no longer one.
+
+    Returns
+    -------
+    span : tuple of float
+        Start, and end of the longest window, after the motion's end [s].
+    windows : list of slice
+        Of the samples.
+    """
+    rests = [
+        (move, residual_window(float(run.time[move.rest - 1] - run.time[move.end])))
+        for move in moves
+        if move.rest > move.end
+    ]
+    start = max((span[0] for _, span in rests), default=0.0)
+    windows, longest = [], start
+    for move, (begin, end) in rests:
+        if begin == start:
+            first = np.searchsorted(run.time, run.time[move.end] + begin - 1e-9)
+            windows.append(slice(int(first), move.rest))
+            longest = max(longest, end)
+    return (start, longest), windows
+
+
+def tip_bending(run, window):
+    """Displacement of the tip by bending over a rest, shape (known samples, 3) [m].
+
+    By the tip's Jacobian with respect to the amplitudes at the mean joint angles.
     """
     bent = run.deflections(window)
     bent = bent[np.isfinite(bent).all(axis=1)]
-    q = np.nanmean(run.positions(window), axis=0)
-    J = tip_jacobian(run.model, q)
-    return np.linalg.norm((bent - bent.mean(axis=0)) @ J.T, axis=1)
+    return bent @ tip_jacobian(run.model, np.nanmean(run.positions(window), axis=0)).T
 
 
 def tip_jacobian(model, q):
-    """Derivative of the tip's position by the modal amplitudes of the straight arm, shape (3, m)."""
+    """Derivative of the tip's position with respect to the modal amplitudes, for the straight arm, shape (3, m)."""
     return jacobian(lambda delta: model.tip_position(q, delta), np.zeros(model.n_modes))
 
 
 def tip_rows(model):
-    """What makes the deflection of each link's tip, across it, of the amplitudes: rows (r, m) and their names."""
+    """Rows (r, m) that map the amplitudes to the deflection of each link's tip across the link, and their names."""
     rows, names, modes = [], [], model.arm.modes
     for link in model.arm.links:
         for direction in sorted(set(link.flexible) - {"twist"}):
@@ -195,12 +235,12 @@ def tip_rows(model):
 
 
 def _parts(run, size=200_000):
-    """Slices over all samples, so that no table of all of them is in memory."""
+    """Slices that cover all samples, so that no table of all of them has to be in memory."""
     return [slice(a, a + size) for a in range(0, run.time.size, size)]
 
 
 def torque_column(run, j):
-    """The torque of a joint as it was sent, else as it was applied [N m]; NaN while it was not enabled."""
+    """A joint's torque as sent, or as applied where the bag lacks that [N m]; NaN while torque was not enabled."""
     mode = run.column("joint_torque", "mode")
     sent = run.column("joint_torque", "torque", j)
     if sent is not None and mode is not None:
@@ -218,11 +258,11 @@ def _torque(run):
         torque = torque_column(run, j)
         known = torque is not None and np.isfinite(torque).any()
         peaks.append(float(np.nanmax(np.abs(torque))) if known else None)
-    saturated, share = run.column("controller/state", "saturated"), None
+    saturated, fraction = run.column("controller/state", "saturated"), None
     if saturated is not None:
         active = (run.state >= READY) & (run.state <= STOPPING)
-        share = float(np.mean(saturated[active] > 0.0)) if active.any() else None
-    return {"peak_torque_Nm": peaks, "torque_limit_Nm": limits, "saturation_share": share}
+        fraction = float(np.mean(saturated[active] > 0.0)) if active.any() else None
+    return {"peak_torque_Nm": peaks, "torque_limit_Nm": limits, "saturation_share": fraction}
 
 
 # Spectra ---------------------------------------------------------------------------------------
@@ -230,7 +270,7 @@ def _torque(run):
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """How strongly the links' tips (or, without a model, the modes) vibrate at which frequency.
+    """How strongly the links' tips vibrate at each frequency; without a model, the modes.
 
     Attributes
     ----------
@@ -240,9 +280,9 @@ class Spectrum:
         Amplitude spectral density [m / sqrt(Hz)], or [m, rad / sqrt(Hz)] of modes.
     names : list of str
     configuration : ndarray, shape (n,)
-        Mean joint angles meanwhile [rad].
+        Mean joint angles over the samples used [rad].
     seconds : float
-        Of how long it was taken.
+        Duration of these samples.
     """
 
     frequency: np.ndarray
@@ -253,7 +293,7 @@ class Spectrum:
 
 
 def spectrum(run, mask):
-    """Welch's estimate over the gapless stretches of some samples; None where none is long enough.
+    """Welch's estimate over the stretches without gaps in some samples; None where none is long enough.
 
     Parameters
     ----------
@@ -266,7 +306,7 @@ def spectrum(run, mask):
         return None
     rate = 1.0 / run.period
     mask = mask & run.bent_known
-    pieces = [(a, b) for a, b in _gapless(run, mask) if (b - a) * run.period >= SHORTEST_SEGMENT]
+    pieces = [(a, b) for a, b in _gapless(run, mask) if (b - a) * run.period >= MIN_SEGMENT]
     if not pieces:
         return None
     if run.model is not None:
@@ -294,7 +334,7 @@ def spectrum(run, mask):
 
 
 def _gapless(run, mask):
-    """Stretches of samples in `mask` that follow one another without a loss."""
+    """Stretches of samples in `mask` of which none is missing."""
     starts, ends = stretches(mask)
     cuts = np.flatnonzero(~run.timeline.joined) + 1
     for a, b in zip(starts, ends, strict=True):
@@ -319,14 +359,14 @@ def predicted(run, q):
 
 
 def highest(run, cases):
-    """Up to which frequency there is something to tell: well above the lowest of `predicted` [Hz]."""
+    """Highest frequency to show: well above the lowest ones of `predicted` [Hz]."""
     nyquist = 0.5 / run.period
-    known = [f for values in cases.values() for f in values[:LOWEST]]
+    known = [f for values in cases.values() for f in values[:MAX_FREQUENCIES]]
     return float(min(nyquist, 2.0 * max(known)) if known else min(nyquist, 100.0))
 
 
-def peaks(spectrum_, top=np.inf, most=4):
-    """Frequencies up to `top` that stand out in the sum of all signals, the strongest first [Hz]."""
+def peaks(spectrum_, top=np.inf, count=4):
+    """Up to `count` frequencies below `top` that stand out in the sum of all signals, the strongest first [Hz]."""
     from scipy.signal import find_peaks
 
     power = (spectrum_.density[spectrum_.frequency <= top] ** 2).sum(axis=1)
@@ -335,7 +375,7 @@ def peaks(spectrum_, top=np.inf, most=4):
     at = find_peaks(
         np.log10(power + 1e-300), prominence=np.log10(OUTSTANDING), distance=4 * PADDED
     )[0]
-    order = np.argsort(power[at])[::-1][:most]
+    order = np.argsort(power[at])[::-1][:count]
     return [float(spectrum_.frequency[i]) for i in at[order]]
 
 
@@ -343,7 +383,7 @@ def peaks(spectrum_, top=np.inf, most=4):
 
 
 def episodes(run):
-    """Stretches in one state of the supervisor: (start [s], end [s], state, reason), state -1 where not known."""
+    """Stretches in one state of the supervisor: (start [s], end [s], state, reason); state -1 where unknown."""
     if not run.has("controller/state"):
         return []
     change = np.flatnonzero(np.diff(run.state) != 0) + 1
@@ -358,7 +398,7 @@ def episodes(run):
 
 
 def refusals(run):
-    """Where a reason of refusal came up: (time [s], state, reason)."""
+    """When a reason for a refusal was given: (time [s], state, reason)."""
     if not run.has("controller/state"):
         return []
     reasons = run.contents.reasons

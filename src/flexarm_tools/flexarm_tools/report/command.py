@@ -60,7 +60,7 @@ def report(options):
     return made
 
 
-def make(bags, out, arm=None, namespace=None, progress=None):
+def make(bags, out, arm=None, namespace=None, progress=None, names=None, opening=""):
     """Write the report of some bags.
 
     Parameters
@@ -71,6 +71,10 @@ def make(bags, out, arm=None, namespace=None, progress=None):
     arm, namespace : str, optional
         See `bag.read`.
     progress : Progress, optional
+    names : sequence of str, optional
+        What the runs are called on the page; by their folders if not given.
+    opening : str
+        Sentences before the numbers: what one sees on the page.
 
     Returns
     -------
@@ -79,38 +83,45 @@ def make(bags, out, arm=None, namespace=None, progress=None):
     Raises
     ------
     FlexarmError
-        For a bag that tells nothing, and for a page that can't be written.
+        For a bag without states of an arm, and for a page that can't be written.
     """
     out = _page_file(out)
-    return _write(read(bags, arm, namespace, progress), out, progress)
+    runs = read(bags, arm, namespace, progress)
+    for run, name in zip(runs, names or (), strict=bool(names)):
+        run.label = name
+    return _write(runs, out, progress, opening)
 
 
 def _page_file(out):
     out = Path(out)
     if out.suffix not in (".html", ".htm"):
-        raise FlexarmError(f"--out {out}: a page ends in .html")
+        raise FlexarmError(
+            "is no name of a page", field="--out", value=str(out), hint="it ends in .html"
+        )
     return out
 
 
-def _write(runs, out, progress):
+def _write(runs, out, progress, opening=""):
     if progress is not None:
         progress.step("figures and page")
-    # matplotlib and jinja2 are loaded when there is something to draw.
+    # Imported here: matplotlib and jinja2 are needed for drawing only.
     from . import page
 
-    text = page.write(runs)
+    text = page.write(runs, opening)
     if progress is not None:
         progress.done()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise FlexarmError(f"--out {out}: can't be written: {error.strerror or error}") from None
+        raise FlexarmError(
+            f"can't be written: {error.strerror or error}", field="--out", value=str(out)
+        ) from None
     return out
 
 
 def read(bags, arm=None, namespace=None, progress=None):
-    """The runs in some bags, each under a name of its own, a list of `Run`."""
+    """The runs in some bags, a list of `Run`; each has a label of its own."""
     from ..recording import bag
     from .run import Run
 
@@ -118,12 +129,12 @@ def read(bags, arm=None, namespace=None, progress=None):
     for path in bags:
         if progress is not None:
             progress.step(f"read {path}")
-        told = time.monotonic()
+        shown = time.monotonic()
 
         def fraction(done):
-            nonlocal told
-            if progress is not None and time.monotonic() > told + 0.1:
-                told = time.monotonic()
+            nonlocal shown
+            if progress is not None and time.monotonic() > shown + 0.1:
+                shown = time.monotonic()
                 progress.fraction(done)
 
         for contents in bag.read(path, arm, namespace, fraction):
@@ -133,7 +144,7 @@ def read(bags, arm=None, namespace=None, progress=None):
 
 
 def labels(paths, namespaces):
-    """What runs are called: the last parts of their paths that tell them apart, the namespace where that does not."""
+    """Labels of runs: as many last parts of their paths as tell them apart, and the namespace where paths don't."""
     parts = []
     for path in paths:
         path = Path(path).resolve()

@@ -7,57 +7,63 @@ import math
 from jinja2 import Environment
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.loop import metrics
 
 from . import analysis, animation, figures, template
 from .run import STATES
 
-#: A page is to be sent by mail: larger than this it must not be [bytes].
-LARGEST = 5_000_000
+#: Largest page: it has to fit into a mail [bytes].
+MAX_SIZE = 5_000_000
 #: Rows of the table of events.
-MOST_EVENTS = 200
-#: More runs than this can't be told apart.
-MOST_RUNS = len(figures.COLOURS)
+MAX_EVENTS = 200
+#: More runs than this have no colour of their own.
+MAX_RUNS = len(figures.COLOURS)
 DEGREES = 180.0 / math.pi
 
 TERMS = (
     (
-        "Tracking error",
-        "Reference less measured joint angle, over all samples in which the supervisor was TRACKING, HOLDING or"
-        " STOPPING (READY, if it was nothing else).",
+        "Peak and rms tracking error",
+        "Distance of the measured joint angle from its reference, from the first motion's start on, over all samples"
+        " in which the supervisor was TRACKING, HOLDING or STOPPING (READY in a run without these).",
     ),
     (
         "Residual vibration",
-        f"Rms distance of the tip from its mean place that the links' bending makes, over up to {analysis.WINDOW:g} s"
-        f" of rest after each motion (rests shorter than {analysis.SHORTEST:g} s don't count), all motions together."
-        " From the modal amplitudes in the bag and the arm file's mode shapes.",
+        "Rms distance of the tip from its mean place, as far as the links' bending moves it, over a window after each"
+        f" motion that is shown beside the number: from {metrics.SETTLE:g} s after the motion's end, when the joints"
+        f" have settled, to {metrics.MAX_REST:g} s after it, or to the end of the rest. A run in which no rest lasts"
+        f" {metrics.SETTLE + metrics.MIN_WINDOW:g} s is judged from the motion's end on: the number then contains the"
+        f" slow settling. Rests below {metrics.MIN_WINDOW:g} s don't count. All motions together; from the modal"
+        " amplitudes in the bag and the arm file's mode shapes.",
     ),
     (
         "Peak deflection",
-        "The tip of a link against the straight line that its base points along, across the link.",
+        "Distance of a link's tip from the straight line along its base, across the link; all samples.",
     ),
     (
         "Samples lost",
-        "Numbers missing in the sequence that the source counts. The recorder's are those of which the bag has the"
-        " answering torque: the control loop had them.",
+        "Numbers missing in the sequence that the source counts. The recorder missed those of which the bag holds the"
+        " answering torque: they reached the controller.",
     ),
     (
         "Compute time",
-        "As the controller told it in controller/state: its median, 99th percentile and maximum.",
+        "As the controller reports it in controller/state: median, 99th percentile and maximum.",
     ),
     (
         "Figures",
-        "Of long series the least and the greatest value of each of some hundred bins are drawn: peaks are kept. Lines"
-        " are broken where samples are missing.",
+        "Long series are drawn as the smallest and the largest value in each of some hundred bins, so that peaks are"
+        " kept. Lines are broken where samples are missing.",
     ),
 )
 
 
-def write(runs):
+def write(runs, opening=""):
     """The page as text.
 
     Parameters
     ----------
     runs : list of Run
+    opening : str
+        Sentences before the numbers: what one sees on the page.
 
     Returns
     -------
@@ -66,10 +72,15 @@ def write(runs):
     Raises
     ------
     FlexarmError
-        For more runs than can be told apart, or a page that can't be made small enough.
+        For more than `MAX_RUNS` runs, or a page that can't be made small enough.
     """
-    if len(runs) > MOST_RUNS:
-        raise FlexarmError(f"{len(runs)} runs: at most {MOST_RUNS} can be told apart on a page")
+    if len(runs) > MAX_RUNS:
+        raise FlexarmError(
+            "can't be told apart on a page",
+            field="runs",
+            value=len(runs),
+            limit=f"at most {MAX_RUNS}",
+        )
     moves = [analysis.motions(run) for run in runs]
     label = _align(runs, moves)
     numbers = [analysis.summary(run, m) for run, m in zip(runs, moves, strict=True)]
@@ -77,14 +88,20 @@ def write(runs):
     film = animation.data(runs)
     for png in (False, True):
         drawn = figures.draw(runs, moves, spectra, label, png)
-        page = _page(runs, numbers, spectra, drawn, film, label)
-        if len(page.encode()) <= LARGEST:
+        page = _page(runs, numbers, spectra, drawn, film, label, opening)
+        if len(page.encode()) <= MAX_SIZE:
             return page
-    raise FlexarmError(f"the page would be larger than {LARGEST} bytes: give fewer bags at once")
+    raise FlexarmError(
+        "is too large",
+        field="page",
+        value=len(page.encode()),
+        limit=f"at most {MAX_SIZE} bytes",
+        hint="give fewer bags at once",
+    )
 
 
 def _align(runs, moves):
-    """Put time zero at the first motion, where every run has one; what the time counts from."""
+    """Put time zero at the first motion, where every run has one. Returns what the time counts from, in words."""
     if all(moves):
         for run, m in zip(runs, moves, strict=True):
             run.start_at(m[0].start)
@@ -101,7 +118,7 @@ def _spectrum(run, moves):
     return found
 
 
-def _page(runs, numbers, spectra, drawn, film, label):
+def _page(runs, numbers, spectra, drawn, film, label, opening):
     shown = [
         {
             "label": run.label,
@@ -128,6 +145,7 @@ def _page(runs, numbers, spectra, drawn, film, label):
         style=template.STYLE,
         script=template.SCRIPT,
         runs=shown,
+        opening=opening,
         short=short(runs, numbers),
         notes=[f"{run.label}: {note}" if several else note for run in runs for note in run.notes],
         rows=rows(runs, numbers),
@@ -136,8 +154,8 @@ def _page(runs, numbers, spectra, drawn, film, label):
         film_caption=_film_caption(film, label),
         figures=drawn,
         frequencies=_frequencies(runs, spectra),
-        events=events[:MOST_EVENTS],
-        events_left=max(len(events) - MOST_EVENTS, 0),
+        events=events[:MAX_EVENTS],
+        events_left=max(len(events) - MAX_EVENTS, 0),
         time_label=label,
         terms=TERMS,
     )
@@ -163,7 +181,7 @@ def _several(count, noun):
 
 
 def short(runs, numbers):
-    """The story in sentences, one for each run, and what differs between them."""
+    """The summary in sentences: one paragraph for each run, then the differences between them."""
     lines = []
     for run, m in zip(runs, numbers, strict=True):
         parts = [f"{digits(m['duration_s'])} s at {digits(m['rate_hz'], 4)} Hz"]
@@ -174,11 +192,9 @@ def short(runs, numbers):
         if m["peak_error_rad"] and None not in m["peak_error_rad"]:
             worst = max(range(len(m["peak_error_rad"])), key=lambda j: m["peak_error_rad"][j])
             error = DEGREES * m["peak_error_rad"][worst]
-            text += f" Off the reference by at most {digits(error)}° ({run.joint_names[worst]})."
+            text += f" Largest tracking error: {digits(error)}° ({run.joint_names[worst]})."
         if m["residual_m"] is not None:
-            text += (
-                f" At rest after it, the tip vibrated by {digits(1e3 * m['residual_m'])} mm rms."
-            )
+            text += f" The tip vibrated by {digits(1e3 * m['residual_m'])} mm rms, {_window(m)}."
         text += _torque_words(run, m)
         if m["faults"]:
             text += (
@@ -190,40 +206,53 @@ def short(runs, numbers):
     return lines + _differences(runs, numbers)
 
 
+def _window(m):
+    """When residual vibration was judged, in words."""
+    start, end = m["residual_window_s"]
+    return f"{start:.3g} to {end:.3g} s after {'the motion' if m['residual_windows'] == 1 else 'each motion'}"
+
+
 def _torque_words(run, m):
-    shares = [
+    fractions = [
         (peak / limit, j)
         for j, (peak, limit) in enumerate(
             zip(m["peak_torque_Nm"], m["torque_limit_Nm"], strict=True)
         )
         if peak is not None and limit
     ]
-    if not shares:
+    if not fractions:
         return ""
-    share, j = max(shares)
-    text = f" Up to {digits(100.0 * share)} % of the torque limit ({run.joint_names[j]})"
+    fraction, j = max(fractions)
+    text = f" Torque up to {digits(100.0 * fraction)} % of the limit ({run.joint_names[j]})"
     if m["saturation_share"]:
-        text += f"; it was met in {digits(100.0 * m['saturation_share'])} % of the samples"
+        text += f"; at the limit in {digits(100.0 * m['saturation_share'])} % of the samples"
     return f"{text}."
 
 
 def _differences(runs, numbers):
-    """How much the best run is better than the worst."""
-    if len(runs) < 2:
-        return []
+    """How the best run compares with the worst."""
     lines = []
-    for name, value in (
-        ("Residual vibration", lambda m: m["residual_m"]),
-        ("Peak tracking error", lambda m: _worst(m["peak_error_rad"])),
+    for name, value, window in (
+        ("Residual vibration", lambda m: m["residual_m"], _window),
+        ("Peak tracking error", lambda m: _worst(m["peak_error_rad"]), None),
     ):
-        known = [(value(m), run.label) for run, m in zip(runs, numbers, strict=True) if value(m)]
-        if len(known) > 1:
-            (low, best), (high, worst) = min(known), max(known)
-            ratio = high / low
-            if ratio >= 1.05:
-                lines.append(f"{name}: {best} has {digits(ratio)} times less than {worst}.")
-            else:
-                lines.append(f"{name}: the same within 5 % in all of them.")
+        known = [(value(m), i) for i, m in enumerate(numbers) if value(m)]
+        if len(known) < 2:
+            continue
+        if window is not None:
+            windows = sorted({window(numbers[i]) for _, i in known})
+            name += (
+                f", {windows[0]}"
+                if len(windows) == 1
+                else ", over windows that differ (see the table)"
+            )
+        (low, best), (high, worst) = min(known), max(known)
+        if high / low >= 1.05:
+            lines.append(
+                f"{name}: {runs[best].label} has {digits(high / low)} times less than {runs[worst].label}."
+            )
+        else:
+            lines.append(f"{name}: the same within 5 % in all runs.")
     return lines
 
 
@@ -248,7 +277,7 @@ def rows(runs, numbers):
             out.append({"name": name, "cells": cells})
 
     group("Record")
-    row("arm", lambda r, m: _cell(m["arm"] or "not known"))
+    row("arm", lambda r, m: _cell(m["arm"] or "unknown"))
     row(
         "duration [s]",
         lambda r, m: _cell(digits(m["duration_s"], 4), f"in {_several(m['sessions'], 'session')}"),
@@ -261,8 +290,8 @@ def rows(runs, numbers):
     row("faults", _faults)
     group("Tracking and vibration")
     for key, name in (
-        ("peak_error_rad", "peak tracking error [deg]"),
-        ("rms_error_rad", "rms tracking error [deg]"),
+        ("peak_error_rad", "peak tracking error, motion and rest [deg]"),
+        ("rms_error_rad", "rms tracking error, motion and rest [deg]"),
     ):
         row(name, lambda r, m, key=key: _per_joint(r, m[key], DEGREES))
     row("residual vibration of the tip, rms [mm]", _residual)
@@ -270,7 +299,7 @@ def rows(runs, numbers):
     group("Torque and time")
     row("peak torque [N m]", _peak_torque)
     row("samples with the torque at a limit [%]", _saturation)
-    row("compute time, median / 99 % / most [ms]", _compute)
+    row("compute time, median / 99 % / maximum [ms]", _compute)
     return [
         r
         for k, r in enumerate(out)
@@ -290,18 +319,18 @@ def _repeats(m):
 def _lost(run, m):
     if not m["lost"]:
         return _cell("0")
-    share = f"({digits(100.0 * m['lost'] / (m['lost'] + m['samples']))} %"
+    fraction = f"({digits(100.0 * m['lost'] / (m['lost'] + m['samples']))} %"
     missed = (
         f", {m['lost_by_recorder']} missed by the recorder alone" if m["lost_by_recorder"] else ""
     )
-    return _cell(str(m["lost"]), f"{share}{missed})", bad=m["lost"] > m["lost_by_recorder"])
+    return _cell(str(m["lost"]), f"{fraction}{missed})", bad=m["lost"] > m["lost_by_recorder"])
 
 
 def _unanswered(run, m):
     if m["unanswered"] is None:
         return _cell("–")
-    share = f"({digits(100.0 * m['unanswered'] / m['samples'])} %)" if m["unanswered"] else ""
-    return _cell(str(m["unanswered"]), share, bad=m["unanswered"] > 0.01 * m["samples"])
+    fraction = f"({digits(100.0 * m['unanswered'] / m['samples'])} %)" if m["unanswered"] else ""
+    return _cell(str(m["unanswered"]), fraction, bad=m["unanswered"] > 0.01 * m["samples"])
 
 
 def _faults(run, m):
@@ -322,8 +351,8 @@ def _per_joint(run, values, scale):
 def _residual(run, m):
     if m["residual_m"] is None:
         return _cell("–")
-    count = m["residual_windows"]
-    return _cell(digits(1e3 * m["residual_m"]), f"after {_several(count, 'motion')}")
+    motions = f", {m['residual_windows']} motions" if m["residual_windows"] > 1 else ""
+    return _cell(digits(1e3 * m["residual_m"]), f"({_window(m)}{motions})")
 
 
 def _deflection(run, m):
@@ -343,8 +372,8 @@ def _peak_torque(run, m):
 
 
 def _saturation(run, m):
-    share = m["saturation_share"]
-    return _cell("–" if share is None else digits(100.0 * share), bad=bool(share))
+    fraction = m["saturation_share"]
+    return _cell("–" if fraction is None else digits(100.0 * fraction), bad=bool(fraction))
 
 
 def _compute(run, m):
@@ -362,7 +391,7 @@ def _frequencies(runs, spectra):
         known = analysis.predicted(run, s.configuration)
         top = analysis.highest(run, known)
         cells = [
-            [f for f in known.get(f"joints {case}", ()) if f < top][: analysis.LOWEST]
+            [f for f in known.get(f"joints {case}", ()) if f < top][: analysis.MAX_FREQUENCIES]
             for case in ("locked", "free")
         ]
         measured = [digits(f, 4) for f in analysis.peaks(s, top)] or ["none stands out"]
@@ -379,9 +408,9 @@ def _frequencies(runs, spectra):
 def _events(runs):
     found = []
     for run in runs:
-        told = [(a, state, why) for a, _, state, why in analysis.episodes(run) if state >= 0]
-        told += [(t, STATES.index(s), why) for t, s, why in analysis.refusals(run) if s in STATES]
-        for t, state, why in dict.fromkeys(told):
+        seen = [(a, state, why) for a, _, state, why in analysis.episodes(run) if state >= 0]
+        seen += [(t, STATES.index(s), why) for t, s, why in analysis.refusals(run) if s in STATES]
+        for t, state, why in dict.fromkeys(seen):
             found.append((run.label, t, STATES[state], why))
     found.sort(key=lambda e: (e[1], e[0]))
     return [(label, f"{t:.3f}", state, why) for label, t, state, why in found]

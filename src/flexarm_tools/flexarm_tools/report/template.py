@@ -21,7 +21,7 @@ nav a:hover { color: var(--ink); text-decoration: underline; }
 section { background: #fff; border: 1px solid var(--line); border-radius: 8px; padding: 16px 20px;
   margin-bottom: 18px; scroll-margin-top: 52px; }
 section > p.caption { color: var(--soft); font-size: 14px; margin: 0 0 8px; max-width: 95ch; }
-ul.short { margin: 6px 0 0; padding-left: 20px; } ul.short li { margin: 4px 0; }
+p.opening { margin: 2px 0 8px; max-width: 95ch; } ul.short { margin: 6px 0 0; padding-left: 20px; } ul.short li { margin: 4px 0; }
 .notes li { color: #7a4a00; }
 table { border-collapse: collapse; width: 100%; font-size: 14px; }
 th, td { text-align: left; padding: 5px 12px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
@@ -291,8 +291,9 @@ PAGE = """<!DOCTYPE html>
 {%- if events %}<a href="#events">Events</a>{% endif %}</nav>
 <main>
 <section id="short"><h2>In short</h2>
-<ul class="short">{% for line in short %}<li>{{ line }}</li>{% endfor %}</ul>
-{% if notes %}<h2 style="margin-top:14px">To mind</h2>
+{% if opening %}<p class="opening">{{ opening }}</p>
+{% endif %}<ul class="short">{% for line in short %}<li>{{ line }}</li>{% endfor %}</ul>
+{% if notes %}<h2 style="margin-top:14px">Notes</h2>
 <ul class="short notes">{% for note in notes %}<li>{{ note }}</li>{% endfor %}</ul>{% endif %}
 </section>
 <section id="summary"><h2>Summary</h2>
@@ -325,7 +326,7 @@ PAGE = """<!DOCTYPE html>
 </section>
 {% endfor %}
 {% if events %}<section id="events"><h2>Events</h2>
-<p class="caption">What the supervisor came to, and why; times {{ time_label }}.{% if events_left %} The first {{ events|length }}; {{ events_left }} more are not shown.{% endif %}</p>
+<p class="caption">What the supervisor decided, and why; times {{ time_label }}.{% if events_left %} The first {{ events|length }}; {{ events_left }} more are not shown.{% endif %}</p>
 <div class="scroll tall"><table><thead><tr><th>run</th><th>time [s]</th><th>state</th><th>reason</th></tr></thead>
 <tbody>{% for e in events %}<tr><td>{{ e[0] }}</td><td>{{ e[1] }}</td><td{% if e[2] == "FAULT" %} class="bad"{% endif %}>{{ e[2] }}</td><td>{{ e[3] }}</td></tr>{% endfor %}</tbody></table></div></section>{% endif %}
 <footer><h2>How the numbers are made</h2><dl>{% for term, text in terms %}<dt>{{ term }}</dt><dd>{{ text }}</dd>{% endfor %}</dl>
