@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds the site of these pages: ``make docs``, or ``python docs/build_site.py --out results/docs``.
 
-The pages of ``docs/`` are copied, and beside them are put
+It copies the pages of ``docs/`` and adds
 
 - ``api/``: a page for each public module, from its docstrings;
 - ``messages.md``: from the ``.msg`` files;
 - ``readme.md`` and ``contributing.md``: the README and CONTRIBUTING;
-- ``parameters.md``: anew from the declarations.
+- ``parameters.md``: generated from the declarations.
 
-Links to source files become links to the pages of their modules. Before, all links and anchors are checked
-(`links.py`), after, Sphinx does: any warning of it is an error. Nothing is fetched.
+Links to source files become links to the pages of their modules. First `links.py` checks all links and anchors; then
+Sphinx builds the site, and any warning is an error. Nothing is downloaded.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def first_sentence(path):
 
 
 def write_api(out):
-    """A page per module, and one per package that lists them."""
+    """Write a page per module, and one per package that lists them."""
     out.mkdir(parents=True)
     index = ["# API", "", "From the docstrings of the public modules.", ""]
     toc = []
@@ -101,14 +101,14 @@ def write_messages(file):
 
 
 def write_parameters(file):
-    """The page with the tables of the declarations, made now."""
+    """Write the page with the tables of the declarations."""
     from flexarm_tools import parameter_tables
 
     parameter_tables.write(file)
 
 
 def adapt(text, page):
-    """Links of a page to what has a page of its own here, or none."""
+    """Rewrite the links of a page: to the site's page of a module where there is one."""
     known = {}
     for package in PACKAGES:
         for name, path in modules(package):
@@ -151,7 +151,7 @@ def copy_pages(out):
 
 
 def main():
-    """Build; the exit code is that of the first step that fails."""
+    """Build the site; the exit code is that of the first step that fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "docs")
     out = parser.parse_args().out.resolve()

@@ -17,15 +17,15 @@ html_copy_source = False
 master_doc = "index"
 exclude_patterns = []
 
-# Markdown: as GitHub reads it, anchors of headings included, with formulas in dollars.
+# Markdown as GitHub reads it, with anchors of headings, and formulas between dollars.
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 suppress_warnings = [
-    "myst.header",  # a page taken from a part of another one may begin below level 1
+    "myst.header",  # a page made from part of another one may begin below level 1
 ]
 
-# Docstrings: numpydoc; members in the order of the source, where each comes after what it needs.
+# Docstrings: numpydoc; members in the order of the source, where definitions precede their use.
 autodoc_member_order = "bysource"
 autodoc_default_options = {
     "members": True,
@@ -37,13 +37,13 @@ numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 numpydoc_xref_param_type = False
 
-# numpydoc compiles its template anew for every docstring, a third of a build: one is enough.
+# numpydoc compiles its template for every docstring, which takes a third of a build: compile it once.
 _templates = Path(docscrape_sphinx.__file__).parent / "templates"
 _environment = docscrape_sphinx.SandboxedEnvironment(loader=FileSystemLoader(_templates))
 docscrape_sphinx.SandboxedEnvironment = lambda loader: _environment
 
-# What -n complains of and cannot be resolved offline: base classes of packages whose pages are on the web, and what
-# docstrings inherited from them refer to.
+# References that -n cannot resolve offline: base classes of other packages, and the references in docstrings that are
+# inherited from them.
 nitpick_ignore_regex = [
     (
         r"py:.*",

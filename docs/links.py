@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the links inside the repository's Markdown lead anywhere: ``python docs/links.py``.
+"""Checks the links inside the repository's Markdown: ``python docs/links.py``.
 
-Of every page in ``docs/``, the README and the examples, each link that is no web address must be a file or a folder
-of the repository, with the case of its letters, and each ``#anchor`` a heading of the page it names, spelled as GitHub
-makes anchors of headings.
-Standard library alone.
+It checks every page in ``docs/`` and ``examples/``, the README and CONTRIBUTING. Each link that is not a web address
+must name a file or folder of the repository, with the case of its letters. Each ``#anchor`` must be a heading of its
+page, in GitHub's spelling of anchors. Standard library only.
 """
 
 import re
@@ -37,7 +36,7 @@ def _blank(match):
 
 
 def anchors(text):
-    """Anchors of a page: small letters, no punctuation, hyphens for spaces, -1 at the second of a name."""
+    """Anchors of a page: lower case, no punctuation, hyphens for spaces, ``-1`` after the second of the same name."""
     seen, found = {}, set()
     for _, title in HEADING.findall(FENCE.sub(_blank, text)):
         plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", title)
@@ -49,7 +48,7 @@ def anchors(text):
 
 
 def links(text):
-    """Targets of the links of a page with their line numbers; those in code are none."""
+    """Targets of the links of a page with their line numbers, code excluded."""
     prose = CODE.sub(_blank, FENCE.sub(_blank, text))
     for pattern in (LINK, IMAGE, DEFINITION):
         for match in pattern.finditer(prose):
@@ -57,7 +56,7 @@ def links(text):
 
 
 def as_spelled(path):
-    """Whether a path exists with the very letters it is written in: a disk may forgive what a web server does not."""
+    """Whether a path exists with the same case; some file systems ignore case, web servers do not."""
     here = path.resolve()
     if not here.exists():
         return False
@@ -69,7 +68,7 @@ def as_spelled(path):
 
 
 def broken(page, root=ROOT):
-    """What is wrong with the links of one page, a line of text each."""
+    """Broken links of one page, a line of text each."""
     text = page.read_text(encoding="utf-8")
     for line, target in links(text):
         if re.match(r"[a-z][a-z+.-]*:", target):
