@@ -4,7 +4,6 @@
 import numpy as np
 
 from flexarm_control import trajectory
-from flexarm_control.component import sizes
 from flexarm_control.composite.law import FAST, MANIFOLD, SLOW, design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
@@ -14,7 +13,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import check_all
+from flexarm_dynamics.parameters import check_all, sizes
 from flexarm_ros.messages import CompositeStateWriter
 from flexarm_studies.loop.closed_loop import ClosedLoop
 

@@ -2,7 +2,7 @@
 """What slow laws, fast laws, manifolds, feed-forwards and observers have in common, and how one is made by name."""
 
 from flexarm_dynamics import registry
-from flexarm_dynamics.parameters import check_all
+from flexarm_dynamics.parameters import check_all, sizes
 
 
 class Component:
@@ -50,11 +50,6 @@ class Law(Component):
         dt : float
             True time since the last sample [s].
         """
-
-
-def sizes(model):
-    """Lengths of array parameters by the names that their declarations use."""
-    return {"joints": model.n_joints, "modes": model.n_modes, "z": 2 * model.n_modes}
 
 
 def make(group, name, model, values, prefix, *known):

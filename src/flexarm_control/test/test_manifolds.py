@@ -199,7 +199,7 @@ def test_joints_follow_the_reference_on_the_manifold():
 
 def test_orders_out_of_range_are_refused():
     model = build(arm_file.load("R"))
-    with pytest.raises(ParameterError, match=r"manifold\.order: 7 is above its upper limit 6"):
+    with pytest.raises(ParameterError, match=r"manifold\.order: 7 is above its upper limit \(6\)"):
         manifold(model, "corrected", order=7)
     with pytest.raises(ParameterError, match=r"manifold\.order: 2\.0 is not an integer"):
         manifold(model, "corrected", order=2.0)

@@ -5,7 +5,12 @@ An error carries what a program or a test wants to know (`field`, `value`, `limi
 which it is written out for people: ``field: value problem (limit); hint``, without the parts that are not given.
 """
 
+import numpy as np
+
 from .shown import show
+
+#: Values beyond this are no measurement of an arm [rad, m, rad/s, m/s].
+MAX_MEASUREMENT = 1e6
 
 
 class _NotGiven:
@@ -105,3 +110,27 @@ class DesignError(FlexarmError):
 
 class UnknownComponentError(FlexarmError):
     """A law, observer or model name that no installed package provides."""
+
+
+def check_finite(values, names, field):
+    """Refuse measurements that are not finite or beyond any arm's.
+
+    Parameters
+    ----------
+    values : ndarray, shape (k,)
+    names : sequence of str
+        Of the joints or modes that the values belong to.
+    field : str
+        Field of the message, such as ``joint_position``.
+
+    Raises
+    ------
+    MessageError
+        Naming the first bad value and its joint or mode.
+    """
+    if values.dot(values) < MAX_MEASUREMENT:
+        return  # so is every usable sample, and one product costs a third of what follows
+    if not np.abs(values).max(initial=0.0) < MAX_MEASUREMENT:  # false for NaN too
+        i = int(np.argmin(np.abs(values) < MAX_MEASUREMENT))
+        problem, field = "is not a usable measurement", f"{field} of {names[i]}"
+        raise MessageError(problem, field=field, value=float(values[i]), limit=MAX_MEASUREMENT)

@@ -10,8 +10,10 @@ import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from .errors import ParameterError
-from .shown import number, show
+from .shown import show
 
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
 
@@ -79,23 +81,20 @@ class Parameter:
         where = prefix + self.name
         if self.kind == "bool":
             if not isinstance(value, bool):
-                raise ParameterError(
-                    f"{where}: {show(value)} is not a boolean: write true or false"
-                )
+                raise _refusal(where, value, "is not a boolean", hint="write true or false")
             return value
         if self.kind == "string":
             if not isinstance(value, str):
-                raise ParameterError(f"{where}: {show(value)} is not a string")
+                raise _refusal(where, value, "is not a string")
             if self.choices and value not in self.choices:
-                raise ParameterError(
-                    f"{where}: {show(value)} is not one of {', '.join(self.choices)}"
-                )
+                choices = ", ".join(self.choices)
+                raise _refusal(where, value, "is not one of the choices", limit=choices)
             return value
         if self.kind == "string_array":
             if isinstance(value, str) or not isinstance(value, Sequence):
-                raise ParameterError(f"{where}: {show(value)} is not a list of strings")
+                raise _refusal(where, value, "is not a list of strings")
             if not all(isinstance(item, str) for item in value):
-                raise ParameterError(f"{where}: {show(list(value))} holds what is not a string")
+                raise _refusal(where, list(value), "holds what is not a string")
             return list(value)
         if self.kind == "int_array":
             entries = enumerate(_listed(where, value, "integers"))
@@ -108,18 +107,17 @@ class Parameter:
 
     def _int(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-            raise ParameterError(f"{where}: {show(value)} is not an integer")
+            raise _refusal(where, value, "is not an integer")
         return int(self._in_range(where, value))
 
     def _float(self, where, value):
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise ParameterError(f"{where}: {show(value)} is not a number")
+            raise _refusal(where, value, "is not a number")
         if not _is_finite(value):
-            raise ParameterError(f"{where}: {number(value)} is not finite")
+            raise _refusal(where, value, "is not finite")
         if isinstance(value, numbers.Integral):
-            raise ParameterError(
-                f"{where}: {show(value)} is an integer where a float is asked for: write {float(value)}"
-            )
+            hint = f"write {float(value)}"
+            raise _refusal(where, value, "is an integer where a float is needed", hint=hint)
         return float(self._in_range(where, value))
 
     def _float_array(self, where, value, sizes):
@@ -128,38 +126,34 @@ class Parameter:
             isinstance(v, numbers.Integral) and not isinstance(v, bool) and _is_finite(v)
             for v in value
         ):
+            problem = "is a list of integers where floats are needed"
             wanted = ", ".join(str(float(v)) for v in value[:12])
-            raise ParameterError(
-                f"{where}: {show([int(v) for v in value])} is a list of integers where floats are asked"
-                f" for: write [{wanted}]"
-            )
+            raise _refusal(where, [int(v) for v in value], problem, hint=f"write [{wanted}]")
         out = [self._float(f"{where}[{i}]", v) for i, v in enumerate(value)]
-        if self.length is None:
-            return out
-        wanted = self.length if isinstance(self.length, int) else sizes.get(self.length)
-        if wanted is None:
+        wanted = sizes.get(self.length) if isinstance(self.length, str) else self.length
+        if wanted is None or len(out) == wanted:
             return out
         if len(out) == 1:
             return out * wanted
-        if len(out) != wanted:
-            what = f" ({self.length})" if isinstance(self.length, str) else ""
-            raise ParameterError(
-                f"{where}: {len(out)} values where {wanted}{what} are needed; one value stands for all"
-            )
-        return out
+        what = f" ({self.length})" if isinstance(self.length, str) else ""
+        problem = f"{len(out)} values where {wanted}{what} are needed"
+        raise ParameterError(problem, field=where, hint="one value stands for all")
 
     def _in_range(self, where, value):
         if not _is_finite(value):
-            raise ParameterError(f"{where}: {number(value)} is not finite")
+            raise _refusal(where, value, "is not finite")
+        unit = "" if self.unit == "-" else f"{self.unit} "
         if self.low is not None and value < self.low:
-            raise ParameterError(
-                f"{where}: {number(value)} is below its lower limit {self.low} [{self.unit}]"
-            )
+            raise _refusal(where, value, f"{unit}is below its lower limit", limit=self.low)
         if self.high is not None and value > self.high:
-            raise ParameterError(
-                f"{where}: {number(value)} is above its upper limit {self.high} [{self.unit}]"
-            )
+            raise _refusal(where, value, f"{unit}is above its upper limit", limit=self.high)
         return value
+
+
+def _refusal(where, value, problem, **more):
+    """The error for a value; a NumPy scalar is shown as the number that it is."""
+    value = value.item() if isinstance(value, np.generic) else value
+    return ParameterError(problem, field=where, value=value, **more)
 
 
 def _listed(where, value, what):
@@ -169,7 +163,7 @@ def _listed(where, value, what):
             return list(value)
         except TypeError:  # an array without dimensions has a length in name only
             pass
-    raise ParameterError(f"{where}: {show(value)} is not a list of {what}")
+    raise _refusal(where, value, f"is not a list of {what}")
 
 
 def _is_finite(value):
@@ -178,6 +172,11 @@ def _is_finite(value):
         return math.isfinite(value)
     except OverflowError:
         return False
+
+
+def sizes(model):
+    """Lengths of array parameters by the names that declarations use: ``joints``, ``modes``, and ``z`` for z_f."""
+    return {"joints": model.n_joints, "modes": model.n_modes, "z": 2 * model.n_modes}
 
 
 def check_all(declared, values, sizes=None, prefix=""):
@@ -207,8 +206,7 @@ def check_all(declared, values, sizes=None, prefix=""):
     known = {p.name: p for p in declared}
     for name in values:
         if name not in known:
-            raise ParameterError(
-                f"{prefix}{name if isinstance(name, str) else show(name)}: no such parameter; there are"
-                f" {', '.join(sorted(known)) or 'none'}"
-            )
+            field = prefix + (name if isinstance(name, str) else show(name))
+            hint = f"there are {', '.join(sorted(known)) or 'none'}"
+            raise ParameterError("no such parameter", field=field, hint=hint)
     return {name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()}

@@ -43,15 +43,16 @@ def find(group, name):
     found = [e for e in entry_points(group=group) if e.name == name]
     if not found:
         close = difflib.get_close_matches(name, names(group), 1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        known = ", ".join(names(group)) or "none; is the workspace built and sourced?"
         raise UnknownComponentError(
-            f"{group}: {name!r} is provided by no installed package (there are:"
-            f" {', '.join(names(group)) or 'none; is the workspace built and sourced?'}){hint}"
+            "is provided by no installed package",
+            field=group,
+            value=name,
+            limit=f"there are: {known}",
+            hint=f"did you mean {close[0]!r}?" if close else "",
         )
     try:
         return found[0].load()
     except Exception as error:
-        raise UnknownComponentError(
-            f"{group}: {name!r} ({found[0].value}) can't be imported:"
-            f" {type(error).__name__}: {error}"
-        ) from error
+        problem = f"({found[0].value}) can't be imported: {type(error).__name__}: {error}"
+        raise UnknownComponentError(problem, field=group, value=name) from error

@@ -3,10 +3,18 @@
 
 import pickle
 
+import numpy as np
 import pytest
 
 from flexarm_dynamics import errors
-from flexarm_dynamics.errors import NOT_GIVEN, ArmFileError, FlexarmError, ParameterError
+from flexarm_dynamics.errors import (
+    NOT_GIVEN,
+    ArmFileError,
+    FlexarmError,
+    MessageError,
+    ParameterError,
+    check_finite,
+)
 
 KINDS = [
     kind
@@ -56,3 +64,13 @@ def test_an_error_travels_whole(kind):
         is NOT_GIVEN
     )
     assert type(again) is kind and vars(again) == vars(made) and str(again) == str(made)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e6, -1e200])
+def test_a_measurement_that_is_none_is_refused_with_its_joint(bad):
+    check_finite(np.array([9.9e5, -9.9e5]), ("a", "b"), "joint_position")
+    with pytest.raises(MessageError) as error:
+        check_finite(np.array([1.0, bad, np.nan]), ("a", "b", "c"), "joint_position")
+    assert error.value.field == "joint_position of b"
+    np.testing.assert_equal(error.value.value, bad)
+    assert error.value.limit == errors.MAX_MEASUREMENT

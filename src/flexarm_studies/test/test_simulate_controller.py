@@ -543,7 +543,7 @@ def test_a_setting_that_is_no_parameter_is_refused_by_name(setting, message):
         ("slow.kp=[6]", r"slow\.kp: \[6\] is a list of integers.*write \[6\.0\]"),
         ("slow.kp=[1.0, 2.0]", r"slow\.kp: 2 values where 1 \(joints\)"),
         ("fast.alpha=-1.0", r"fast\.alpha: -1\.0 is below"),
-        ("rate=0.5", r"rate: 0\.5 is below its lower limit 1\.0 \[Hz\]"),
+        ("rate=0.5", r"rate: 0\.5 Hz is below its lower limit \(1\.0\)"),
         ("torque_limit=much", r"torque_limit: 'much' is not a list"),
     ],
 )
@@ -564,7 +564,9 @@ def test_closed_loop_takes_the_observers_common_parameters():
     slow = {"type": "linear_model_following"}
     loop = ClosedLoop("R", slow, {"type": "none"}, observer)
     assert loop.observer.bandwidth == 123.0
-    with pytest.raises(ParameterError, match=r"observer\.joint_velocity_bandwidth: 0\.1 is below"):
+    with pytest.raises(
+        ParameterError, match=r"observer\.joint_velocity_bandwidth: 0\.1 rad/s is below"
+    ):
         ClosedLoop("R", slow, {"type": "none"}, observer | {"joint_velocity_bandwidth": 0.1})
 
 

@@ -3,11 +3,10 @@
 
 import numpy as np
 
-from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.errors import FlexarmError, MessageError, check_finite
 from flexarm_dynamics.parameters import Parameter
 
 from ..arrays import clip
-from ..observers.arm_observer import check_finite
 from ..trajectory import ReferenceGenerator, Verdict, validate
 from . import supervisor
 from .samples import ArmSample, SampleOrder

@@ -17,7 +17,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import Parameter, sizes
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros import qos, scheduling
 from flexarm_ros.messages import (
@@ -33,7 +33,6 @@ from flexarm_ros.start import leave
 from flexarm_ros.statistics import Latency
 
 from .. import trajectory
-from ..component import sizes
 from ..composite import law as composite
 from ..composite.design_process import AwayError, DesignProcess
 from ..composite.law import FAST, MANIFOLD, PREFIX, SLOW

@@ -12,7 +12,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import Parameter, sizes
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
@@ -21,7 +21,6 @@ from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
 from flexarm_ros.statistics import Gaps, Latency, Percentiles
 
-from ..component import sizes
 from ..loop.samples import ArmSample
 from ..observers import arm_observer, gauge_health
 

@@ -4,7 +4,7 @@
 import numpy as np
 
 from flexarm_dynamics.arm.strain_map import StrainMap
-from flexarm_dynamics.errors import MessageError, ModelError
+from flexarm_dynamics.errors import MessageError, ModelError, check_finite
 from flexarm_dynamics.parameters import Parameter, check_all
 
 from ..component import make
@@ -329,17 +329,5 @@ class ArmObserver:
 LONGEST_GAP = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].
 LONGEST_PREDICTION = 0.01
-#: Values beyond this are no measurement of an arm (rad, m, and their rates).
-HUGE = 1e6
 #: Torques beyond this are none [N m].
 HUGE_TORQUE = 1e9
-
-
-def check_finite(values, names, field):
-    """Raise, naming the first bad entry, unless all values are finite and of a sane size."""
-    # So is every usable sample; one product costs a third of what follows.
-    if values.dot(values) < HUGE:
-        return
-    if not np.abs(values).max(initial=0.0) < HUGE:  # false for NaN too
-        i = int(np.argmin(np.abs(values) < HUGE))
-        raise MessageError(f"{field} of {names[i]} is {values[i]}: not a usable measurement")
