@@ -4,7 +4,7 @@
 import numpy as np
 
 from flexarm_control import trajectory
-from flexarm_control.composite.law import FAST, MANIFOLD, SLOW, design
+from flexarm_control.composite.design import FAST, MANIFOLD, SLOW, design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers import arm_observer

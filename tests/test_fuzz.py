@@ -12,7 +12,7 @@ sys.path.insert(
     0, str(Path(__file__).resolve().parents[1])
 )  # the folder is no package of the workspace
 
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import observe
 from flexarm_control.trajectory import files

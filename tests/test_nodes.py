@@ -13,7 +13,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import FAST, SLOW, design_law
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.models import model
@@ -268,12 +268,12 @@ def gain(**changes):
     """K_f for the paper's parameters with some changed."""
     keys = ("q", "r", "alpha", "configuration")
     values = {k: PAPER[f"fast.{k}"] for k in keys} | changes
-    return composite.design_law(composite.FAST, "lqr", MODEL, values).K_f
+    return design_law(FAST, "lqr", MODEL, values).K_f
 
 
 def slow_gain():
     """What multiplies the acceleration in (17) [kg m^2]."""
-    law = composite.design_law(composite.SLOW, "linear_model_following", MODEL, {})
+    law = design_law(SLOW, "linear_model_following", MODEL, {})
     return law.B_inverse(MODEL.terms(np.zeros(1), np.zeros(1)))[0, 0]
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from flexarm_control.composite import full_order
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import design
 from flexarm_dynamics import singular_perturbation
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models.model import build
@@ -61,8 +61,8 @@ def names(arm):
     kp, kv, alpha = np.full(n, 2.0), np.full(n, 3.0), 1.5
     slow = {"type": "model_following", "kp": [2.0] * n, "kv": [3.0] * n}
     fast = {"type": "lqr", "alpha": alpha, "q": [2.0] * m + [0.5] * m, "r": [0.7] * n}
-    law = composite.design(model, slow, fast, {"type": "quasi_steady"})
-    exact = composite.design(model, slow, fast, {"type": "corrected", "order": 1})
+    law = design(model, slow, fast, {"type": "quasi_steady"})
+    exact = design(model, slow, fast, {"type": "corrected", "order": 1})
     reference = Motion(q + 0.01, qd - 0.02)
     z = 1e-3 * random.uniform(-1, 1, 2 * m)
     law.step(q, qd, z[:m], z[m:], reference, 1e-3)

@@ -31,9 +31,9 @@ for top in sys.argv[1:]:
             importlib.import_module(found.name)
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import design
 arm = model.build(arm_file.load(sys.path[0] + "/R.yaml"))
-composite.design(arm, {"type": "linear_model_following"}, {"type": "lqr"})
+design(arm, {"type": "linear_model_following"}, {"type": "lqr"})
 """
 
 

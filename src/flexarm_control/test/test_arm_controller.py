@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control import trajectory
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_control.composite.law import FAST, SLOW, design, design_law
+from flexarm_control.composite.design import FAST, SLOW, design, design_law
 from flexarm_control.observers.arm_observer import design_observer
 from flexarm_control.trajectory import validate
 from flexarm_dynamics.errors import (

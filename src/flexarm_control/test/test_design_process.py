@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flexarm_control.composite import design_process, priority
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import design
 from flexarm_control.composite.design_process import AwayError, DesignProcess
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
@@ -40,7 +40,7 @@ def torques(control, n, m):
 @pytest.mark.parametrize("slow", ["linear_model_following", "model_following", "sliding_mode"])
 @pytest.mark.parametrize("kind", ["none", "model", "preview"])
 def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
-    made = composite.design(arm_r, {"type": slow}, FAST, CORRECTED, {"feedforward": kind})
+    made = design(arm_r, {"type": slow}, FAST, CORRECTED, {"feedforward": kind})
     data = design_process.dumps(made, arm_r.arm)
     expected = torques(made, 1, arm_r.n_modes)
     travelled = design_process.loads(data, arm_r)
@@ -91,7 +91,7 @@ def test_the_process_designs_refuses_and_comes_again_when_it_has_died(arm_r):
     try:
         slow, settings = {"type": "linear_model_following"}, {"feedforward": "model"}
         made = worker.design(slow, FAST, CORRECTED, settings)
-        here = composite.design(arm_r, slow, FAST, CORRECTED, settings)
+        here = design(arm_r, slow, FAST, CORRECTED, settings)
         m = arm_r.n_modes
         np.testing.assert_allclose(torques(made, 1, m), torques(here, 1, m), rtol=1e-12)
         with pytest.raises(ParameterError, match=r"slow\.kp"):
@@ -109,6 +109,6 @@ def test_a_law_of_many_links_travels():
     model = build(arm_file.load("two_link"))
     given = {"type": "model_following", "kp": [2.25], "kv": [3.0]}
     fast = {"type": "lqr", "alpha": 2.0, "q": [0.0] * 4 + [0.001] * 4, "configuration": [0.8, 0.8]}
-    made = composite.design(model, given, fast, CORRECTED | {"order": 1})
+    made = design(model, given, fast, CORRECTED | {"order": 1})
     travelled = design_process.loads(design_process.dumps(made, model.arm), model)
     np.testing.assert_array_equal(torques(travelled, 2, 4), torques(made, 2, 4))

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import solve_continuous_are
 
-from flexarm_control.composite.law import FAST, design_law
+from flexarm_control.composite.design import FAST, design_law
 from flexarm_dynamics.arm.units import POUND_FORCE
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import Terms

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite import full_order
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_dynamics import linear
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexarm_control import trajectory
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import design
 from flexarm_control.trajectory import ReferenceGenerator
 
 SLOW, FAST = {"type": "linear_model_following"}, {"type": "lqr"}
@@ -17,7 +17,7 @@ MS = 1_000_000
 
 def torques(model, kind, ahead, gaps, count=None):
     """Torques over two motions; `count` collects how often the manifold was worked out on the path."""
-    control = composite.design(model, SLOW, FAST, CORRECTED, {"feedforward": kind})
+    control = design(model, SLOW, FAST, CORRECTED, {"feedforward": kind})
     reference = ReferenceGenerator(model.joint_names)
     reference.start(np.zeros(1), 0)
     calls, along = [], control.manifold.along
@@ -77,7 +77,7 @@ def test_looking_ahead_leaves_the_manifold_of_the_motion_out_of_the_step(arm_r):
 
 def test_the_slow_torque_is_that_about_the_motion_as_it_is_now(arm_r):
     """Of every sample anew: the torque of the motion less the slow law's on it, and the law's about it."""
-    control = composite.design(arm_r, SLOW, FAST, CORRECTED, {"feedforward": "model"})
+    control = design(arm_r, SLOW, FAST, CORRECTED, {"feedforward": "model"})
     motion, n, m = control.feedforward, arm_r.n_joints, arm_r.n_modes
     L, U = control.manifold.error_response(motion.settings.configuration)
     reference = ReferenceGenerator(arm_r.joint_names)
@@ -102,7 +102,7 @@ def test_the_slow_torque_is_that_about_the_motion_as_it_is_now(arm_r):
 
 
 def test_a_control_without_feedforward_has_nothing_to_look_ahead_to(arm_r):
-    control = composite.design(arm_r, SLOW, FAST, CORRECTED)
+    control = design(arm_r, SLOW, FAST, CORRECTED)
     control.look_ahead()
     reference = SimpleNamespace(
         position=np.zeros(1),

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.linalg import schur
 
+from flexarm_control.composite.design import MANIFOLD, design, design_law
 from flexarm_control.composite.full_order import at_rest
-from flexarm_control.composite.law import MANIFOLD, design, design_law
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models.model import build

@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import place_poles
 
 from flexarm_control.composite import full_order
-from flexarm_control.composite.law import FAST, design, design_law
+from flexarm_control.composite.design import FAST, design, design_law
 from flexarm_control.fast.scheduled_lqr import GainTable
 from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from flexarm_control.composite.law import SLOW, design, design_law
+from flexarm_control.composite.design import SLOW, design, design_law
 from flexarm_control.motions import profiles
 from flexarm_control.slow.payload_model import PayloadModel
 from flexarm_control.slow.rigid_arm import Tip, rigid_arm

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from flexarm_control.composite import law as composite
+from flexarm_control.composite.design import design
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.models.model import build
@@ -53,7 +53,7 @@ def deviations(order, stiffness, straight=False):
     x is the joint's position and velocity, z = (delta/mu^2, delta_d/mu), of order one both.
     """
     model = build(scaled(arm_file.load("one_link"), stiffness=stiffness, damping=0.0))
-    control = composite.design(
+    control = design(
         model,
         {"type": "model_following", "kp": [KP], "kv": [KV]},
         {"type": "pole_placement", "damping": [0.3, 0.1]},

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flexarm_control.composite.law import FAST, SLOW, design_law
+from flexarm_control.composite.design import FAST, SLOW, design_law
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import ArmObserver, design_observer
 from flexarm_dynamics import registry

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from flexarm_control.composite.law import SLOW, design_law
+from flexarm_control.composite.design import SLOW, design_law
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
 from flexarm_dynamics.models.model import Terms

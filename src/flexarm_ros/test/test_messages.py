@@ -302,7 +302,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_control.loop.samples import ArmSample
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_studies.loop.metrics import Record, case_study_metrics, linear_metrics
 

@@ -3,7 +3,7 @@
 
 import pytest
 
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models import model

@@ -22,7 +22,7 @@ from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models import model as models
 from flexarm_dynamics.models.model import ArmModel
 
-from . import law as composite
+from .design import design
 from .priority import step_back
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
@@ -103,7 +103,7 @@ def _nothing(model):
 
 
 def _design(model, slow, fast, manifold, settings):
-    return composite.design(model, slow, fast, manifold, settings)
+    return design(model, slow, fast, manifold, settings)
 
 
 def _prepare(model, feedforward, trajectory, start):

@@ -33,9 +33,9 @@ from flexarm_ros.start import leave
 from flexarm_ros.statistics import Latency
 
 from .. import trajectory
-from ..composite import law as composite
+from ..composite import design as composite
+from ..composite.design import FAST, MANIFOLD, PREFIX, SLOW
 from ..composite.design_process import AwayError, DesignProcess
-from ..composite.law import FAST, MANIFOLD, PREFIX, SLOW
 from ..loop import arm_controller
 from ..loop.arm_controller import ArmController
 from ..loop.samples import ArmSample

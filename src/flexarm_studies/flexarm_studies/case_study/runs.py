@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexarm_control import trajectory
-from flexarm_control.composite.law import design
+from flexarm_control.composite.design import design
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model

@@ -5,8 +5,8 @@ from collections import deque
 
 import numpy as np
 
-from flexarm_control.composite.law import PARAMETERS as DESIGN_PARAMETERS
-from flexarm_control.composite.law import design, typed
+from flexarm_control.composite.design import PARAMETERS as DESIGN_PARAMETERS
+from flexarm_control.composite.design import design, typed
 from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.loop.arm_controller import START_TOLERANCE, ArmController
 from flexarm_control.loop.samples import ArmSample

@@ -13,8 +13,8 @@ import numpy as np
 import yaml
 
 from flexarm_control import trajectory
-from flexarm_control.composite.law import FAST, MANIFOLD, SLOW
-from flexarm_control.composite.law import PARAMETERS as DESIGN_PARAMETERS
+from flexarm_control.composite.design import FAST, MANIFOLD, SLOW
+from flexarm_control.composite.design import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.loop.arm_controller import START_TOLERANCE
 from flexarm_control.loop.supervisor import State

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The design of the composite control: its components by name, their parameters, and the checks of the whole."""
+
+from flexarm_dynamics import registry
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import Parameter, check_all
+
+from ..component import make
+from ..feedforward.base import Settings
+from . import full_order
+from .law import CompositeControl
+
+SLOW, FAST, MANIFOLD = "flexarm.slow_laws", "flexarm.fast_laws", "flexarm.manifolds"
+FEEDFORWARD = "flexarm.feedforwards"
+
+#: Prefix of the parameters of each group.
+PREFIX = {SLOW: "slow.", FAST: "fast.", MANIFOLD: "manifold."}
+
+#: Parameters of the whole design.
+PARAMETERS = (
+    Parameter(
+        "feedforward",
+        "string",
+        "model",
+        "Motion that the arm is held to: none, the reference and the slow manifold; model, the nominal arm"
+        " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
+        " end at rest. Or another of the entry-point group flexarm.feedforwards.",
+    ),
+    Parameter(
+        "rate",
+        "float",
+        1000.0,
+        "Samples per second that the driver or simulator sends: what designs are checked at.",
+        unit="Hz",
+        low=1.0,
+        high=20000.0,
+    ),
+    Parameter(
+        "stability_margin",
+        "float",
+        0.0,
+        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this.",
+        unit="1/s",
+        low=-1e3,
+        high=1e3,
+    ),
+)
+
+
+def design_law(group, name, model, values, *known):
+    """Find a law by name, check its parameters and design it.
+
+    Parameters
+    ----------
+    group : str
+        `SLOW`, `FAST` or `MANIFOLD`.
+    name : str
+        As registered.
+    model : ArmModel
+    values : mapping
+        Parameter values without prefix; those of other laws are ignored by the caller, not here.
+    *known
+        What the component is designed for beside the model: the slow law, for a manifold.
+
+    Returns
+    -------
+    SlowLaw, FastLaw or Manifold
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError
+    """
+    return make(group, name, model, values, PREFIX[group], *known)
+
+
+def design(model, slow, fast, manifold=None, settings=None):
+    """Composite control from mappings with the key `type` and the component's parameters.
+
+    Parameters
+    ----------
+    model : ArmModel
+    slow, fast, manifold : mapping
+        ``{"type": "linear_model_following", "kp": [6.25], …}``; no manifold: the paper's.
+    settings : mapping, optional
+        Values of `PARAMETERS`; not given: the paper's design, without feed-forward and unchecked.
+
+    Returns
+    -------
+    CompositeControl
+
+    Raises
+    ------
+    UnknownComponentError, ParameterError, DesignError
+        Nothing is made then.
+    """
+
+    def law(group, given, *known):
+        name, values = typed(given, PREFIX[group][:-1])
+        return design_law(group, name, model, values, *known)
+
+    slow_law, fast_law = law(SLOW, slow), law(FAST, fast)
+    surface = law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law)
+    if settings is None:
+        return CompositeControl(model, slow_law, fast_law, surface)
+    chosen = check_all(PARAMETERS, settings)
+    wanted = chosen["feedforward"]
+    kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
+    q = fast_law.configuration
+    control = CompositeControl(model, slow_law, fast_law, surface)
+    free = slow_law.drifts  # joints that nothing holds have no pole left of zero
+    if not free:
+        full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
+    if kind is None or free or slow_law.learns:
+        return control
+    motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
+    return CompositeControl(model, slow_law, fast_law, surface, motion)
+
+
+def typed(given, prefix):
+    """Split a mapping into its `type` and the parameters.
+
+    `given` is ``{"type": ..., parameters...}``, `prefix` that of its parameters, for the message.
+
+    Raises
+    ------
+    ParameterError
+        Without a type.
+    """
+    values = dict(given)
+    name = values.pop("type", None)
+    if not isinstance(name, str):
+        what = "missing" if name is None else f"{name!r} is not a name"
+        raise ParameterError(f"{prefix}.type: {what}; write the name of a law, none for no control")
+    return name, values
