@@ -128,7 +128,7 @@ def arm(tmp_path_factory):
 
 
 def reference(line):
-    line.recorder.poll()
+    line.poll()
     raw = line.recorder.raw["controller/state"][-1]
     return deserialize_message(raw, CompositeState)
 

@@ -13,7 +13,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.progress import Progress
 
-from .live import PATIENCE, Graph
+from .live import PATIENCE, START_DRIVER
 
 #: Wall time without a new state after which the arm is taken for lost [s].
 SILENCE = 10.0
@@ -60,7 +60,9 @@ def excite(options):
     FlexarmError
         When the arm must not move, no driver answers, or the excitation was stopped; what came before is kept.
     """
-    from ..recording.recorder import write_bag
+    from flexarm_ros.session import Session
+
+    from ..recording.recorder import Recorder, write_bag
 
     if not options.allow_motion:
         raise FlexarmError("this moves the arm: stand clear, and give --allow-motion")
@@ -69,17 +71,16 @@ def excite(options):
         raise FlexarmError(f"--out {out}: exists already")
     out.parent.mkdir(parents=True, exist_ok=True)
     arm_file.load(options.arm)  # refused here, and not in another process's log
-    with Graph(RECORDER, options.namespace) as graph:
-        states = graph.tap.raw["arm_state"]
-        silence = f"no arm_state for {PATIENCE:g} s: start the driver (or simulator)"
-        graph.wait_for(lambda: states, PATIENCE, silence)
-        if graph.tap.publishers("joint_torque"):
+    with Session(RECORDER, namespace=options.namespace) as session:
+        recorder = Recorder(session, ("arm_state", "joint_torque"))
+        session.wait_for("arm_state", lambda: recorder.raw["arm_state"], PATIENCE, START_DRIVER)
+        if session.taps["joint_torque"].publishers():
             raise FlexarmError("a controller sends joint_torque: stop it")
         progress = Progress()
         progress.step(f"shake {options.arm}")
-        said = _run(options, graph)
+        said = _run(options, session)
         progress.done()
-        kept = between(graph.tap.messages(), graph.tap.raw)
+        kept = between(recorder.messages(), recorder.raw)
     if not kept["joint_torque"]:
         raise FlexarmError(f"no torque was sent:\n{said}")
     write_bag(out, kept, options.arm)
@@ -106,7 +107,7 @@ def node_parameters(options):
     return {k: v for k, v in values.items() if v != ""}
 
 
-def _run(options, graph):
+def _run(options, session):
     """Run the node until it says that it has ended; what it said."""
     from ..running.processes import arguments, executable
 
@@ -125,19 +126,13 @@ def _run(options, graph):
         def ended():
             return process.poll() is not None or "excitation complete" in said() or _ending(said())
 
+        states = session.taps["arm_state"].messages
         try:
-            seen = -1
             while not ended():
-                new = len(graph.tap.raw["arm_state"])
-                if new == seen:
+                seen = len(states)
+                if not session.serve(SILENCE, lambda seen=seen: len(states) > seen or ended()):
                     raise FlexarmError(f"no arm_state for {SILENCE:g} s\n{said()}")
-                seen = new
-                graph.wait_for(
-                    lambda seen=seen: len(graph.tap.raw["arm_state"]) > seen or ended(),
-                    SILENCE,
-                    f"no arm_state for {SILENCE:g} s\n{said()}",
-                )
-            graph.tap.poll()
+            session.poll()
         finally:
             process.send_signal(signal.SIGINT)
             try:

@@ -5,7 +5,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
@@ -42,12 +41,6 @@ def keep_for_recording(node):
     return {f"qos_overrides./{topic}.publisher.depth": KEPT for topic in PUBLISHERS[node]}
 
 
-#: Deep enough for a reader that falls behind for seconds.
-DEEP = QoSProfile(
-    history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
-)
-
-
 def raw_stamp_ns(raw):
     """Stamp of a serialised message that begins with a header (CDR, little endian) [ns]."""
     sec, nanosec = struct.unpack_from("<iI", raw, 4)
@@ -55,31 +48,30 @@ def raw_stamp_ns(raw):
 
 
 class Recorder:
-    """Keeps every message of the line, as it came, until it is read.
-
-    `poll` empties the middleware's queues without waking an executor per message: that would take a core
-    from the loop that is recorded.
+    """Collects the serialised messages of an arm's topics until they are read.
 
     Parameters
     ----------
-    node : rclpy.node.Node
-        Which has the subscriptions; its executor must not serve them: `poll` does.
+    session : Session
+        Whose `poll` collects them.
+    topics : sequence of str
+        Of `TOPICS`.
     """
 
-    def __init__(self, node):
-        self.raw = {topic: [] for topic in TOPICS}
-        self._subscriptions = {
-            topic: node.create_subscription(kind, topic, lambda raw: None, DEEP, raw=True)
-            for topic, kind in TOPICS.items()
-        }
+    def __init__(self, session, topics=tuple(TOPICS)):
+        self._taps = {topic: session.tap(TOPICS[topic], topic, raw=True) for topic in topics}
 
-    def poll(self):
-        """Take what has come since the last call."""
-        for topic, subscription in self._subscriptions.items():
-            kept, handle = self.raw[topic], subscription.handle
-            with handle:
-                while (taken := handle.take_message(subscription.msg_type, True)) is not None:
-                    kept.append(taken[0])
+    @property
+    def raw(self):
+        """Topic to the list of serialised messages, in the order of arrival."""
+        return {topic: tap.messages for topic, tap in self._taps.items()}
+
+    def messages(self):
+        """Topic to the list of messages."""
+        return {
+            topic: [deserialize_message(raw, TOPICS[topic]) for raw in tap.messages]
+            for topic, tap in self._taps.items()
+        }
 
     def complete(self):
         """Whether something has come on every topic."""
@@ -88,8 +80,8 @@ class Recorder:
     @property
     def latest_ns(self):
         """Stamp of the newest torque [ns]; 0 before the first."""
-        raw = self.raw["joint_torque"]
-        return raw_stamp_ns(raw[-1]) if raw else 0
+        newest = self._taps["joint_torque"].newest
+        return raw_stamp_ns(newest) if newest else 0
 
     def samples(self, begin_ns, end_ns):
         """One serialised message per stamp and topic: what was sent again is kept once, the last time.
@@ -111,7 +103,7 @@ class Recorder:
         """
         kept = {}
         for topic, messages in self.raw.items():
-            by_stamp = {raw_stamp_ns(raw): bytes(raw) for raw in messages}
+            by_stamp = {raw_stamp_ns(raw): raw for raw in messages}
             kept[topic] = {s: r for s, r in sorted(by_stamp.items()) if begin_ns <= s <= end_ns}
         stamps = set().union(*kept.values())
         for topic, messages in kept.items():

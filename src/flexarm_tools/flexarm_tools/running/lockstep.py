@@ -4,17 +4,14 @@
 import time
 from dataclasses import dataclass
 
-import rclpy
 from builtin_interfaces.msg import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from flexarm_msgs.msg import CompositeState
-from flexarm_ros import qos
 from flexarm_ros.messages import set_stamp
+from flexarm_ros.session import Session, WaitError
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 
 from ..recording.recorder import Recorder, raw_stamp_ns
@@ -64,50 +61,29 @@ class Timing:
         return self.wall_seconds / self.samples
 
 
-class LockstepRun:
-    """Talks to three running nodes: trajectory, start, recording.
+class LockstepRun(Session):
+    """A session with three running nodes: trajectory, start, recording.
 
     Parameters
     ----------
     processes : Processes
         With simulator (``lockstep``), observer and controller started.
     patience : float
-        Longest wait for any one thing [s].
+        Timeout of a single wait [s].
     """
 
     #: Between two looks at the recording [s].
     POLL_PERIOD = 0.005
 
     def __init__(self, processes, patience=60.0):
-        self.processes, self.patience = processes, patience
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=processes.domain)
-        quiet = {"start_parameter_services": False, "enable_rosout": False}
-        self.node = Node("case_study", context=self.context, **quiet)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self._recording = Node("recorder", context=self.context, **quiet)
-        self.recorder = Recorder(self._recording)
-        self._trajectory = self.node.create_publisher(
-            JointTrajectory, "joint_trajectory", qos.COMMAND
+        super().__init__(
+            "case_study",
+            domain=processes.domain,
+            processes=processes,
+            patience=patience,
+            period=0.02,
         )
-        self._pause = self.node.create_client(SetBool, "simulator/pause")
-
-    def wait_for(self, what, condition):
-        """Serve the executor until `condition` holds.
-
-        Raises
-        ------
-        ProcessError
-            Naming `what`, after `patience` seconds of wall time, or when a process has ended.
-        """
-        end = time.monotonic() + self.patience
-        while not condition():
-            self.executor.spin_once(timeout_sec=0.02)
-            self.recorder.poll()
-            self.processes.check()
-            if time.monotonic() > end:
-                raise ProcessError(f"waited {self.patience:g} s in vain for {what}")
+        self.processes, self.recorder = processes, Recorder(self)
 
     def controller_state(self):
         """The newest `controller/state`."""
@@ -132,20 +108,18 @@ class LockstepRun:
     def offer(self, message):
         """Publish a trajectory and wait until it is accepted."""
         before = self.accepted()
-        self.wait_for("the controller", lambda: self._trajectory.get_subscription_count() > 0)
-        self._trajectory.publish(message)
+        self.publisher(JointTrajectory, "joint_trajectory", readers=1).publish(message)
         try:
             self.wait_for("the trajectory to be accepted", lambda: self.accepted() > before)
-        except ProcessError as error:
-            raise ProcessError(f"{error}: {self.controller_state().rejected_reason}") from None
+        except WaitError as error:
+            reason = self.controller_state().rejected_reason
+            raise ProcessError(f"the trajectory was not accepted: {reason}\n{error}") from None
 
     def pause(self, paused):
         """Call the simulator's `~/pause`."""
-        self.wait_for("the service simulator/pause", self._pause.service_is_ready)
-        future = self._pause.call_async(SetBool.Request(data=paused))
-        self.wait_for("an answer of simulator/pause", future.done)
-        if not future.result().success:
-            raise ProcessError(f"simulator/pause: {future.result().message}")
+        answer = self.call(SetBool, "simulator/pause", data=paused)
+        if not answer.success:
+            raise ProcessError(f"simulator/pause: {answer.message}")
 
     def run(self, message, duration, progress=lambda fraction: None):
         """Offer a trajectory at `TRAJECTORY_START_NS`, run `duration` seconds beyond its start, and record.
@@ -168,7 +142,7 @@ class LockstepRun:
         newest = 0
         while recorder.latest_ns < end:
             time.sleep(self.POLL_PERIOD)
-            recorder.poll()
+            self.poll()
             now = time.monotonic()
             if now - last_check > 0.2:
                 last_check = now
@@ -192,16 +166,3 @@ class LockstepRun:
         state = self.controller_state()
         if state.supervisor_state == CompositeState.FAULT:
             raise ProcessError(f"the controller is in fault: {state.rejected_reason}")
-
-    def close(self):
-        """Leave the graph."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self._recording.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()

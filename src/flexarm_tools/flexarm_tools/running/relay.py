@@ -164,7 +164,7 @@ def measure(arm, log_directory, count=3000, recorder=None):
                 source = processes.start_module("relay_source", __name__, "source", arm, str(count))
                 while source.poll() is None:
                     time.sleep(listener.POLL_PERIOD)
-                    listener.recorder.poll()
+                    listener.poll()
         del processes.running["relay_source"]
         return float(processes.log("relay_source").split()[-1])
 
