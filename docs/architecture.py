@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws architecture.svg and lists the modules of architecture.md, both from the sources' imports and docstrings."""
+"""Draws architecture.svg and lists the modules in architecture.md, from the sources' imports and docstrings."""
 
 import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -14,13 +15,21 @@ from flexarm_studies.markdown import write_between
 
 HERE = Path(__file__).resolve().parent
 SOURCE = HERE.parent / "src"
-PACKAGES = (
-    "flexarm_dynamics", "flexarm_msgs", "flexarm_ros", "flexarm_sim", "flexarm_control", "flexarm_studies",
-    "flexarm_tools", "flexarm_bringup",
-)  # fmt: skip
+#: Column and row of each package in the drawing. Column 2 is that of the packages with ROS.
+PLACES = {
+    "flexarm_dynamics": (0.5, 0), "flexarm_msgs": (2, 0),
+    "flexarm_control": (0, 1), "flexarm_sim": (1, 1), "flexarm_ros": (2, 1),
+    "flexarm_studies": (0.5, 2), "flexarm_tools": (2, 2),
+    "flexarm_bringup": (2, 3),
+}  # fmt: skip
+PACKAGES = tuple(PLACES)
 BEGIN, END = "<!-- modules: begin -->", "<!-- modules: end -->"
-#: Size of a box, distance of boxes and of rows of them, height of a line of text [drawing units].
-WIDTH, LINE, GAP, ROW = 3.2, 0.26, 0.9, 0.95
+#: Width of a box, distance of columns, height of a line of text, distance of rows [in].
+WIDTH, PITCH, LINE, ROW = 2.1, 2.5, 0.19, 0.5
+WITHOUT, WITH = (
+    ("#34526f", "#eaf1f8"),
+    ("#9a5b13", "#fdf1e0"),
+)  # edge and face, without ROS and with it
 
 
 def modules():
@@ -32,12 +41,15 @@ def modules():
 
 
 def part(path):
-    """Folder of a module within its package, empty for the package itself: what the drawing has a line for."""
+    """Folder of a module within its package; empty for the package itself."""
     return path.parts[1] if len(path.parts) > 2 else ""
 
 
 def imports():
-    """How many modules of a part of a package import another package: {(package, part, package): count}."""
+    """Count the modules of a part of a package that import another package: {(package, part, package): count}.
+
+    Modules that are loaded by their names in strings count, too: the command line does so.
+    """
     found = Counter()
     for package, paths in modules().items():
         for path in paths:
@@ -53,18 +65,27 @@ def imports():
                 for node in ast.walk(tree)
                 if isinstance(node, ast.ImportFrom) and not node.level and node.module
             }
+            names |= {
+                node.value
+                for node in ast.walk(tree)
+                if isinstance(node, ast.Constant)
+                and re.fullmatch(r"flexarm_\w+(\.\w+)+", str(node.value))
+            }
             for other in {name.split(".")[0] for name in names} & set(PACKAGES) - {package}:
                 found[package, part(path), other] += 1
     return found
 
 
-def levels(needs):
-    """Row of each package: one above the highest that it imports."""
+def direct(needs):
+    """Leave out the imports that a longer way implies: {package: packages}."""
 
-    def level(package):
-        return 1 + max((level(other) for other in needs[package]), default=-1)
+    def below(package):
+        return needs[package].union(*(below(other) for other in needs[package]))
 
-    return {package: level(package) for package in needs}
+    return {
+        package: others - set().union(*(below(other) for other in others))
+        for package, others in needs.items()
+    }
 
 
 def labels(package):
@@ -76,51 +97,77 @@ def labels(package):
 
 
 def draw(file):
-    """Packages as boxes with their folders, in rows by what they import; thin arrows: their nodes alone do."""
+    """Draw packages as boxes with their folders, and who imports whom; what another arrow implies is left out."""
     found = imports()
-    needs = {p: {other for of, _, other in found if of == p} for p in PACKAGES}
-    rows = levels(needs)
-    figure, axes = plt.subplots(figsize=(10.0, 7.2))
-    boxes, bottom = {}, 0.0
-    for row in range(max(rows.values()) + 1):
-        here = [p for p in PACKAGES if rows[p] == row]
-        height = max(LINE * (len(labels(p)) + 1.6) for p in here)
-        left = -0.5 * (len(here) * (WIDTH + GAP) - GAP)
-        for i, package in enumerate(here):
-            boxes[package] = left + i * (WIDTH + GAP), bottom, height
-        bottom += height + ROW
-    for package, (left, low, height) in boxes.items():
-        axes.add_patch(
-            plt.Rectangle((left, low), WIDTH, height, fc="#eef3f8", ec="#34526f", lw=1.2, zorder=2)
-        )
-        axes.text(left + 0.12, low + height - 0.27, package, weight="bold", size=10, zorder=3)
-        for i, text in enumerate(labels(package)):
-            axes.text(
-                left + 0.3, low + height - 0.27 - LINE * (i + 1), text, size=8, color="#444444"
-            )
-    for package, others in needs.items():
-        for other in others:
-            core = any(
-                of == package and to == other and where != "nodes" for of, where, to in found
-            )
-            x0, y0, _ = boxes[package]
-            x1, y1, height = boxes[other]
-            axes.annotate(
-                "", (x1 + 0.5 * WIDTH + 0.12 * (x0 - x1), y1 + height), (x0 + 0.5 * WIDTH + 0.12 * (x1 - x0), y0),
-                arrowprops={"arrowstyle": "-|>", "color": "#34526f", "lw": 1.6 if core else 0.8,
-                            "ls": "-" if core else "--", "connectionstyle": "arc3,rad=0.06"}, zorder=1,
-            )  # fmt: skip
-    axes.set_title("Who imports whom; dashed: the nodes alone", size=10, loc="left")
-    axes.autoscale_view()
-    axes.set_aspect("equal")
+    every = {p: {to for of, _, to in found if of == p} for p in PACKAGES}
+    core = {p: {to for of, part, to in found if of == p and part != "nodes"} for p in PACKAGES}
+    short, plain = direct(every), direct(core)
+    lines = {p: labels(p) for p in PACKAGES}
+    bottoms, top = [], 0.0
+    for row in range(1 + max(row for _, row in PLACES.values())):
+        bottoms.append(top)
+        top += LINE * (2.2 + max(len(lines[p]) for p in PACKAGES if PLACES[p][1] == row)) + ROW
+    figure = plt.figure(figsize=(3 * PITCH, top))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(-0.2, 3 * PITCH - 0.2), ylim=(-0.1, top - 0.1))
     axes.axis("off")
+    boxes = {}  # left, bottom, height
+    for package, (column, row) in PLACES.items():
+        left, low = PITCH * column, bottoms[row]
+        height = LINE * (2.0 + len(lines[package]))
+        boxes[package] = left, low, height
+        edge, face = WITH if column == 2 else WITHOUT
+        axes.add_patch(
+            plt.Rectangle((left, low), WIDTH, height, fc=face, ec=edge, lw=1.2, zorder=2)
+        )
+        style = {"va": "top", "zorder": 3}
+        axes.text(
+            left + 0.1, low + height - 0.08, package, weight="bold", size=10, color=edge, **style
+        )
+        for i, text in enumerate(lines[package], start=1):
+            colour = WITH[0] if text.startswith("nodes/") else "#444444"
+            at = low + height - 0.12 - LINE * i
+            axes.text(left + 0.2, at, text, size=8.5, color=colour, **style)
+    for package in PACKAGES:
+        for other in plain[package]:
+            _arrow(axes, boxes[package], boxes[other], "-")
+        for other in short[package] - core[package]:
+            _arrow(axes, boxes[package], boxes[other], "--")
+    axes.text(
+        0, top - 0.3, "blue: without ROS      brown: with ROS      dashed: nodes/ only", size=8.5
+    )
     matplotlib.rcParams |= {"svg.hashsalt": "flexarm", "svg.fonttype": "none"}
-    figure.savefig(file, bbox_inches="tight", metadata={"Date": None})
+    figure.savefig(file, metadata={"Date": None} if str(file).endswith("svg") else None)
     plt.close(figure)
 
 
+def _arrow(axes, box, target, line):
+    """Draw an arrow from a box to one beside it or below it."""
+    (x, y, height), (left, low, tall) = box, target
+    lean = max(-0.8, min(0.8, 0.3 * (left - x)))
+    if y == low:  # from the side that faces the target, over what stands between them
+        near = abs(left - x) < 2 * PITCH
+        start = (
+            x + (WIDTH if left > x else 0.0),
+            y + 0.5 * min(height, tall) if near else y + 0.75 * height,
+        )
+        end = (left + (0.0 if left > x else WIDTH), start[1]) if near else (left + 0.3, low + tall)
+    else:
+        start, end = (x + 0.5 * WIDTH + lean, y), (left + 0.5 * WIDTH - lean, low + tall)
+    width = 1.4 if line == "-" else 0.9
+    style = {
+        "arrowstyle": "-|>",
+        "color": "#34526f",
+        "lw": width,
+        "ls": line,
+        "shrinkA": 0,
+        "shrinkB": 0,
+    }
+    axes.annotate("", end, start, arrowprops=style, zorder=4)
+
+
 def table():
-    """A list of all modules, with the first line of what each says of itself."""
+    """Return a list of all modules with the first line of each docstring."""
     lines = []
     for package, paths in modules().items():
         if not paths:
@@ -141,7 +188,7 @@ def table():
 
 
 def main():
-    """Write both."""
+    """Write the list and the drawing."""
     write_between(HERE / "architecture.md", BEGIN, END, f"\n{table()}")
     draw(HERE / "architecture.svg")
 
