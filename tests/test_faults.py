@@ -47,20 +47,20 @@ def source(line):
 
 #: What is changed in a good state, what the reason in controller/state says, what the observer logs.
 BAD_STATES = {
-    "NaN position": ({"joint_position": [NAN]}, "joint_position of joint1 is nan"),
-    "inf position": ({"joint_position": [INF]}, "joint_position of joint1 is inf"),
-    "huge position": ({"joint_position": [1e9]}, "joint_position of joint1 is 1000000000.0"),
+    "NaN position": ({"joint_position": [NAN]}, "joint_position of joint1: nan"),
+    "inf position": ({"joint_position": [INF]}, "joint_position of joint1: inf"),
+    "huge position": ({"joint_position": [1e9]}, "joint_position of joint1: 1000000000.0"),
     "two positions": ({"joint_position": [0.0, 0.0]}, "joint_position has 2 values for 1 names"),
     "no position": ({"joint_position": []}, "joint_position is empty"),
-    "NaN velocity": ({"joint_velocity": [NAN]}, "joint_velocity of joint1 is nan"),
+    "NaN velocity": ({"joint_velocity": [NAN]}, "joint_velocity of joint1: nan"),
     "two velocities": ({"joint_velocity": [0.0, 0.0]}, "joint_velocity has 2 values for 1 names"),
     "two torques": ({"joint_torque": [0.0, 0.0]}, "joint_torque has 2 values for 1 names"),
     "wrong joint": ({"joint_names": ["elbow"]}, "missing joint1; unknown elbow"),
     "no joint names": ({"joint_names": []}, "missing joint1"),
     "joint twice": ({"joint_names": ["joint1", "joint1"]}, "joint_names .*a name twice"),
-    "NaN amplitude": ({"modal_amplitude": [NAN, 0.0]}, "modal_amplitude of link1_y_mode1 is nan"),
-    "inf amplitude": ({"modal_amplitude": [0.0, -INF]}, "modal_amplitude of link1_y_mode2 is -inf"),
-    "huge amplitude": ({"modal_amplitude": [0.0, 1e8]}, "modal_amplitude of link1_y_mode2 is 1"),
+    "NaN amplitude": ({"modal_amplitude": [NAN, 0.0]}, "modal_amplitude of link1_y_mode1: nan"),
+    "inf amplitude": ({"modal_amplitude": [0.0, -INF]}, "modal_amplitude of link1_y_mode2: -inf"),
+    "huge amplitude": ({"modal_amplitude": [0.0, 1e8]}, "modal_amplitude of link1_y_mode2: 1"),
     "one amplitude": ({"modal_amplitude": [0.0]}, r"modal_amplitude has \d values for 2 names"),
     "three amplitudes": ({"modal_amplitude": [0.0] * 3}, r"modal_amplitude has \d values for 2"),
     "wrong mode": (
@@ -75,7 +75,7 @@ BAD_STATES = {
         {"strain": [], "modal_amplitude": []},
         "neither strain nor modal_amplitude",
     ),
-    "NaN rate": ({"modal_rate": [NAN, 0.0]}, "modal_rate of link1_y_mode1 is nan"),
+    "NaN rate": ({"modal_rate": [NAN, 0.0]}, "modal_rate of link1_y_mode1: nan"),
 }
 
 
@@ -103,7 +103,7 @@ def test_a_bad_state_is_a_fault_with_a_reason_until_recover_is_called(source, ca
 
 def test_bad_joints_are_named_in_controller_state_too(source):
     _, state = source.step(joint_position=[NAN])
-    assert "joint_position of joint1 is nan" in state.rejected_reason
+    assert "joint_position of joint1: nan" in state.rejected_reason
     source.recover()
     _, state = source.step(joint_names=["elbow"])
     assert "missing joint1; unknown elbow" in state.rejected_reason

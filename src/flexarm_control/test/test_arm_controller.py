@@ -255,10 +255,10 @@ def test_with_synchronised_clocks_an_old_state_or_one_of_the_future_is_a_fault(a
 # --------------------------------------------------------------------------- unusable samples
 
 BAD = {
-    "joint_position of joint1 is nan": {"position": np.nan},
-    "joint_velocity of joint1 is inf": {"velocity": [np.inf]},
-    "modal_amplitude of link1_y_mode2 is nan": {"amplitude": [0.0, np.nan]},
-    "modal_rate of link1_y_mode1 is -2000000.0": {"rate": [-2e6, 0.0]},
+    "joint_position of joint1: nan": {"position": np.nan},
+    "joint_velocity of joint1: inf": {"velocity": [np.inf]},
+    "modal_amplitude of link1_y_mode2: nan": {"amplitude": [0.0, np.nan]},
+    "modal_rate of link1_y_mode1: -2000000.0": {"rate": [-2e6, 0.0]},
     "modal_amplitude is not known yet": {"amplitude": None},
     "modal_rate is not known yet": {"rate": None},
 }
@@ -458,7 +458,7 @@ def test_a_trajectory_is_refused_after_a_disable_saying_why(arm_r):
     core.step(sample(1, np.nan))
     verdict = core.offer(motion())
     assert not verdict.accepted
-    assert "in fault, call ~/recover first: joint_position of joint1 is nan" in verdict.reason
+    assert "in fault, call ~/recover first: joint_position of joint1: nan" in verdict.reason
     core.recover()
     assert "no valid state: none yet" in core.offer(motion()).reason
 

@@ -132,5 +132,8 @@ def check_finite(values, names, field):
         return  # so is every usable sample, and one product costs a third of what follows
     if not np.abs(values).max(initial=0.0) < MAX_MEASUREMENT:  # false for NaN too
         i = int(np.argmin(np.abs(values) < MAX_MEASUREMENT))
-        problem, field = "is not a usable measurement", f"{field} of {names[i]}"
-        raise MessageError(problem, field=field, value=float(values[i]), limit=MAX_MEASUREMENT)
+        value, where = float(values[i]), f"{field} of {names[i]}"
+        if not np.isfinite(value):
+            raise MessageError("is not finite", field=where, value=value)
+        problem = "is beyond what an arm measures"
+        raise MessageError(problem, field=where, value=value, limit=MAX_MEASUREMENT)

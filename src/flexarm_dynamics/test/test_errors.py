@@ -66,11 +66,11 @@ def test_an_error_travels_whole(kind):
     assert type(again) is kind and vars(again) == vars(made) and str(again) == str(made)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e6, -1e200])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e6, -1e12])
 def test_a_measurement_that_is_none_is_refused_with_its_joint(bad):
     check_finite(np.array([9.9e5, -9.9e5]), ("a", "b"), "joint_position")
     with pytest.raises(MessageError) as error:
         check_finite(np.array([1.0, bad, np.nan]), ("a", "b", "c"), "joint_position")
     assert error.value.field == "joint_position of b"
     np.testing.assert_equal(error.value.value, bad)
-    assert error.value.limit == errors.MAX_MEASUREMENT
+    assert error.value.limit == (errors.MAX_MEASUREMENT if np.isfinite(bad) else None)
