@@ -13,21 +13,15 @@ import select
 import sys
 import time
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
-from flexarm_ros import qos
+from flexarm_ros.session import Session
 
 NODES = ("simulator", "observer", "controller")
-#: Reliable; deep enough for a witness that falls behind for seconds.
-DEEP = QoSProfile(depth=20_000)
 
 
 def _diagnostics(message):
@@ -41,14 +35,6 @@ def _trajectory(goal, duration):
         positions=[goal], velocities=[0.0], accelerations=[0.0], time_from_start=when
     )
     return JointTrajectory(joint_names=["joint1"], points=[end])
-
-
-def _taken(subscription):
-    """What has come on a topic, in order."""
-    handle = subscription.handle
-    with handle:
-        while (taken := handle.take_message(subscription.msg_type, False)) is not None:
-            yield taken[0]
 
 
 #: Topic to type and to what is of interest in a message; nothing is said of a message without.
@@ -71,39 +57,33 @@ TOPICS = {
 
 def main():
     """Until standard input ends."""
-    rclpy.init()
-    quiet = {"start_parameter_services": False, "enable_rosout": False}
-    node, tapping = Node("witness", **quiet), Node("witness_taps", **quiet)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)  # not the other, whose messages are taken here
-    taps = {
-        topic: tapping.create_subscription(kind, topic, lambda message: None, DEEP)
-        for topic, (kind, _) in TOPICS.items()
-    }
-    mover = node.create_publisher(JointTrajectory, "joint_trajectory", qos.COMMAND)
-    recover = node.create_client(Trigger, "controller/recover")
+    with Session("witness") as session:
+        for topic, (kind, _) in TOPICS.items():
+            session.tap(kind, topic)
+        mover = session.publisher(JointTrajectory, "joint_trajectory")
 
-    def obey(name, *arguments):
-        if name == "move":
-            mover.publish(_trajectory(*arguments))
-        elif recover.service_is_ready():
-            recover.call_async(Trigger.Request())
+        recovery = None
 
-    while True:
-        if select.select([sys.stdin], [], [], 0.005)[0]:
-            line = sys.stdin.readline()
-            if not line:
-                break
-            obey(*json.loads(line))
-        executor.spin_once(timeout_sec=0.0)
-        for topic, tap in taps.items():
-            for message in _taken(tap):
-                if told := TOPICS[topic][1](message):
-                    print(json.dumps([topic, time.monotonic(), told]))
-        sys.stdout.flush()
-    node.destroy_node()
-    tapping.destroy_node()
-    rclpy.try_shutdown()
+        def obey(name, *arguments):
+            nonlocal recovery
+            if name == "move":
+                mover.publish(_trajectory(*arguments))
+            elif recovery is None or recovery.answer is not None:
+                recovery = session.ask(Trigger, "controller/recover")
+
+        while True:
+            if select.select([sys.stdin], [], [], 0.005)[0]:
+                line = sys.stdin.readline()
+                if not line:
+                    break
+                obey(*json.loads(line))
+            session.serve(0.001)
+            for topic, tap in session.taps.items():
+                for message in tap.messages:
+                    if interesting := TOPICS[topic][1](message):
+                        print(json.dumps([topic, time.monotonic(), interesting]))
+                tap.messages.clear()
+            sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -31,4 +31,6 @@ def test_a_drive_that_ignores_torque_fails_and_is_told_so(bench, tmp_path):
 def test_without_a_driver_it_says_so(bench):
     code, said = check_driver(bench, "--timeout", "0.2")
     assert code == 1
-    assert said.startswith("flexarm check_driver: no arm_state for 0.2 s: start the driver")
+    assert said.startswith(
+        "flexarm check_driver: waited 0.2 s in vain for arm_state; start the driver"
+    )

@@ -94,17 +94,11 @@ OPEN = {
 class Chain:
     """One loop or relay on a domain of its own, paused between windows."""
 
-    #: Longest wait for any one thing [s].
+    #: Timeout of a single wait [s].
     PATIENCE = 180.0
 
     def __init__(self, stack, name, case, directory, relay_spin):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
-        from std_srvs.srv import SetBool
-        from trajectory_msgs.msg import JointTrajectory
-
-        from flexarm_ros import qos
+        from flexarm_ros.session import Session
         from flexarm_tools.running.processes import Processes, own_domain
 
         self.name, self.case = name, case
@@ -112,19 +106,17 @@ class Chain:
             Processes(stack.enter_context(own_domain()), directory / name)
         )
         self._start(relay_spin)
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=self.processes.domain)
-        stack.callback(rclpy.try_shutdown, context=self.context)
-        quiet = {"start_parameter_services": False, "enable_rosout": False}
-        self.node = Node("latency", context=self.context, **quiet)
-        stack.callback(self.node.destroy_node)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        stack.callback(self.executor.shutdown)
-        self._pause = self.node.create_client(SetBool, "simulator/pause")
-        self._trajectory = self.node.create_publisher(
-            JointTrajectory, "joint_trajectory", qos.COMMAND
+        self.session = stack.enter_context(
+            Session(
+                "latency",
+                domain=self.processes.domain,
+                processes=self.processes,
+                patience=self.PATIENCE,
+                period=0.05,
+            )
         )
+        self.session.ask_again = self.PATIENCE  # a design takes long, and is to be made once
+        self.wait_for = self.session.wait_for
 
     def _start(self, relay_spin):
         from flexarm_tools.running.processes import arguments
@@ -142,22 +134,12 @@ class Chain:
                 given = {"arm": case.arm, "rate": case.rate, **OPEN}
                 start(role, timed, role, *arguments(given, file))
 
-    def wait_for(self, what, condition):
-        """Serve the executor until `condition` holds."""
-        from flexarm_tools.running.processes import ProcessError
-
-        end = time.monotonic() + self.PATIENCE
-        while not (value := condition()):
-            self.executor.spin_once(timeout_sec=0.05)
-            self.processes.check()
-            if time.monotonic() > end:
-                raise ProcessError(f"{self.name}: waited {self.PATIENCE:g} s in vain for {what}")
-        return value
-
     def get_ready(self):
         """Wait for the nodes; the first calls, which load code, are not measured."""
         for topic in ("arm_state", "arm_state_estimate", "joint_torque"):
-            self.wait_for(f"who publishes {topic}", lambda t=topic: self.node.count_publishers(t))
+            self.wait_for(
+                f"a publisher of {topic}", lambda t=topic: self.session.node.count_publishers(t)
+            )
         wanted = "latencies" if self.name == "relay" else "enabled"
         self.wait_for("a torque", lambda: self.window(0.2)[wanted])
 
@@ -165,32 +147,28 @@ class Chain:
         """Call the simulator's `~/pause`."""
         from std_srvs.srv import SetBool
 
-        self.wait_for("simulator/pause", self._pause.service_is_ready)
-        future = self._pause.call_async(SetBool.Request(data=paused))
-        self.wait_for("an answer of simulator/pause", future.done)
+        self.session.call(SetBool, "simulator/pause", data=paused)
 
     def offer(self, duration):
         """Have the loop begin a motion of this duration [s] with its next window."""
+        from trajectory_msgs.msg import JointTrajectory
+
         from flexarm_control.motions.profiles import quintic
         from flexarm_msgs.msg import CompositeState
-        from flexarm_ros import qos
         from flexarm_tools.running.lockstep import trajectory_message
 
-        states = []
-        listener = self.node.create_subscription(
-            CompositeState, "controller/state", states.append, qos.LINE
-        )
+        states = self.session.tap(CompositeState, "controller/state").messages
         self.wait_for("the controller to be ready", lambda: any(s.supervisor_state for s in states))
-        self.wait_for("the controller", self._trajectory.get_subscription_count)
         joints = arm_file.load(self.case.arm).joint_names
         profile = quintic(np.array(self.case.begin), np.array(self.case.end), duration)
-        self._trajectory.publish(trajectory_message(joints, profile))
+        publisher = self.session.publisher(JointTrajectory, "joint_trajectory", readers=1)
+        publisher.publish(trajectory_message(joints, profile))
         del states[:]
         self.wait_for(
             "the motion to be accepted",
             lambda: any(s.accepted_trajectory_id for s in states[-3:]),
         )
-        self.node.destroy_subscription(listener)
+        self.session.untap("controller/state")
 
     def window(self, seconds):
         """Let it run for a while; what the simulator found."""

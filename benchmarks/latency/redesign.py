@@ -66,23 +66,20 @@ class Setter:
     """Sets parameters of the controller of a chain, one answer after the other."""
 
     def __init__(self, chain, case):
-        from rcl_interfaces.srv import SetParametersAtomically
-
         self.chain, self.answers = chain, []
-        self._client = chain.node.create_client(
-            SetParametersAtomically, "controller/set_parameters_atomically"
-        )
-        self._request = SetParametersAtomically.Request
         self._values = {what: itertools.cycle(all_) for what, all_ in values_of(case).items()}
-        chain.wait_for("the controller's parameters", self._client.service_is_ready)
 
     def set(self, what):
-        """Ask for `ALPHA` or `GRID`; the future of the answer."""
-        from rclpy.parameter import Parameter
+        """Ask for `ALPHA` or `GRID`; the `Question`."""
+        from rcl_interfaces.srv import SetParametersAtomically
 
-        values = next(self._values[what])
-        wanted = [Parameter(k, value=v).to_parameter_msg() for k, v in values.items()]
-        return self._client.call_async(self._request(parameters=wanted))
+        from flexarm_ros.session import parameter_messages
+
+        return self.chain.session.ask(
+            SetParametersAtomically,
+            "controller/set_parameters_atomically",
+            parameters=parameter_messages(next(self._values[what])),
+        )
 
     def window(self, what):
         """One window with `what` set once in a while; what the simulator found."""
@@ -94,7 +91,7 @@ class Setter:
             if what != NOTHING and now >= due:
                 self._take(answer)
                 answer, due = self.set(what), now + EVERY
-            chain.executor.spin_once(timeout_sec=0.05)
+            chain.session.serve(0.05)
         self._take(answer)
         chain.pause(True)
         if what != NOTHING:
@@ -103,14 +100,12 @@ class Setter:
 
     def _wait_for_design(self):
         """Let what is still being designed end, with the machine to itself: the next window is to be without."""
-        end = time.monotonic() + REST
-        while time.monotonic() < end:
-            self.chain.executor.spin_once(timeout_sec=0.05)
+        self.chain.session.serve(REST)
 
     def _take(self, answer):
         if answer is not None:
-            self.chain.wait_for("parameters to be set", answer.done)
-            self.answers.append(answer.result().result)
+            self.chain.wait_for("parameters to be set", answer.poll)
+            self.answers.append(answer.answer.result)
 
 
 def measure(case, rounds, fraction=lambda done: None):

@@ -26,8 +26,6 @@ DEEP = QoSProfile(
 LOOKING_ON = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT
 )
-#: A request is sent again after this time [s]: a server that has not discovered the client yet drops its answer.
-ASK_AGAIN = 3.0
 
 
 class WaitError(FlexarmError):
@@ -92,6 +90,10 @@ class Tap:
         """The last message; None before the first."""
         return self.messages[-1] if self.messages else None
 
+    def close(self, node):
+        """Unsubscribe."""
+        node.destroy_subscription(self._subscription)
+
     def publishers(self):
         """Number of publishers of the topic."""
         return self._subscription.get_publisher_count()
@@ -131,6 +133,8 @@ class Question:
     request : object
     then : callable, optional
         Called with the answer.
+    again : float
+        Time after which the request is sent again [s].
 
     Attributes
     ----------
@@ -138,9 +142,9 @@ class Question:
         None before it arrives.
     """
 
-    def __init__(self, client, request, then=None):
+    def __init__(self, client, request, then=None, again=3.0):
         self._client, self._request, self._then = client, request, then
-        self._futures, self._again = [], 0.0
+        self._futures, self._every, self._again = [], again, 0.0
         self.answer = None
 
     def poll(self):
@@ -153,7 +157,7 @@ class Question:
                 if self._then is not None:
                     self._then(self.answer)
             elif time.monotonic() > self._again and self._client.service_is_ready():
-                self._again = time.monotonic() + ASK_AGAIN
+                self._again = time.monotonic() + self._every
                 self._futures.append(self._client.call_async(self._request))
         return self.answer is not None
 
@@ -178,7 +182,15 @@ class Session:
         Timeout of a wait that names none [s].
     period : float
         Time between two looks at the taps and at the condition that is waited for [s].
+
+    Attributes
+    ----------
+    ask_again : float
+        Time after which a request without an answer is sent again [s]: a server that has not discovered the client
+        yet drops its answer.
     """
+
+    ask_again = 3.0
 
     def __init__(
         self,
@@ -277,6 +289,10 @@ class Session:
             self._taps[topic] = Tap(self.node, kind, topic, raw)
         return self._taps[topic]
 
+    def untap(self, topic):
+        """Stop collecting a topic."""
+        self._taps.pop(topic).close(self.node)
+
     @property
     def taps(self):
         """All taps, by topic."""
@@ -285,7 +301,7 @@ class Session:
     def publisher(self, kind, topic, readers=0, profile=qos.COMMAND):
         """The publisher of a topic, once `readers` subscriptions have discovered it.
 
-        Reliable and volatile as ``ros2 topic pub``'s, if no profile is given.
+        `kind` is the type of the messages; without a profile it is reliable and volatile, as ``ros2 topic pub``'s.
         """
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(kind, topic, profile)
@@ -298,7 +314,7 @@ class Session:
     # Services --------------------------------------------------------------------------------
 
     def ask(self, kind, service, /, then=None, **request):
-        """Send a request without waiting; ``then(answer)`` is called while this session serves.
+        """Send a request of a `kind` to a `service` without waiting; ``then(answer)`` is called while serving.
 
         Returns
         -------
@@ -306,13 +322,13 @@ class Session:
         """
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
-        question = Question(self._clients[service], kind.Request(**request), then)
+        question = Question(self._clients[service], kind.Request(**request), then, self.ask_again)
         self._questions.append(question)
         question.poll()
         return question
 
     def call(self, kind, service, /, **request):
-        """Send a request and wait for its answer."""
+        """Send a request of a `kind` to a `service` and wait for its answer."""
         question = self.ask(kind, service, **request)
         try:
             self.wait_for(f"an answer of the service {service}", question.poll)

@@ -77,6 +77,8 @@ def test_taps_collect_in_order_and_latest_keeps_the_newest(session):
     assert deserialize_message(raw.newest, String).data == "4"
     assert latest.take().data == "4"
     assert latest.take() is None
+    session.untap("words")
+    assert list(session.taps) == ["raw_words"]
 
 
 def test_a_service_is_called_and_asked_without_waiting(session):

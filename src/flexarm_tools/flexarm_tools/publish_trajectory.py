@@ -5,7 +5,6 @@ import argparse
 import json
 import math
 import sys
-import time
 
 import numpy as np
 
@@ -213,44 +212,6 @@ def _of(limit):
     return "" if limit is None else f" of {limit:g}"
 
 
-class _Conversation:
-    """A node that publishes trajectories and hears what the controller makes of them."""
-
-    def __init__(self, options, ros_args):
-        import rclpy
-        from trajectory_msgs.msg import JointTrajectory
-
-        from flexarm_msgs.msg import CompositeState
-        from flexarm_ros import qos
-
-        self.timeout = options.timeout
-        self.context = rclpy.Context()
-        rclpy.init(args=ros_args, context=self.context)
-        self.node = rclpy.create_node("publish_trajectory", context=self.context)
-        self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.publisher = self.node.create_publisher(JointTrajectory, options.topic, qos.COMMAND)
-        self.state = None
-        self.node.create_subscription(CompositeState, "controller/state", self._hear, qos.LINE)
-
-    def _hear(self, msg):
-        self.state = msg
-
-    def wait_for(self, condition, otherwise):
-        """Serve callbacks until `condition` holds; raise a FlexarmError with `otherwise` when it does not."""
-        end = time.monotonic() + self.timeout
-        while not condition():
-            self.executor.spin_once(timeout_sec=0.05)
-            if time.monotonic() > end:
-                raise FlexarmError(otherwise)
-
-    def close(self):
-        import rclpy
-
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
 def publish(options, ros_args=None):
     """Publish once, with stamp 0 (now), to a controller that is there; say what became of it.
 
@@ -266,6 +227,11 @@ def publish(options, ros_args=None):
     if options.dry_run or options.out:
         prepare(options)
         return
+    from trajectory_msgs.msg import JointTrajectory
+
+    from flexarm_msgs.msg import CompositeState
+    from flexarm_ros.session import Session
+
     from .running.lockstep import trajectory_message
 
     arm = arm_file.load(options.arm)
@@ -274,46 +240,49 @@ def publish(options, ros_args=None):
     built = model.build(arm) if specs.needs_model(options.profile, settings) else None
     if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
         profile_of(options, [0.0] * len(names), built)  # wrong options are said before it waits
-    line = _Conversation(options, ros_args)
-    try:
-        line.wait_for(
-            lambda: line.state is not None and line.publisher.get_subscription_count(),
-            f"no controller answers on {line.publisher.topic_name} and controller/state for"
-            f" {options.timeout:g} s: start simulator, observer and controller, on this ROS_DOMAIN_ID",
+    with Session("publish_trajectory", args=ros_args or (), patience=options.timeout) as session:
+        states = session.tap(CompositeState, "controller/state")
+        publisher = session.publisher(JointTrajectory, options.topic)
+        session.wait_for(
+            f"a controller on {publisher.topic_name} and controller/state",
+            lambda: states.newest is not None and publisher.get_subscription_count(),
+            hint="start simulator, observer and controller, on this ROS_DOMAIN_ID",
         )
-        before = line.state
+        before = states.newest
         profile = profile_of(options, before.reference_position, built)
         message = trajectory_message(names, profile, points_of(options))
         if options.profile == "quintic" and not options.start and not options.shaper:
             # The controller's own quintic to the last point begins at its reference, moving or not.
             message.points = message.points[-1:]
-        line.publisher.publish(message)
+        publisher.publish(message)
 
         def answered():
-            now = line.state
+            now = states.newest
+            del states.messages[:-1]
             refused = now.rejected_reason not in ("", before.rejected_reason)
             return now.accepted_trajectory_id != before.accepted_trajectory_id or refused
 
         last = f"; it last refused: {before.rejected_reason}" if before.rejected_reason else ""
-        line.wait_for(
-            answered, f"the controller took no notice: a repeat of what it follows?{last}"
+        session.wait_for(
+            "the controller to accept or refuse the trajectory",
+            answered,
+            hint=f"is it a repeat of the one that is followed?{last}",
         )
-        if line.state.accepted_trajectory_id == before.accepted_trajectory_id:
-            raise FlexarmError(f"refused: {line.state.rejected_reason}")
-        said = {
-            "profile": options.profile,
-            "trajectory_id": line.state.accepted_trajectory_id,
-            "points": len(message.points),
-            "duration_s": profile.duration,
-        }
-        print(
-            json.dumps(said)
-            if options.json
-            else f"{options.profile}: accepted as trajectory {said['trajectory_id']}, {said['points']} points,"
-            f" {profile.duration:g} s"
-        )
-    finally:
-        line.close()
+        after = states.newest
+    if after.accepted_trajectory_id == before.accepted_trajectory_id:
+        raise FlexarmError(f"refused: {after.rejected_reason}")
+    said = {
+        "profile": options.profile,
+        "trajectory_id": after.accepted_trajectory_id,
+        "points": len(message.points),
+        "duration_s": profile.duration,
+    }
+    print(
+        json.dumps(said)
+        if options.json
+        else f"{options.profile}: accepted as trajectory {said['trajectory_id']}, {said['points']} points,"
+        f" {profile.duration:g} s"
+    )
 
 
 def main(args=None):

@@ -17,8 +17,8 @@ from flexarm_control.loop.samples import ArmSample
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
 from flexarm_ros.messages import StateWriter
+from flexarm_tools.shape.amplitudes import Amplitudes
 from flexarm_tools.shape.drawing import ARROW, Drawer, Trail
-from flexarm_tools.shape.latest import Amplitudes
 from flexarm_tools.shape.node import Markers
 
 LAYOUTS = Path(__file__).resolve().parents[2] / "flexarm_bringup" / "layouts"

@@ -77,27 +77,16 @@ class Conversation:
     CONTROLLER_ID = 0xC4EC
 
     def __init__(self, arm, namespace=""):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
-
         from flexarm_msgs.msg import ArmState, JointTorque
         from flexarm_ros import qos
+        from flexarm_ros.session import Session
 
         self._arm, self._kind = arm, JointTorque
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, args=[])
-        self.node = Node(
-            "check_driver",
-            context=self._context,
-            namespace=namespace,
-            start_parameter_services=False,
-            enable_rosout=False,
-        )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        # Woken by each state, which is answered at once.
+        self.session = Session("check_driver", namespace=namespace, period=0.05)
+        self.node = self.session.node
         self.heard, self._answer = [], None
-        self._publisher = self.node.create_publisher(JointTorque, "joint_torque", qos.LINE)
+        self._publisher = self.session.publisher(JointTorque, "joint_torque", profile=qos.LINE)
         self.node.create_subscription(ArmState, "arm_state", self._on_state, qos.LINE)
 
     def _on_state(self, message):
@@ -106,27 +95,12 @@ class Conversation:
         if self._answer is not None:
             self._answer(message)
 
-    def wait_for(self, condition, seconds, problem):
-        """Serve until `condition` holds.
-
-        Raises
-        ------
-        FlexarmError
-            With `problem`, when it does not.
-        """
-        end = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > end:
-                raise FlexarmError(problem)
-            self._executor.spin_once(timeout_sec=0.05)
-
     def listen(self, seconds, answer=None):
         """States of so many seconds of the driver's time; `answer` is called with time and message.
 
         Wall time ends it where the stamps stand still.
         """
         start, first = len(self.heard), None
-        end = time.monotonic() + PATIENCE + SLOW * seconds
         reached = 0.0
 
         def on_state(message):
@@ -138,8 +112,7 @@ class Conversation:
                 answer(stamp - first, message)
 
         self._answer = on_state
-        while reached < seconds and time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.05)
+        self.session.serve(PATIENCE + SLOW * seconds, lambda: reached >= seconds)
         self._answer = None
         return self.heard[start:]
 
@@ -170,11 +143,7 @@ class Conversation:
 
     def close(self):
         """Leave the domain."""
-        import rclpy
-
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        self.session.close()
 
 
 class Examination:
@@ -326,16 +295,18 @@ def check_driver(options):
     tolerances = Tolerances(**{name: getattr(options, name) for name in names})
     line = Conversation(arm_model.arm, options.namespace)
     try:
-        line.wait_for(
+        line.session.wait_for(
+            "arm_state",
             lambda: line.heard,
             options.timeout,
-            f"no arm_state for {options.timeout:g} s: start the driver, on this ROS_DOMAIN_ID",
+            "start the driver, on this ROS_DOMAIN_ID",
         )
         if options.allow_motion:
-            line.wait_for(
+            line.session.wait_for(
+                "a reader of joint_torque",
                 line.driver_listens,
                 options.timeout,
-                "nobody reads joint_torque: the driver has to take it",
+                "the driver has to subscribe to it",
             )
             if not line.alone():
                 raise FlexarmError(

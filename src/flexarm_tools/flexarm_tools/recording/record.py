@@ -82,7 +82,6 @@ def _take(listener, out, arm, duration, as_json=False):
                 if time.monotonic() > told + TELL_PERIOD:
                     told = time.monotonic()
                     taken.show(told - began)
-                time.sleep(POLL_PERIOD)
         except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the way to end it; SIGTERM
             ended = end
         taken.take(listener.poll(), time.time_ns())
@@ -166,7 +165,7 @@ class Taken:
 
 
 class Listener:
-    """Subscriptions to an arm's topics, and a way to ask its nodes for the arm; a context.
+    """A session that collects an arm's topics and asks its nodes for the arm; a context.
 
     Parameters
     ----------
@@ -174,56 +173,39 @@ class Listener:
     """
 
     def __init__(self, namespace=""):
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.node import Node
+        from flexarm_ros.session import Session
 
         from .recorder import Recorder
 
         self.namespace = namespace.strip("/")
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, args=[])
-        quiet = {"start_parameter_services": False, "enable_rosout": False}
-        quiet |= {"context": self._context, "namespace": self.namespace}
-        # The subscriptions' node is not in the executor: it would take their messages.
-        self._node, self._asking = Node("flexarm_record", **quiet), Node("flexarm_ask", **quiet)
-        self._recorder = Recorder(self._node)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._asking)
-        self._early = {}
+        self._session = Session("flexarm_record", namespace=self.namespace)
+        self._recorder = Recorder(self._session)
 
     def poll(self):
-        """What has come since the last call, topic to list of bytes."""
-        self._recorder.poll()
-        out, raw = self._early, self._recorder.raw
-        self._early = {}
-        for topic, messages in raw.items():
-            out.setdefault(topic, []).extend(map(bytes, messages))
+        """What has arrived since the last call, topic to list of bytes."""
+        self._session.serve(POLL_PERIOD)
+        out = {}
+        for topic, messages in self._recorder.raw.items():
+            out[topic] = list(messages)
             messages.clear()
         return out
 
     def wait_for_first(self, seconds):
-        """Wait until something has come.
+        """Wait until something has arrived.
 
         Raises
         ------
         FlexarmError
             After so long, with the topics that there are.
         """
-        end = time.monotonic() + seconds
-        while True:
-            messages = self.poll()
-            if any(messages.values()):
-                self._early = messages
-                return
-            if time.monotonic() > end:
-                raise FlexarmError(self._silence(seconds))
-            time.sleep(0.01)
+        if not self._session.serve(seconds, lambda: any(self._recorder.raw.values())):
+            raise FlexarmError(self._silence(seconds))
 
     def _silence(self, seconds):
-        there = [n for n, kinds in self._node.get_topic_names_and_types() if _ours(kinds)]
+        node = self._session.node
+        there = [n for n, kinds in node.get_topic_names_and_types() if _ours(kinds)]
         where = f"/{self.namespace}" if self.namespace else "no namespace"
-        others = [n for n in there if self._node.count_publishers(n)]
+        others = [n for n in there if node.count_publishers(n)]
         hint = f"; there are {', '.join(sorted(others))}: give their --namespace" if others else ""
         return (
             f"nothing came in {where} for {seconds:g} s: start the driver (or simulator), in the same"
@@ -231,21 +213,17 @@ class Listener:
         )
 
     def ask_arm(self):
-        """Ask the nodes for their parameter ``arm``; a function that says it once it is known, else ''."""
+        """Ask the nodes for their parameter ``arm``; a function that returns it once it is known, else ''."""
         from rcl_interfaces.srv import GetParameters
 
-        clients = [
-            self._asking.create_client(GetParameters, f"{name}/get_parameters") for name in ASKED
+        questions = [
+            self._session.ask(GetParameters, f"{name}/get_parameters", names=["arm"])
+            for name in ASKED
         ]
-        futures = {}
 
         def answer():
-            for client in clients:
-                if client not in futures and client.service_is_ready():
-                    futures[client] = client.call_async(GetParameters.Request(names=["arm"]))
-            self._executor.spin_once(timeout_sec=0.0)
-            for future in futures.values():
-                values = future.result().values if future.done() and future.result() else ()
+            for question in questions:
+                values = question.answer.values if question.answer else ()
                 if values and values[0].string_value:
                     return values[0].string_value
             return ""
@@ -256,12 +234,7 @@ class Listener:
         return self
 
     def __exit__(self, *_):
-        import rclpy
-
-        self._executor.shutdown()
-        self._asking.destroy_node()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        self._session.close()
 
 
 def _ours(kinds):

@@ -18,10 +18,11 @@ from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import Parameter
 from flexarm_msgs.msg import ArmState, CompositeState
 from flexarm_ros.node import ARM, OK, ArmNode, run
+from flexarm_ros.session import Latest
 from flexarm_ros.start import leave
 
+from .amplitudes import Amplitudes
 from .drawing import Drawer, Trail
-from .latest import Amplitudes, Latest
 
 PARAMETERS = (
     ARM,

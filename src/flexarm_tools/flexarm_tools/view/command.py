@@ -83,10 +83,10 @@ def view(options):
         step_back(NICENESS)  # after the nodes, which would inherit it
         from .link import Link
 
-        link = Link(options.namespace, domain)
+        link = Link(options.namespace, domain, processes)
         stack.callback(link.close)
         with contextlib.suppress(KeyboardInterrupt):
-            View(link, processes, options, stack).run()
+            View(link, options, stack).run()
 
 
 def check(options):
@@ -152,14 +152,12 @@ class View:
     Parameters
     ----------
     link : Link
-    processes : Processes or None
-        What was started.
     options : Namespace
     stack : ExitStack
     """
 
-    def __init__(self, link, processes, options, stack):
-        self.link, self.processes, self.options, self.stack = link, processes, options, stack
+    def __init__(self, link, options, stack):
+        self.link, self.options, self.stack = link, options, stack
         self.page = None
         self.home = None
         self._heard_at = 0.0
@@ -173,8 +171,6 @@ class View:
             self.link.find_arm(self._open)
         while True:
             self.link.serve(1.0 / self.options.rate)
-            if self.processes is not None:
-                self.processes.check()
             if self.page is not None:
                 self._turn()
 

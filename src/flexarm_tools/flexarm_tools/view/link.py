@@ -5,7 +5,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-import rclpy
 from rcl_interfaces.msg import Log, ParameterEvent
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -13,9 +12,6 @@ from rcl_interfaces.srv import (
     ListParameters,
     SetParametersAtomically,
 )
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -24,14 +20,12 @@ from flexarm_control.loop.supervisor import State
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_msgs.msg import ArmState, CompositeState
-from flexarm_ros import qos
 from flexarm_ros.messages import set_stamp, stamp_ns
+from flexarm_ros.session import Latest, Session, parameter_messages, plain
 
-from ..shape.latest import Amplitudes, Latest
+from ..shape.amplitudes import Amplitudes
 from . import gains
 
-#: A service that has not answered for so long is asked again: a server that has not found the client drops it [s].
-ASK_AGAIN = 3.0
 #: Gains that are turned are sent once they have rested for so long [s].
 REST = 0.25
 
@@ -62,34 +56,26 @@ class Link:
         Of the loop's nodes.
     domain : int, optional
         ROS_DOMAIN_ID; not given: that of the environment.
+    processes : Processes, optional
+        Watched while this serves.
     say : callable
         Takes what a person should read: (text, whether it is bad news).
     """
 
-    def __init__(self, namespace="", domain=None, say=lambda text, bad: None):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node(
-            "view",
-            context=self.context,
-            namespace=namespace,
-            start_parameter_services=False,
-            enable_rosout=False,
-            use_global_arguments=False,
+    def __init__(self, namespace="", domain=None, processes=None, say=lambda text, bad: None):
+        # Woken by what arrives: there is nothing else to look at.
+        self.session = Session(
+            "view", namespace=namespace, domain=domain, processes=processes, period=1.0
         )
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        node = self.session.node
         self.say, self.on_values = say, lambda values: None
-        create = self.node.create_subscription
+        create = node.create_subscription
         self._states = Latest(create, ArmState, "arm_state_estimate")
         self._controls = Latest(create, CompositeState, "controller/state")
-        self._trajectories = self.node.create_publisher(
-            JointTrajectory, "joint_trajectory", qos.COMMAND
-        )
-        self._controller = self.node.resolve_service_name("controller")
+        self._trajectories = self.session.publisher(JointTrajectory, "joint_trajectory")
+        self._controller = node.resolve_service_name("controller")
         create(ParameterEvent, "/parameter_events", self._on_event, 100)
         create(Log, "/rosout", self._on_log, 100)
-        self._clients, self._asked = {}, []
         self._turned, self._turned_at, self._setting = {}, 0.0, False
         self.values = {}
         self.control = None
@@ -138,10 +124,7 @@ class Link:
 
     def serve(self, seconds):
         """Serve services and slow topics for so long; send what has been turned."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self.executor.spin_once(timeout_sec=left)
-        self._ask_again()
+        self.session.serve(seconds)
         if self._turned and not self._setting and time.monotonic() > self._turned_at + REST:
             self._send_turned()
 
@@ -195,9 +178,7 @@ class Link:
         self._setting = True
         wanted = gains.changed(self.values, self._turned)
         self._turned = {}
-        messages = [
-            Parameter(name, value=value).to_parameter_msg() for name, value in wanted.items()
-        ]
+        messages = parameter_messages(wanted)
 
         def done(answer):
             self._setting = False
@@ -263,36 +244,11 @@ class Link:
         then(out)
 
     def _ask(self, kind, name, then, **request):
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, f"controller/{name}")
-        question = [self._clients[name], kind.Request(**request), then, None, 0.0]
-        self._asked.append(question)
-        self._ask_again()
-
-    def _ask_again(self):
-        """Questions that wait for their server, or for an answer for too long."""
-        now = time.monotonic()
-        for question in list(self._asked):
-            client, request, then, future, at = question
-            if future is not None and future.done():
-                self._asked.remove(question)
-                then(future.result())
-            elif (future is None or now > at + ASK_AGAIN) and client.service_is_ready():
-                if future is not None:
-                    client.remove_pending_request(future)
-                question[3:] = client.call_async(request), now
+        self.session.ask(kind, f"controller/{name}", then, **request)
 
     def close(self):
         """Leave the graph."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
-def plain(value):
-    """A `ParameterValue` as Python has it, arrays as lists."""
-    found = parameter_value_to_python(value)
-    return found.tolist() if hasattr(found, "tolist") else found
+        self.session.close()
 
 
 def show(value):
