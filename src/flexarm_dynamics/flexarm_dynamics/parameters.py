@@ -8,13 +8,14 @@ Nothing here knows ROS.
 import math
 import numbers
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .errors import ParameterError
 from .shown import show
 
+_KIND_OF = {float: "float", int: "int", bool: "bool", str: "string"}
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
 
 
@@ -55,6 +56,10 @@ class Parameter:
     choices: tuple = ()
     length: str | int | None = None
     read_only: bool = False
+
+    def described(self, text):
+        """The same parameter with a description: what it does, in a sentence."""
+        return replace(self, description=text)
 
     def check(self, value, sizes: Mapping[str, int] | None = None, prefix: str = ""):
         """Return `value` in its canonical type, or say why it can't be used.
@@ -148,6 +153,34 @@ class Parameter:
         if self.high is not None and value > self.high:
             raise _refusal(where, value, f"{unit}is above its upper limit", limit=self.high)
         return value
+
+
+def parameter(name, default, unit="-", low=None, high=None, *, kind=None, **options):
+    """Declare a parameter in three lines; its kind follows from the default.
+
+    Parameters
+    ----------
+    name, default, unit, low, high, kind
+        As of `Parameter`; `kind` is needed where the default does not show it: an empty list, or None.
+    **options
+        The other fields of `Parameter`: `choices`, `length`, `read_only`.
+
+    Returns
+    -------
+    Parameter
+        Without a description, which `Parameter.described` adds.
+
+    Examples
+    --------
+    >>> kp = parameter("kp", [6.25], "1/s^2", 0.0, 1e6, length="joints").described("Position gain.")
+    >>> kp.kind
+    'float_array'
+    """
+    if kind is None:
+        several = isinstance(default, (list, tuple))
+        first = default[0] if several else default
+        kind = _KIND_OF[type(first)] + ("_array" if several else "")
+    return Parameter(name, kind, default, "", unit, low, high, **options)
 
 
 def _refusal(where, value, problem, **more):

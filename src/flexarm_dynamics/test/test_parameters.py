@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import KINDS, Parameter, check_all
+from flexarm_dynamics.parameters import KINDS, Parameter, check_all, parameter
 
 KP = Parameter("kp", "float_array", [6.25], "Gain.", "1/s^2", low=0.0, high=1e4, length="joints")
 ALPHA = Parameter("alpha", "float", 5.0, "Degree of stability.", "1/s", low=0.0, high=100.0)
@@ -135,6 +135,15 @@ def test_a_refusal_is_written_out_with_value_unit_and_limit():
     assert str(refused(LAW, "pid")) == "law: 'pid' is not one of the choices (pd, lqr)"
     assert str(refused(SWITCH, 1)) == "switch: 1 is not a boolean; write true or false"
     assert str(refused(ALPHA, np.float32("nan"))) == "alpha: nan is not finite"
+
+
+@pytest.mark.parametrize("wanted", [KP, ALPHA, COUNT, LAW, SWITCH], ids=lambda p: p.name)
+def test_a_short_declaration_takes_its_kind_from_the_default(wanted):
+    p = wanted
+    more = {"choices": p.choices, "length": p.length}
+    short = parameter(p.name, p.default, p.unit, p.low, p.high, **more)
+    assert short.described(p.description) == p
+    assert parameter("cpus", [], kind="int_array").kind == "int_array"
 
 
 def test_strings_switches_and_integers_pass():

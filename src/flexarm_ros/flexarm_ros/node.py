@@ -17,7 +17,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from . import qos, scheduling
 from .parameters import NodeParameters
@@ -28,19 +28,11 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 REPORT_EVERY = 10_000_000_000  # [ns]
 
-ARM = Parameter(
-    "arm",
-    "string",
-    "",
-    "Arm file: a shipped name, such as R or two_link, or a path.",
-    read_only=True,
+ARM = parameter("arm", "", read_only=True).described(
+    "Arm file: a shipped name, such as R or two_link, or a path."
 )
-AUTOSTART = Parameter(
-    "autostart",
-    "bool",
-    True,
-    "Configure and activate at the start; false: wait for a lifecycle manager.",
-    read_only=True,
+AUTOSTART = parameter("autostart", True, read_only=True).described(
+    "Configure and activate at the start; false: wait for a lifecycle manager."
 )
 #: Parameters of every node.
 COMMON = (AUTOSTART, *scheduling.PARAMETERS)

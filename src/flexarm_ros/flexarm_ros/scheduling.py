@@ -9,25 +9,15 @@ CPUs but have ordinary priority, so that a design never holds up a sample.
 import os
 
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
-CPU_AFFINITY = Parameter(
-    "cpu_affinity",
-    "int_array",
-    [],
-    "CPUs that the node's process runs on; empty: all. Nodes that share a process share it.",
-    low=0,
-    high=1023,
-    read_only=True,
+CPU_AFFINITY = parameter(
+    "cpu_affinity", [], "-", 0, 1023, kind="int_array", read_only=True
+).described(
+    "CPUs that the node's process runs on; empty: all. Nodes that share a process share it."
 )
-REALTIME_PRIORITY = Parameter(
-    "realtime_priority",
-    "int",
-    0,
-    "Priority of the node's process among real-time processes (SCHED_FIFO); 0: an ordinary process.",
-    low=0,
-    high=99,
-    read_only=True,
+REALTIME_PRIORITY = parameter("realtime_priority", 0, "-", 0, 99, read_only=True).described(
+    "Priority of the node's process among real-time processes (SCHED_FIFO); 0: an ordinary process."
 )
 PARAMETERS = (CPU_AFFINITY, REALTIME_PRIORITY)
 

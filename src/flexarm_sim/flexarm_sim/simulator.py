@@ -10,93 +10,44 @@ from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import Parameter, parameter
 
 from . import integrators
 from .plant import Plant
 from .sensors import Sensors
 
 PARAMETERS = (
-    Parameter(
-        "arm",
-        "string",
-        "",
-        "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map are this file's.",
-        read_only=True,
+    parameter("arm", "", read_only=True).described(
+        "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map are this file's."
     ),
-    Parameter(
-        "plant_arm",
-        "string",
-        "",
-        "Arm file of the simulated arm itself, when it differs from `arm`; empty: the same.",
-        read_only=True,
+    parameter("plant_arm", "", read_only=True).described(
+        "Arm file of the simulated arm itself, when it differs from `arm`; empty: the same."
     ),
-    Parameter(
-        "plant_modes",
-        "int",
-        0,
-        "Modes per flexible direction of the simulated arm; 0: as in its file.",
-        low=0,
-        high=20,
-        read_only=True,
+    parameter("plant_modes", 0, "-", 0, 20, read_only=True).described(
+        "Modes per flexible direction of the simulated arm; 0: as in its file."
     ),
-    Parameter(
-        "rate",
-        "float",
-        1000.0,
-        "Control rate: samples per second of simulated time.",
-        unit="Hz",
-        low=1.0,
-        high=20000.0,
-        read_only=True,
+    parameter("rate", 1000.0, "Hz", 1.0, 20000.0, read_only=True).described(
+        "Control rate: samples per second of simulated time."
     ),
-    Parameter(
-        "integrator",
-        "string",
-        "dop853",
+    parameter("integrator", "dop853", choices=tuple(integrators.METHODS), read_only=True).described(
         "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode; implicit damps modes"
-        " too fast for the period, in one step.",
-        choices=tuple(integrators.METHODS),
-        read_only=True,
+        " too fast for the period, in one step."
     ),
-    Parameter(
-        "initial_position",
-        "float_array",
-        [0.0],
-        "Joint angles after a start or reset.",
-        unit="rad",
-        low=-100.0,
-        high=100.0,
-        length="joints",
+    parameter("initial_position", [0.0], "rad", -100.0, 100.0, length="joints").described(
+        "Joint angles after a start or reset."
     ),
-    Parameter(
-        "noise",
-        "bool",
-        False,
-        "Whether gauges have the noise and drift of the arm file.",
-        read_only=True,
+    parameter("noise", False, read_only=True).described(
+        "Whether gauges have the noise and drift of the arm file."
     ),
     Parameter("seed", "int", 0, "Seed of the noise.", low=0, high=2**31 - 1, read_only=True),
-    Parameter(
-        "publish_rates",
-        "bool",
-        False,
-        "Publish the true rates of the observed modes in modal_rate: for tests; no real arm has them.",
-        read_only=True,
+    parameter("publish_rates", False, read_only=True).described(
+        "Publish the true rates of the observed modes in modal_rate: for tests; no real arm has them."
     ),
-    Parameter(
-        "publish_joint_velocity",
-        "bool",
-        True,
-        "Publish joint velocities; false: as a driver that has an encoder alone.",
-        read_only=True,
+    parameter("publish_joint_velocity", True, read_only=True).described(
+        "Publish joint velocities; false: as a driver that has an encoder alone."
     ),
-    Parameter(
-        "publish_modal_amplitude",
-        "bool",
-        True,
-        "Publish the modal amplitudes that the simulator maps from the strains; false: the observer maps them.",
-        read_only=True,
+    parameter("publish_modal_amplitude", True, read_only=True).described(
+        "Publish the modal amplitudes that the simulator maps from the strains; false: the observer maps them."
     ),
 )
 

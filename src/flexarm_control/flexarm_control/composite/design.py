@@ -3,7 +3,7 @@
 
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter, check_all
+from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
 from ..feedforward.base import Settings
@@ -18,31 +18,16 @@ PREFIX = {SLOW: "slow.", FAST: "fast.", MANIFOLD: "manifold."}
 
 #: Parameters of the whole design.
 PARAMETERS = (
-    Parameter(
-        "feedforward",
-        "string",
-        "model",
+    parameter("feedforward", "model").described(
         "Motion that the arm is held to: none, the reference and the slow manifold; model, the nominal arm"
         " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
-        " end at rest. Or another of the entry-point group flexarm.feedforwards.",
+        " end at rest. Or another of the entry-point group flexarm.feedforwards."
     ),
-    Parameter(
-        "rate",
-        "float",
-        1000.0,
-        "Samples per second that the driver or simulator sends: what designs are checked at.",
-        unit="Hz",
-        low=1.0,
-        high=20000.0,
+    parameter("rate", 1000.0, "Hz", 1.0, 20000.0).described(
+        "Samples per second that the driver or simulator sends: what designs are checked at."
     ),
-    Parameter(
-        "stability_margin",
-        "float",
-        0.0,
-        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this.",
-        unit="1/s",
-        low=-1e3,
-        high=1e3,
+    parameter("stability_margin", 0.0, "1/s", -1e3, 1e3).described(
+        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this."
     ),
 )
 

@@ -20,54 +20,27 @@ import numpy as np
 from scipy.linalg import eig
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem, is_stabilisable
 
 from .base import FastLaw
 
 #: Q, R and alpha of (18): the same declarations in every law that solves (20).
 WEIGHTS = (
-    Parameter(
-        "q",
-        "float_array",
-        [1.0],
-        "Diagonal of Q in (18): modal amplitudes, then modal rates.",
-        unit="1/m^2, s^2/m^2",
-        low=0.0,
-        high=1e12,
-        length="z",
+    parameter("q", [1.0], "1/m^2, s^2/m^2", 0.0, 1e12, length="z").described(
+        "Diagonal of Q in (18): modal amplitudes, then modal rates."
     ),
-    Parameter(
-        "r",
-        "float_array",
-        [1.0],
-        "Diagonal of R in (18).",
-        unit="1/(N m)^2",
-        low=1e-9,
-        high=1e12,
-        length="joints",
+    parameter("r", [1.0], "1/(N m)^2", 1e-9, 1e12, length="joints").described(
+        "Diagonal of R in (18)."
     ),
-    Parameter(
-        "alpha",
-        "float",
-        5.0,
-        "Prescribed degree of stability: closed fast poles lie left of -alpha.",
-        unit="1/s",
-        low=0.0,
-        high=1e3,
+    parameter("alpha", 5.0, "1/s", 0.0, 1e3).described(
+        "Prescribed degree of stability: closed fast poles lie left of -alpha."
     ),
 )
 
 #: Where a law with one design is designed.
-CONFIGURATION = Parameter(
-    "configuration",
-    "float_array",
-    [0.0],
-    "Joint configuration of the design: the end of the trajectory.",
-    unit="rad",
-    low=-100.0,
-    high=100.0,
-    length="joints",
+CONFIGURATION = parameter("configuration", [0.0], "rad", -100.0, 100.0, length="joints").described(
+    "Joint configuration of the design: the end of the trajectory."
 )
 
 

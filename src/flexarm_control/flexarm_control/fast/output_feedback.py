@@ -36,7 +36,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import sampled
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from .base import FastLaw
 from .lqr import CONFIGURATION, WEIGHTS, dominant_mode, regulator
@@ -56,23 +56,11 @@ class OutputFeedback(FastLaw):
     PARAMETERS = (
         *WEIGHTS,
         CONFIGURATION,
-        Parameter(
-            "observer_pole",
-            "float",
-            100.0,
-            "How much faster than an open fast mode the estimate of it decays.",
-            unit="1/s",
-            low=1.0,
-            high=1e5,
+        parameter("observer_pole", 100.0, "1/s", 1.0, 1e5).described(
+            "How much faster than an open fast mode the estimate of it decays."
         ),
-        Parameter(
-            "period",
-            "float",
-            0.001,
-            "Sampling period that the design is checked for; the law follows the true one.",
-            unit="s",
-            low=1e-5,
-            high=1.0,
+        parameter("period", 0.001, "s", 1e-5, 1.0).described(
+            "Sampling period that the design is checked for; the law follows the true one."
         ),
     )
 

@@ -21,7 +21,7 @@ from scipy.linalg import matrix_balance
 from scipy.optimize import linear_sum_assignment
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from .base import FastLaw
@@ -40,23 +40,11 @@ class PolePlacement(FastLaw):
     """
 
     PARAMETERS = (
-        Parameter(
-            "damping",
-            "float_array",
-            [0.5],
-            "Damping ratio of each closed fast mode, by ascending open frequency; 0.0 leaves the mode as it is.",
-            low=0.0,
-            high=0.99,
-            length="modes",
+        parameter("damping", [0.5], "-", 0.0, 0.99, length="modes").described(
+            "Damping ratio of each closed fast mode, by ascending open frequency; 0.0 leaves the mode as it is."
         ),
-        Parameter(
-            "frequency_scale",
-            "float_array",
-            [1.0],
-            "Closed over open natural frequency of each fast mode.",
-            low=0.1,
-            high=10.0,
-            length="modes",
+        parameter("frequency_scale", [1.0], "-", 0.1, 10.0, length="modes").described(
+            "Closed over open natural frequency of each fast mode."
         ),
         CONFIGURATION,
     )

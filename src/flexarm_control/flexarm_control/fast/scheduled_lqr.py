@@ -23,7 +23,7 @@ import itertools
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from .base import FastLaw
@@ -93,33 +93,14 @@ class ScheduledLqr(FastLaw):
 
     PARAMETERS = (
         *WEIGHTS,
-        Parameter(
-            "grid",
-            "int",
-            5,
-            "Designs per joint that changes the boundary layer (11); between them the gain is interpolated.",
-            low=2,
-            high=41,
+        parameter("grid", 5, "-", 2, 41).described(
+            "Designs per joint that changes the boundary layer (11); between them the gain is interpolated."
         ),
-        Parameter(
-            "low",
-            "float_array",
-            [0.0],
-            "Lower end of the scheduled range; 0.0 here and in high: limits.position, -pi where there is none.",
-            unit="rad",
-            low=-100.0,
-            high=100.0,
-            length="joints",
+        parameter("low", [0.0], "rad", -100.0, 100.0, length="joints").described(
+            "Lower end of the scheduled range; 0.0 here and in high: limits.position, -pi where there is none."
         ),
-        Parameter(
-            "high",
-            "float_array",
-            [0.0],
-            "Upper end of the scheduled range; 0.0 here and in low: limits.position, pi where there is none.",
-            unit="rad",
-            low=-100.0,
-            high=100.0,
-            length="joints",
+        parameter("high", [0.0], "rad", -100.0, 100.0, length="joints").described(
+            "Upper end of the scheduled range; 0.0 here and in low: limits.position, pi where there is none."
         ),
     )
 

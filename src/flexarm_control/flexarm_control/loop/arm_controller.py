@@ -4,7 +4,7 @@
 import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError, MessageError, check_finite
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from ..arrays import clip
 from ..trajectory import ReferenceGenerator, Verdict, validate
@@ -17,38 +17,17 @@ FAST_RAMP = 0.1
 
 #: Parameters of the controller that belong to no single law.
 PARAMETERS = (
-    Parameter(
-        "torque_limit",
-        "float_array",
-        [0.0],
-        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's.",
-        unit="N m",
-        low=0.0,
-        high=1e6,
-        length="joints",
+    parameter("torque_limit", [0.0], "N m", 0.0, 1e6, length="joints").described(
+        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's."
     ),
-    Parameter(
-        "torque_rate_limit",
-        "float_array",
-        [0.0],
-        "Largest change of torque per second, against the last torque sent; 0.0: none.",
-        unit="N m/s",
-        low=0.0,
-        high=1e9,
-        length="joints",
+    parameter("torque_rate_limit", [0.0], "N m/s", 0.0, 1e9, length="joints").described(
+        "Largest change of torque per second, against the last torque sent; 0.0: none."
     ),
     *supervisor.PARAMETERS,
 )
 
-START_TOLERANCE = Parameter(
-    "start_tolerance",
-    "float",
-    0.01,
-    "How far a first point at time 0 may lie from the reference; farther is refused.",
-    unit="rad",
-    low=0.0,
-    high=10.0,
-    read_only=True,
+START_TOLERANCE = parameter("start_tolerance", 0.01, "rad", 0.0, 10.0, read_only=True).described(
+    "How far a first point at time 0 may lie from the reference; farther is refused."
 )
 
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 #: A limit that is exceeded by this factor is a fault at once.
@@ -37,102 +37,38 @@ FREE_DECELERATION = 10.0
 STOP_SHARE = 0.5
 
 PARAMETERS = (
-    Parameter(
-        "tracking_error_limit",
-        "float",
-        0.5,
-        "Largest distance of a joint from its reference; beyond it the arm is stopped. 0.0: none.",
-        unit="rad",
-        low=0.0,
-        high=100.0,
+    parameter("tracking_error_limit", 0.5, "rad", 0.0, 100.0).described(
+        "Largest distance of a joint from its reference; beyond it the arm is stopped. 0.0: none."
     ),
-    Parameter(
-        "velocity_margin",
-        "float",
-        1.2,
-        "Largest measured joint velocity, as a multiple of the arm file's limits.velocity; 0.0: none.",
-        low=0.0,
-        high=100.0,
+    parameter("velocity_margin", 1.2, "-", 0.0, 100.0).described(
+        "Largest measured joint velocity, as a multiple of the arm file's limits.velocity; 0.0: none."
     ),
-    Parameter(
-        "position_margin",
-        "float",
-        0.05,
-        "How far a joint may come out of the arm file's limits.position, braking distance included; 0.0: not watched.",
-        unit="rad",
-        low=0.0,
-        high=10.0,
+    parameter("position_margin", 0.05, "rad", 0.0, 10.0).described(
+        "How far a joint may come out of the arm file's limits.position, braking distance included; 0.0: not watched."
     ),
-    Parameter(
-        "deflection_limit",
-        "float_array",
-        [0.0],
-        "Largest modal amplitude, per mode; 0.0: none.",
-        unit="m, rad",
-        low=0.0,
-        high=1e3,
-        length="modes",
+    parameter("deflection_limit", [0.0], "m, rad", 0.0, 1e3, length="modes").described(
+        "Largest modal amplitude, per mode; 0.0: none."
     ),
-    Parameter(
-        "strain_limit",
-        "float",
-        0.0,
-        "Largest strain that the deflections put on a gauge; 0.0: the gauge's full_scale in the arm file.",
-        low=0.0,
-        high=1.0,
+    parameter("strain_limit", 0.0, "-", 0.0, 1.0).described(
+        "Largest strain that the deflections put on a gauge; 0.0: the gauge's full_scale in the arm file."
     ),
-    Parameter(
-        "saturation_time",
-        "float",
-        2.0,
-        "Longest time that a torque may stay at its limit; then the arm is stopped. 0.0: any.",
-        unit="s",
-        low=0.0,
-        high=1e4,
+    parameter("saturation_time", 2.0, "s", 0.0, 1e4).described(
+        "Longest time that a torque may stay at its limit; then the arm is stopped. 0.0: any."
     ),
-    Parameter(
-        "limit_patience",
-        "float",
-        1.0,
-        "A limit that stays exceeded for so long, in spite of the stop, is a fault.",
-        unit="s",
-        low=0.0,
-        high=1e3,
+    parameter("limit_patience", 1.0, "s", 0.0, 1e3).described(
+        "A limit that stays exceeded for so long, in spite of the stop, is a fault."
     ),
-    Parameter(
-        "max_gap",
-        "float",
-        0.5,
-        "Longest time between the stamps of two states; a fault beyond it.",
-        unit="s",
-        low=1e-3,
-        high=1e4,
+    parameter("max_gap", 0.5, "s", 1e-3, 1e4).described(
+        "Longest time between the stamps of two states; a fault beyond it."
     ),
-    Parameter(
-        "synchronised_clocks",
-        "bool",
-        False,
-        "Whether stamps are of this machine's clock: then a state's age is judged, else its order alone.",
-        read_only=True,
+    parameter("synchronised_clocks", False, read_only=True).described(
+        "Whether stamps are of this machine's clock: then a state's age is judged, else its order alone."
     ),
-    Parameter(
-        "max_age",
-        "float",
-        0.1,
-        "With synchronised_clocks: an older state, or one so far from the future, is a fault.",
-        unit="s",
-        low=1e-4,
-        high=1e3,
+    parameter("max_age", 0.1, "s", 1e-4, 1e3).described(
+        "With synchronised_clocks: an older state, or one so far from the future, is a fault."
     ),
-    Parameter(
-        "stop_deceleration",
-        "float_array",
-        [0.0],
-        "Deceleration of the reference in a smooth stop, per joint; 0.0: half of what the torque limit allows.",
-        unit="rad/s^2",
-        low=0.0,
-        high=1e5,
-        length="joints",
+    parameter("stop_deceleration", [0.0], "rad/s^2", 0.0, 1e5, length="joints").described(
+        "Deceleration of the reference in a smooth stop, per joint; 0.0: half of what the torque limit allows."
     ),
 )
 

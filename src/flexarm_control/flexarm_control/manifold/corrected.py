@@ -28,7 +28,7 @@ where they were placed. The derivation, beside a manifold found numerically: doc
 import numpy as np
 from scipy.linalg import expm
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from .base import Manifold
 from .expansion import Point, expand, reach, step
@@ -38,14 +38,9 @@ class CorrectedManifold(Manifold):
     """The integral manifold; see the module."""
 
     PARAMETERS = (
-        Parameter(
-            "order",
-            "int",
-            2,
+        parameter("order", 2, "-", 0, 6).described(
             "Order of the corrected manifold in mu: 0 is the paper's, 1 adds the rates of the deflections, 2 their"
-            " inertia; each two more take two more derivatives of the reference.",
-            low=0,
-            high=6,
+            " inertia; each two more take two more derivatives of the reference."
         ),
     )
 

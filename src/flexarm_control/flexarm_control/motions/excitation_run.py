@@ -6,48 +6,25 @@ from enum import Enum
 import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from ..loop.samples import SampleOrder
 from . import excitation_torque
 from .excitation_torque import ExcitationTorque
 
 LIMITS = (
-    Parameter(
-        "travel",
-        "float",
-        1.0,
-        "The excitation stops when a joint is further from where it started; the arm file's limits hold too.",
-        unit="rad",
-        low=0.001,
-        high=100.0,
+    parameter("travel", 1.0, "rad", 0.001, 100.0).described(
+        "The excitation stops when a joint is further from where it started; the arm file's limits hold too."
     ),
-    Parameter(
-        "strain_limit",
-        "float",
-        0.0,
-        "The excitation stops when a gauge reads more, its bias aside; 0: four fifths of its full scale.",
-        low=0.0,
-        high=0.1,
+    parameter("strain_limit", 0.0, "-", 0.0, 0.1).described(
+        "The excitation stops when a gauge reads more, its bias aside; 0: four fifths of its full scale."
     ),
-    Parameter(
-        "hold_frequency",
-        "float",
-        0.2,
+    parameter("hold_frequency", 0.2, "Hz", 0.0, 10.0).described(
         "Frequency of the soft, damped spring that keeps the joints about where they started; 0: none. Keep it well"
-        " below the first bending frequency.",
-        unit="Hz",
-        low=0.0,
-        high=10.0,
+        " below the first bending frequency."
     ),
-    Parameter(
-        "settle",
-        "float",
-        0.2,
-        "The arm must have been at rest for so long before it is shaken.",
-        unit="s",
-        low=0.0,
-        high=60.0,
+    parameter("settle", 0.2, "s", 0.0, 60.0).described(
+        "The arm must have been at rest for so long before it is shaken."
     ),
 )
 PARAMETERS = (*excitation_torque.PARAMETERS, *LIMITS)

@@ -17,69 +17,30 @@ from collections.abc import Mapping
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter, check_all
+from flexarm_dynamics.parameters import check_all, parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 KINDS = ("ring_down", "sweep", "pulse")
 PARAMETERS = (
-    Parameter(
-        "kind",
-        "string",
-        "sweep",
+    parameter("kind", "sweep", choices=KINDS).described(
         "What the torque is over time: a sweep of frequencies, a pulse forth and back, or some periods at the first"
-        " bending frequency.",
-        choices=KINDS,
+        " bending frequency."
     ),
-    Parameter(
-        "joint",
-        "string",
-        "",
-        "Joint that is shaken; empty: one after the other.",
+    parameter("joint", "").described("Joint that is shaken; empty: one after the other."),
+    parameter("amplitude", 0.0, "N m", 0.0, 1e6).described(
+        "Amplitude of the torque; at most the joint's limit. 0: a fifth of that."
     ),
-    Parameter(
-        "amplitude",
-        "float",
-        0.0,
-        "Amplitude of the torque; at most the joint's limit. 0: a fifth of that.",
-        unit="N m",
-        low=0.0,
-        high=1e6,
+    parameter("duration", 0.0, "s", 0.0, 600.0).described(
+        "Of the shaking of one joint; 0: by the kind and the slowest mode."
     ),
-    Parameter(
-        "duration",
-        "float",
-        0.0,
-        "Of the shaking of one joint; 0: by the kind and the slowest mode.",
-        unit="s",
-        low=0.0,
-        high=600.0,
+    parameter("rest", 2.0, "s", 0.0, 600.0).described(
+        "Time in which the arm rings freely, after each joint."
     ),
-    Parameter(
-        "rest",
-        "float",
-        2.0,
-        "Time in which the arm rings freely, after each joint.",
-        unit="s",
-        low=0.0,
-        high=600.0,
+    parameter("frequency_low", 0.0, "Hz", 0.0, 10000.0).described(
+        "Where a sweep begins; 0: at a quarter of the lowest bending frequency."
     ),
-    Parameter(
-        "frequency_low",
-        "float",
-        0.0,
-        "Where a sweep begins; 0: at a quarter of the lowest bending frequency.",
-        unit="Hz",
-        low=0.0,
-        high=10000.0,
-    ),
-    Parameter(
-        "frequency_high",
-        "float",
-        0.0,
-        "Where a sweep ends; 0: at 1.3 times the highest bending frequency of the arm file.",
-        unit="Hz",
-        low=0.0,
-        high=10000.0,
+    parameter("frequency_high", 0.0, "Hz", 0.0, 10000.0).described(
+        "Where a sweep ends; 0: at 1.3 times the highest bending frequency of the arm file."
     ),
 )
 #: Share of a sweep over which it fades in, and out [-].

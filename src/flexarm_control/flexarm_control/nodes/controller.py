@@ -17,7 +17,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter, sizes
+from flexarm_dynamics.parameters import parameter, sizes
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros import qos, scheduling
 from flexarm_ros.messages import (
@@ -41,42 +41,22 @@ from ..loop.arm_controller import ArmController
 from ..loop.samples import ArmSample
 from ..loop.supervisor import State
 
-SLOW_TYPE = Parameter(
-    "type",
-    "string",
-    "linear_model_following",
-    "Slow law, by its name in the entry-point group flexarm.slow_laws; none: fast control alone.",
+SLOW_TYPE = parameter("type", "linear_model_following").described(
+    "Slow law, by its name in the entry-point group flexarm.slow_laws; none: fast control alone."
 )
-FAST_TYPE = Parameter(
-    "type",
-    "string",
-    "lqr",
-    "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone.",
+FAST_TYPE = parameter("type", "lqr").described(
+    "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone."
 )
-MANIFOLD_TYPE = Parameter(
-    "type",
-    "string",
-    "corrected",
+MANIFOLD_TYPE = parameter("type", "corrected").described(
     "Slow manifold that the fast control holds the deflections to, by its name in the entry-point group"
-    " flexarm.manifolds; quasi_steady: the paper's.",
+    " flexarm.manifolds; quasi_steady: the paper's."
 )
-STATE_TIMEOUT = Parameter(
-    "state_timeout",
-    "float",
-    0.5,
-    "Without a state for so long the torque is disabled: a fault.",
-    unit="s",
-    low=0.01,
-    high=3600.0,
-    read_only=True,
+STATE_TIMEOUT = parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
+    "Without a state for so long the torque is disabled: a fault."
 )
-DESIGN_PROCESS = Parameter(
-    "design_process",
-    "bool",
-    True,
+DESIGN_PROCESS = parameter("design_process", True, read_only=True).described(
     "Whether laws are designed anew, and motions planned, in a process of their own, which takes memory, rather than"
-    " in a thread, which may hold up a sample for some milliseconds.",
-    read_only=True,
+    " in a thread, which may hold up a sample for some milliseconds."
 )
 
 #: Longer trajectories are refused: their points are read in one go.

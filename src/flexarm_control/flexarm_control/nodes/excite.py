@@ -8,7 +8,7 @@ from rclpy.duration import Duration
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import StateReader, TorqueWriter
@@ -20,31 +20,14 @@ from ..motions import excitation_run
 from ..motions.excitation_run import ExcitationRun, Stage
 
 PARAMETERS = (
-    Parameter(
-        "state_timeout",
-        "float",
-        0.5,
-        "Without a state for so long the excitation stops.",
-        unit="s",
-        low=0.01,
-        high=3600.0,
-        read_only=True,
+    parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
+        "Without a state for so long the excitation stops."
     ),
-    Parameter(
-        "readers",
-        "int",
-        1,
-        "No state is answered before so many read joint_torque: the driver, and a recorder.",
-        low=0,
-        high=100,
-        read_only=True,
+    parameter("readers", 1, "-", 0, 100, read_only=True).described(
+        "No state is answered before so many read joint_torque: the driver, and a recorder."
     ),
-    Parameter(
-        "recorder",
-        "string",
-        "",
-        "Name of a node that is to read joint_torque before a state is answered; empty: none is waited for.",
-        read_only=True,
+    parameter("recorder", "", read_only=True).described(
+        "Name of a node that is to read joint_torque before a state is answered; empty: none is waited for."
     ),
 )
 

@@ -12,7 +12,7 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter, sizes
+from flexarm_dynamics.parameters import parameter, sizes
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
@@ -27,12 +27,8 @@ from ..observers import arm_observer, gauge_health
 #: So large a part of the samples may get lost in a second before it is worth a warning.
 MANY_LOST = 0.01
 
-TYPE = Parameter(
-    "type",
-    "string",
-    "filtered_derivative",
-    "Observer, by its name in the entry-point group flexarm.observers.",
-    read_only=True,
+TYPE = parameter("type", "filtered_derivative", read_only=True).described(
+    "Observer, by its name in the entry-point group flexarm.observers."
 )
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError, ModelError, check_finite
-from flexarm_dynamics.parameters import Parameter, check_all
+from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
 from ..loop.samples import ArmSample, SampleOrder
@@ -16,29 +16,14 @@ OBSERVERS = "flexarm.observers"
 
 #: Parameters of the observer that belong to no single law.
 PARAMETERS = (
-    Parameter(
-        "joint_velocity_bandwidth",
-        "float",
-        500.0,
-        "Corner of the filtered derivative of the joint positions, for a source without joint velocities.",
-        unit="rad/s",
-        low=1.0,
-        high=1e6,
+    parameter("joint_velocity_bandwidth", 500.0, "rad/s", 1.0, 1e6).described(
+        "Corner of the filtered derivative of the joint positions, for a source without joint velocities."
     ),
-    Parameter(
-        "delay",
-        "float",
-        0.0,
-        "From a sample's stamp to when the torque that answers it acts: the estimate is predicted ahead by it.",
-        unit="s",
-        low=0.0,
-        high=0.1,
+    parameter("delay", 0.0, "s", 0.0, 0.1).described(
+        "From a sample's stamp to when the torque that answers it acts: the estimate is predicted ahead by it."
     ),
-    Parameter(
-        "smooth_position",
-        "bool",
-        True,
-        "Pass on the observer's joint positions, where it estimates them, in place of the encoders'.",
+    parameter("smooth_position", True).described(
+        "Pass on the observer's joint positions, where it estimates them, in place of the encoders'."
     ),
     *gauge_health.PARAMETERS,
 )

@@ -26,7 +26,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import jacobian
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import Parameter, parameter
 
 from .kalman import NOISE, Kalman
 from .motion import DIFFERENCE, discretise, force_density, mass_matrix
@@ -67,15 +67,9 @@ class ExtendedKalman(Kalman):
         _size("payload_drift", 1e-3, "s^-0.5", "Random walk of the payload's scale, per root of a second."),
         _size("viscous_drift", 1e-3, "N m s^0.5/rad", "Random walk of viscous friction."),
         _size("coulomb_drift", 1e-3, "N m s^-0.5", "Random walk of Coulomb friction."),
-        Parameter(
-            "relinearise",
-            "float",
-            0.01,
-            "Jacobians are taken anew after this time; 0.0: at every sample.",
-            unit="s",
-            low=0.0,
-            high=1.0,
-        ),
+        parameter("relinearise", 0.01, "s", 0.0, 1.0).described(
+"Jacobians are taken anew after this time; 0.0: at every sample."
+),
     )  # fmt: skip
 
     def _prepare(self):

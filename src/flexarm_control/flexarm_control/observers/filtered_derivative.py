@@ -15,7 +15,7 @@ It needs no model. It delays a slow rate by 1/omega_c + omega_c h^2/12, and ampl
 
 import numpy as np
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from .base import Observer
 
@@ -24,14 +24,8 @@ class FilteredDerivative(Observer):
     """First-order filtered derivative; see the module."""
 
     PARAMETERS = (
-        Parameter(
-            "bandwidth",
-            "float",
-            1000.0,
-            "Corner frequency of the filtered derivative.",
-            unit="rad/s",
-            low=1.0,
-            high=1e6,
+        parameter("bandwidth", 1000.0, "rad/s", 1.0, 1e6).described(
+            "Corner frequency of the filtered derivative."
         ),
     )
 

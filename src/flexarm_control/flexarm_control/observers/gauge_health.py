@@ -28,31 +28,19 @@ with the static deflection :math:`\delta_s`, joints held; its rms error is that 
 import numpy as np
 
 from flexarm_dynamics.errors import MessageError, ModelError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 #: As in flexarm_msgs/ObserverState.
 GOOD, MISSING, STUCK, SATURATED, SUSPECT = range(5)
 WORDS = ("good", "missing", "stuck", "saturated", "suspect")
 
 PARAMETERS = (
-    Parameter(
-        "calibration_samples",
-        "int",
-        200,
-        "Samples at rest of which ~/calibrate_gauges takes the mean.",
-        low=2,
-        high=100_000,
-        read_only=True,
+    parameter("calibration_samples", 200, "-", 2, 100_000, read_only=True).described(
+        "Samples at rest of which ~/calibrate_gauges takes the mean."
     ),
-    Parameter(
-        "stuck_samples",
-        "int",
-        50,
+    parameter("stuck_samples", 50, "-", 2, 100_000, read_only=True).described(
         "A gauge that reads the same for so many samples while the others move is stuck; one that was bad is"
-        " taken back after as many good ones.",
-        low=2,
-        high=100_000,
-        read_only=True,
+        " taken back after as many good ones."
     ),
 )
 

@@ -31,57 +31,26 @@ from scipy.stats import chi2
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 
 from .base import Observer
 from .motion import Motion
 
 NOISE = (
-    Parameter(
-        "strain_noise",
-        "float",
-        0.0,
-        "Noise of every gauge, rms; 0: each as in the arm file, bits included, 1e-6 where it states none.",
-        unit="strain",
-        low=0.0,
-        high=1e-2,
+    parameter("strain_noise", 0.0, "strain", 0.0, 1e-2).described(
+        "Noise of every gauge, rms; 0: each as in the arm file, bits included, 1e-6 where it states none."
     ),
-    Parameter(
-        "position_noise",
-        "float",
-        0.0,
-        "Noise of the joint positions, rms; 0: that of the arm file's encoder_counts, 1e-5 rad where there are none.",
-        unit="rad",
-        low=0.0,
-        high=1.0,
+    parameter("position_noise", 0.0, "rad", 0.0, 1.0).described(
+        "Noise of the joint positions, rms; 0: that of the arm file's encoder_counts, 1e-5 rad where there are none."
     ),
-    Parameter(
-        "amplitude_noise",
-        "float",
-        1e-5,
-        "Noise of the modal amplitudes, rms, of an arm whose file has no gauges.",
-        unit="m, rad",
-        low=1e-12,
-        high=1.0,
+    parameter("amplitude_noise", 1e-5, "m, rad", 1e-12, 1.0).described(
+        "Noise of the modal amplitudes, rms, of an arm whose file has no gauges."
     ),
-    Parameter(
-        "torque_noise",
-        "float_array",
-        [0.01],
-        "Unknown torque at each joint: root of the spectral density; an error of rms s that lasts t: s sqrt(2 t).",
-        unit="N m s^0.5",
-        low=1e-9,
-        high=1e6,
-        length="joints",
+    parameter("torque_noise", [0.01], "N m s^0.5", 1e-9, 1e6, length="joints").described(
+        "Unknown torque at each joint: root of the spectral density; an error of rms s that lasts t: s sqrt(2 t)."
     ),
-    Parameter(
-        "modal_force_noise",
-        "float",
-        0.001,
-        "Unknown force on every mode: root of the spectral density.",
-        unit="N s^0.5, N m s^0.5",
-        low=0.0,
-        high=1e6,
+    parameter("modal_force_noise", 0.001, "N s^0.5, N m s^0.5", 0.0, 1e6).described(
+        "Unknown force on every mode: root of the spectral density."
     ),
 )
 

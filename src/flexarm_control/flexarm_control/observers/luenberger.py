@@ -27,7 +27,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.linear import sampled
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from .base import Observer
@@ -37,14 +37,8 @@ class Luenberger(Observer):
     """Reduced-order observer with one prescribed pole; see the module."""
 
     PARAMETERS = (
-        Parameter(
-            "pole",
-            "float",
-            300.0,
-            "Decay rate of the estimation error: observer poles at -pole.",
-            unit="1/s",
-            low=1.0,
-            high=1e5,
+        parameter("pole", 300.0, "1/s", 1.0, 1e5).described(
+            "Decay rate of the estimation error: observer poles at -pole."
         ),
     )
 

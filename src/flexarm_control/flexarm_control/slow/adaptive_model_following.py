@@ -36,7 +36,7 @@ direction in which the estimate looks.
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
@@ -69,32 +69,15 @@ class AdaptiveModelFollowing(SlowLaw):
     PARAMETERS = (
         KP,
         KV,
-        Parameter(
-            "adaptation_gain",
-            "float",
-            0.3,
+        parameter("adaptation_gain", 0.3, "s^2", 0.0, 1e4).described(
             "How fast adaptive model following learns: the square of the estimate's frequency per squared"
-            " acceleration; 0.0: not at all.",
-            unit="s^2",
-            low=0.0,
-            high=1e4,
+            " acceleration; 0.0: not at all."
         ),
-        Parameter(
-            "payload_scale_max",
-            "float",
-            5.0,
-            "Largest payload that adaptive model following believes in, in parts of the arm file's.",
-            low=1.0,
-            high=1e3,
+        parameter("payload_scale_max", 5.0, "-", 1.0, 1e3).described(
+            "Largest payload that adaptive model following believes in, in parts of the arm file's."
         ),
-        Parameter(
-            "dead_zone",
-            "float",
-            0.02,
-            "Adaptive model following learns nothing from a combined error s below it: what bending and noise leave.",
-            unit="rad/s",
-            low=0.0,
-            high=10.0,
+        parameter("dead_zone", 0.02, "rad/s", 0.0, 10.0).described(
+            "Adaptive model following learns nothing from a combined error s below it: what bending and noise leave."
         ),
     )
 

@@ -3,30 +3,16 @@
 
 from abc import ABC, abstractmethod
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
 from ..component import Law
 
-KP = Parameter(
-    "kp",
-    "float_array",
-    [6.25],
-    "Position gain of the reference model: -Lambda_0 of (14), k_p of (17).",
-    unit="1/s^2",
-    low=0.0,
-    high=1e6,
-    length="joints",
+KP = parameter("kp", [6.25], "1/s^2", 0.0, 1e6, length="joints").described(
+    "Position gain of the reference model: -Lambda_0 of (14), k_p of (17)."
 )
-KV = Parameter(
-    "kv",
-    "float_array",
-    [5.0],
-    "Velocity gain of the reference model: -Lambda_1 of (14), k_v of (17).",
-    unit="1/s",
-    low=0.0,
-    high=1e4,
-    length="joints",
+KV = parameter("kv", [5.0], "1/s", 0.0, 1e4, length="joints").described(
+    "Velocity gain of the reference model: -Lambda_1 of (14), k_v of (17)."
 )
 
 

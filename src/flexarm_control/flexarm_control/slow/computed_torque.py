@@ -22,7 +22,7 @@ Assumes that a and B are known up to a slowly varying torque; linear error dynam
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
@@ -46,33 +46,15 @@ class ComputedTorque(SlowLaw):
     PARAMETERS = (
         KP,
         KV,
-        Parameter(
-            "ki",
-            "float_array",
-            [0.0],
-            "Integral gain of computed torque, below kp kv; 0.0: none.",
-            unit="1/s^3",
-            low=0.0,
-            high=1e8,
-            length="joints",
+        parameter("ki", [0.0], "1/s^3", 0.0, 1e8, length="joints").described(
+            "Integral gain of computed torque, below kp kv; 0.0: none."
         ),
-        Parameter(
-            "integral_limit",
-            "float_array",
-            [2.0],
-            "Largest acceleration that the integral of computed torque asks for.",
-            unit="rad/s^2",
-            low=0.0,
-            high=1e4,
-            length="joints",
+        parameter("integral_limit", [2.0], "rad/s^2", 0.0, 1e4, length="joints").described(
+            "Largest acceleration that the integral of computed torque asks for."
         ),
-        Parameter(
-            "feedforward_at",
-            "string",
-            "state",
+        parameter("feedforward_at", "state", choices=("state", "reference")).described(
             "Where computed torque takes inertia, Coriolis, gravity and friction: at the measured state or at the"
-            " reference.",
-            choices=("state", "reference"),
+            " reference."
         ),
     )
 

@@ -13,7 +13,7 @@ Assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. E
 
 import numpy as np
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
@@ -25,12 +25,8 @@ class LinearModelFollowing(SlowLaw):
     PARAMETERS = (
         KP,
         KV,
-        Parameter(
-            "gain",
-            "string",
-            "m11",
-            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as print has it.",
-            choices=("m11", "h11"),
+        parameter("gain", "m11", choices=("m11", "h11")).described(
+            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as print has it."
         ),
     )
 

@@ -23,7 +23,7 @@ reference (elbow up or down): else the tip arrives with the other elbow.
 
 import numpy as np
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
@@ -36,32 +36,15 @@ class ResolvedAcceleration(SlowLaw):
     PARAMETERS = (
         KP,
         KV,
-        Parameter(
-            "tip_kp",
-            "float",
-            6.25,
-            "Position gain of the tip in resolved acceleration.",
-            unit="1/s^2",
-            low=0.0,
-            high=1e6,
+        parameter("tip_kp", 6.25, "1/s^2", 0.0, 1e6).described(
+            "Position gain of the tip in resolved acceleration."
         ),
-        Parameter(
-            "tip_kv",
-            "float",
-            5.0,
-            "Velocity gain of the tip in resolved acceleration.",
-            unit="1/s",
-            low=0.0,
-            high=1e4,
+        parameter("tip_kv", 5.0, "1/s", 0.0, 1e4).described(
+            "Velocity gain of the tip in resolved acceleration."
         ),
-        Parameter(
-            "singularity",
-            "float",
-            0.05,
+        parameter("singularity", 0.05, "-", 1e-6, 1.0).described(
             "Singular value of the tip's Jacobian, in parts of the arm's reach, below which resolved acceleration"
-            " hands over to the joints' gains.",
-            low=1e-6,
-            high=1.0,
+            " hands over to the joints' gains."
         ),
     )
 

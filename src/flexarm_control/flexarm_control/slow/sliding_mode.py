@@ -26,7 +26,7 @@ too thin for it (`warnings`) makes the switching excite the fast subsystem that 
 
 import numpy as np
 
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import SlowLaw
@@ -39,53 +39,20 @@ class SlidingMode(SlowLaw):
     """Sliding mode against bounded errors of the model; see the module."""
 
     PARAMETERS = (
-        Parameter(
-            "lambda",
-            "float_array",
-            [2.5],
-            "Rate at which the error decays on the sliding surface.",
-            unit="1/s",
-            low=0.0,
-            high=1e4,
-            length="joints",
+        parameter("lambda", [2.5], "1/s", 0.0, 1e4, length="joints").described(
+            "Rate at which the error decays on the sliding surface."
         ),
-        Parameter(
-            "eta",
-            "float_array",
-            [0.5],
-            "Rate at which the sliding surface is approached at least.",
-            unit="rad/s^2",
-            low=1e-6,
-            high=1e4,
-            length="joints",
+        parameter("eta", [0.5], "rad/s^2", 1e-6, 1e4, length="joints").described(
+            "Rate at which the sliding surface is approached at least."
         ),
-        Parameter(
-            "disturbance_bound",
-            "float_array",
-            [0.5],
-            "Bound of what sliding mode does not know of the joint's acceleration.",
-            unit="rad/s^2",
-            low=0.0,
-            high=1e4,
-            length="joints",
+        parameter("disturbance_bound", [0.5], "rad/s^2", 0.0, 1e4, length="joints").described(
+            "Bound of what sliding mode does not know of the joint's acceleration."
         ),
-        Parameter(
-            "inertia_error",
-            "float",
-            0.0,
-            "Bound of the relative error of the inertia that sliding mode stands: of B' B^-1 - 1, largest row sum.",
-            low=0.0,
-            high=0.95,
+        parameter("inertia_error", 0.0, "-", 0.0, 0.95).described(
+            "Bound of the relative error of the inertia that sliding mode stands: of B' B^-1 - 1, largest row sum."
         ),
-        Parameter(
-            "boundary_layer",
-            "float_array",
-            [0.4],
-            "Half width of the layer around the sliding surface in which sliding mode is linear.",
-            unit="rad/s",
-            low=1e-6,
-            high=1e3,
-            length="joints",
+        parameter("boundary_layer", [0.4], "rad/s", 1e-6, 1e3, length="joints").described(
+            "Half width of the layer around the sliding surface in which sliding mode is linear."
         ),
     )
 

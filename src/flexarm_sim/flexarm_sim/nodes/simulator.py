@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError, ModelError, ParameterError
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import StateWriter, TorqueReader, set_stamp
@@ -30,75 +30,30 @@ AT_ONCE = 200
 WRAP = 2**32
 
 PARAMETERS = (
-    Parameter(
-        "lockstep",
-        "bool",
-        False,
-        "One period per torque that answers the last state, as fast as the machine goes; false: real time.",
-        read_only=True,
+    parameter("lockstep", False, read_only=True).described(
+        "One period per torque that answers the last state, as fast as the machine goes; false: real time."
     ),
-    Parameter(
-        "pause_at",
-        "float",
-        0.0,
+    parameter("pause_at", 0.0, "s", -1.0, 1e6, read_only=True).described(
         "In lockstep, pause at this simulated time, once, until `~/pause` is called with data false;"
-        " negative: never.",
-        unit="s",
-        low=-1.0,
-        high=1e6,
-        read_only=True,
+        " negative: never."
     ),
-    Parameter(
-        "resend_period",
-        "float",
-        0.1,
-        "In lockstep or paused, the state is sent again after so long without an answer (wall time).",
-        unit="s",
-        low=0.01,
-        high=10.0,
-        read_only=True,
+    parameter("resend_period", 0.1, "s", 0.01, 10.0, read_only=True).described(
+        "In lockstep or paused, the state is sent again after so long without an answer (wall time)."
     ),
-    Parameter(
-        "real_time_factor",
-        "float",
-        1.0,
-        "In real time: seconds simulated per second of wall time.",
-        low=0.001,
-        high=100.0,
-        read_only=True,
+    parameter("real_time_factor", 1.0, "-", 0.001, 100.0, read_only=True).described(
+        "In real time: seconds simulated per second of wall time."
     ),
-    Parameter(
-        "torque_timeout",
-        "float",
-        0.05,
-        "In real time: a torque that answers a state older than this is too late; the safe action follows.",
-        unit="s",
-        low=0.001,
-        high=10.0,
-        read_only=True,
+    parameter("torque_timeout", 0.05, "s", 0.001, 10.0, read_only=True).described(
+        "In real time: a torque that answers a state older than this is too late; the safe action follows."
     ),
-    Parameter(
-        "joint_states_rate",
-        "float",
-        50.0,
-        "Rate of joint_states, in simulated time; at most the control rate.",
-        unit="Hz",
-        low=0.1,
-        high=20000.0,
-        read_only=True,
+    parameter("joint_states_rate", 50.0, "Hz", 0.1, 20000.0, read_only=True).described(
+        "Rate of joint_states, in simulated time; at most the control rate."
     ),
-    Parameter(
-        "allow_faults",
-        "bool",
-        False,
-        "Whether `faults` may be set: for tests of what comes after the simulator.",
-        read_only=True,
+    parameter("allow_faults", False, read_only=True).described(
+        "Whether `faults` may be set: for tests of what comes after the simulator."
     ),
-    Parameter(
-        "faults",
-        "string_array",
-        [],
-        'Faults put into arm_state, each "SIGNAL KIND [key=value ...]": docs/fault_injection.md.',
+    parameter("faults", [], kind="string_array").described(
+        'Faults put into arm_state, each "SIGNAL KIND [key=value ...]": docs/fault_injection.md.'
     ),
 )
 
@@ -191,8 +146,8 @@ class SimulatorNode(ArmNode):
 
     def _check_faults(self, parameters):
         """Refuse what the injector would not take; its type has been looked at elsewhere."""
-        for parameter in parameters:
-            lines = parameter.value if parameter.name == "faults" else None
+        for given in parameters:
+            lines = given.value if given.name == "faults" else None
             texts = isinstance(lines, list) and lines and all(isinstance(x, str) for x in lines)
             if self._injector is None or not texts:
                 continue

@@ -15,7 +15,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.urdf import PieceChain
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter
+from flexarm_dynamics.parameters import parameter
 from flexarm_msgs.msg import ArmState, CompositeState
 from flexarm_ros.node import ARM, OK, ArmNode, run
 from flexarm_ros.session import Latest
@@ -26,50 +26,24 @@ from .drawing import Drawer, Trail
 
 PARAMETERS = (
     ARM,
-    Parameter(
-        "draw_rate",
-        "float",
-        30.0,
-        "Pictures per second.",
-        unit="Hz",
-        low=0.1,
-        high=200.0,
-        read_only=True,
+    parameter("draw_rate", 30.0, "Hz", 0.1, 200.0, read_only=True).described(
+        "Pictures per second."
     ),
-    Parameter(
-        "exaggeration",
-        "float",
-        1.0,
-        "Deflections are drawn so many times as large; shape/joint_states has them as they are.",
-        low=0.0,
-        high=1000.0,
+    parameter("exaggeration", 1.0, "-", 0.0, 1000.0).described(
+        "Deflections are drawn so many times as large; shape/joint_states has them as they are."
     ),
-    Parameter(
-        "pieces",
-        "int",
-        8,
-        "Rigid pieces of each flexible link in the URDF, as in flexarm urdf --pieces.",
-        low=1,
-        high=100,
-        read_only=True,
+    parameter("pieces", 8, "-", 1, 100, read_only=True).described(
+        "Rigid pieces of each flexible link in the URDF, as in flexarm urdf --pieces."
     ),
-    Parameter(
-        "trail",
-        "int",
-        300,
-        "Points of the tip's way that are kept.",
-        low=1,
-        high=10000,
-        read_only=True,
+    parameter("trail", 300, "-", 1, 10000, read_only=True).described(
+        "Points of the tip's way that are kept."
     ),
-    Parameter(
+    parameter(
         "state_topic",
-        "string",
         "arm_state_estimate",
-        "Where the states come from; arm_state: as they are measured.",
         choices=("arm_state_estimate", "arm_state"),
         read_only=True,
-    ),
+    ).described("Where the states come from; arm_state: as they are measured."),
 )
 #: Red, green, blue, opacity.
 COLOURS = {
