@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from flexarm_control.motions import profiles, shapers, tip_paths
 from flexarm_control.trajectory import specs
@@ -80,9 +81,15 @@ def test_an_arc_keeps_its_distance_from_its_centre(two_link):
     radius = np.linalg.norm(begin - centre)
     np.testing.assert_allclose(np.linalg.norm(tips - centre, axis=1), radius, atol=1e-7)
     angles = np.unwrap(np.arctan2(*(tips - centre).T[1::-1]))
-    assert np.all(np.diff(angles) > 0.0) or np.all(np.diff(angles) < 0.0)
-    at_via = np.interp(0.0, np.sort((via - tips) @ (end - begin)), np.arange(33))
-    assert 0 < at_via < 32
+    steps = np.diff(angles)
+    np.testing.assert_array_equal(np.sign(steps), np.sign(steps[0]))
+
+    def ahead(t):
+        """How far the tip is ahead of `via`, along the chord [m^2]."""
+        return (resting_tip(two_link, path.position(t)) - via) @ (end - begin)
+
+    at_via = brentq(ahead, 0.1, 1.9, xtol=1e-12)
+    np.testing.assert_allclose(resting_tip(two_link, path.position(at_via)), via, atol=1e-7)
 
 
 def test_a_circle_turns_through_via_even_when_that_is_the_long_way():
