@@ -6,16 +6,18 @@ import pytest
 from scipy.integrate import quad
 
 from flexarm_control.motions.profiles import (
-    MOST_SMOOTHNESS,
+    MAX_SMOOTHNESS,
     paper_profile,
     quintic,
+    rows,
     sample,
     smooth,
 )
 from flexarm_control.trajectory import ReferenceGenerator, validate
-from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.errors import NOT_GIVEN, TrajectoryError
 
 S = 10**9  # [ns]
+NAN, INF = float("nan"), float("inf")
 PROFILES = [
     paper_profile(),
     paper_profile(3.0, [0.5, -1.0], [0.1, 0.2]),
@@ -65,7 +67,7 @@ def test_smooth_motions_are_the_polynomials_that_are_written_out_elsewhere():
     np.testing.assert_allclose(motion.acceleration(s)[:, 0], septic.deriv(2)(s), atol=1e-12)
 
 
-@pytest.mark.parametrize("k", [2, 3, 5, MOST_SMOOTHNESS])
+@pytest.mark.parametrize("k", [2, 3, 5, MAX_SMOOTHNESS])
 def test_smoothness_is_how_many_derivatives_vanish_at_the_ends(k):
     """theta leaves its ends as s^(k+1) / ((k+1) B): derivative k vanishes there and k + 1 does not."""
     motion, small = smooth(0.0, 1.0, 1.0, k), 1e-3
@@ -119,13 +121,10 @@ def test_shapes_follow_the_times_and_the_joints():
     [(quintic(0.2, -1.3, 0.7), 2, 1e-14), (paper_profile(), 21, 5.4e-9)],
 )
 def test_sampled_profiles_are_followed(profile, n_points, tolerance):
-    points = sample(profile, n_points)
-    rows = [
-        (round(t * S), list(p), list(v), list(a), []) for t, p, v, a in zip(*points, strict=True)
-    ]
+    points = rows(sample(profile, n_points))
     generator = ReferenceGenerator(["a"])
     generator.start(profile.start, 0)
-    assert generator.offer(validate(["a"], ["a"], 0, rows)).accepted
+    assert generator.offer(validate(["a"], ["a"], 0, points)).accepted
     for i in range(400):
         stamp = round(i * profile.duration / 390 * S)
         generator.sample(stamp)
@@ -135,28 +134,27 @@ def test_sampled_profiles_are_followed(profile, n_points, tolerance):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "field", "value"),
     [
-        (lambda: paper_profile(0.0), "duration is 0.0 s: it must be above 0, and 1e.09 at most"),
-        (
-            lambda: paper_profile(1.7e308),
-            "duration is 1.7e.308 s: it must be above 0, and 1e.09 at most",
-        ),
-        (lambda: paper_profile(float("nan")), "duration is nan s"),
-        (lambda: quintic(0.0, 1.0, float("inf")), "duration is inf s"),
-        (lambda: quintic(0.0, [1.0, float("nan")], 1.0), r"end\[1\] is nan rad"),
-        (lambda: paper_profile(angle=float("inf")), r"angle\[0\] is inf rad"),
-        (lambda: quintic([0.0, 1.0], [1.0, 2.0, 3.0], 1.0), "start, end, duration: .*shape"),
-        (lambda: quintic([[0.0]], 1.0, 1.0), r"have shape \(1, 1\)"),
-        (lambda: quintic("x", 1.0, 1.0), "start, end, duration"),
-        (lambda: smooth(0.0, 1.0, 1.0, 1), r"smoothness is 1: give an integer from 2 \(quintic\)"),
-        (lambda: smooth(0.0, 1.0, 1.0, 21), "smoothness is 21: give an integer from 2 .* to 20"),
-        (lambda: smooth(0.0, 1.0, 1.0, 3.0), "smoothness is 3.0"),
-        (lambda: smooth(0.0, 1.0, 0.0), "duration is 0.0 s"),
-        (lambda: sample(paper_profile(), 1), "n_points is 1: give an integer of at least 2"),
-        (lambda: sample(paper_profile(), 2.5), "n_points is 2.5"),
+        (lambda: paper_profile(0.0), "duration", 0.0),
+        (lambda: paper_profile(1.7e308), "duration", 1.7e308),
+        (lambda: paper_profile(NAN), "duration", NAN),
+        (lambda: quintic(0.0, 1.0, INF), "duration", INF),
+        (lambda: quintic(0.0, [1.0, NAN], 1.0), "end[1]", NAN),
+        (lambda: paper_profile(angle=INF), "angle[0]", INF),
+        (lambda: quintic([0.0, 1.0], [1.0, 2.0, 3.0], 1.0), "start, end, duration", NOT_GIVEN),
+        (lambda: quintic([[0.0]], 1.0, 1.0), "start, end", NOT_GIVEN),
+        (lambda: quintic("x", 1.0, 1.0), "start, end, duration", NOT_GIVEN),
+        (lambda: smooth(0.0, 1.0, 1.0, 1), "smoothness", 1),
+        (lambda: smooth(0.0, 1.0, 1.0, 21), "smoothness", 21),
+        (lambda: smooth(0.0, 1.0, 1.0, 3.0), "smoothness", 3.0),
+        (lambda: smooth(0.0, 1.0, 0.0), "duration", 0.0),
+        (lambda: sample(paper_profile(), 1), "n_points", 1),
+        (lambda: sample(paper_profile(), 2.5), "n_points", 2.5),
     ],
 )
-def test_what_makes_no_profile_is_refused(make, message):
-    with pytest.raises(TrajectoryError, match=message):
+def test_what_makes_no_profile_is_refused(make, field, value):
+    with pytest.raises(TrajectoryError) as error:
         make()
+    assert error.value.field == field
+    assert repr(error.value.value) == repr(value)

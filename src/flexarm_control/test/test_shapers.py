@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from flexarm_control.motions import excitation, shapers
 from flexarm_control.motions.profiles import quintic, smooth
-from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.errors import NOT_GIVEN, DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 OMEGA, ZETA = 7.3, 0.06
@@ -124,17 +124,18 @@ def test_on_the_papers_arm_the_fast_subsystem_is_left_at_rest(arm_r):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("make", "field", "value"),
     [
-        (lambda arm: shapers.zv(0.0, 0.1), "frequency is 0.0 rad/s: it must be above 0"),
-        (lambda arm: shapers.zvd(3.0, 1.0), "damping ratio of the mode at 3 rad/s is 1"),
-        (lambda arm: shapers.zv(3.0, -0.1), "is -0.1: only one from 0"),
-        (lambda arm: shapers.for_modes("ei", [1.0], [0.0]), "shaper 'ei': there are zv, zvd"),
-        (lambda arm: shapers.for_modes("zv", [], []), "no modes to shape for"),
-        (lambda arm: shapers.for_modes("zvd", [1.0] * 7, [0.0] * 7), "2187 impulses, above 1000"),
-        (lambda arm: shapers.for_arm(arm, [0.0], "zv", 3), "R: a shaper of 3 modes; the arm has 2"),
+        (lambda arm: shapers.zv(0.0, 0.1), "shaper frequency", 0.0),
+        (lambda arm: shapers.zvd(3.0, 1.0), "shaper damping ratio", 1.0),
+        (lambda arm: shapers.zv(3.0, -0.1), "shaper damping ratio", -0.1),
+        (lambda arm: shapers.for_modes("ei", [1.0], [0.0]), "shaper", "ei"),
+        (lambda arm: shapers.for_modes("zv", [], []), "shaper modes", NOT_GIVEN),
+        (lambda arm: shapers.for_modes("zvd", [1.0] * 7, [0.0] * 7), "shaper impulses", 2187),
+        (lambda arm: shapers.for_arm(arm, [0.0], "zv", 3), "shaper modes", 3),
     ],
 )
-def test_what_makes_no_shaper_is_refused(arm_r, make, message):
-    with pytest.raises(DesignError, match=message):
+def test_what_makes_no_shaper_is_refused(arm_r, make, field, value):
+    with pytest.raises(DesignError) as error:
         make(arm_r)
+    assert (error.value.field, error.value.value) == (field, value)

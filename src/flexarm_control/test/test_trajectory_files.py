@@ -5,21 +5,17 @@ import numpy as np
 import pytest
 import yaml
 
-from flexarm_control.motions.profiles import quintic, sample
+from flexarm_control.motions.profiles import quintic, rows, sample
 from flexarm_control.trajectory import files, validate
-from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.errors import NOT_GIVEN, TrajectoryError
 
 NAMES = ("shoulder", "elbow")
-S = 10**9  # [ns]
 
 
 def trajectory(fields=3):
-    points = sample(quintic([0.1, -1e-7], [1.0 / 3.0, 2.0], np.pi), 7)
-    rows = [
-        (round(t * S), *(list(v) if i < fields else [] for i, v in enumerate(values)), [])
-        for t, *values in zip(*points, strict=True)
-    ]
-    return validate(NAMES, NAMES, 0, rows)
+    points = rows(sample(quintic([0.1, -1e-7], [1.0 / 3.0, 2.0], np.pi), 7))
+    points = [(*row[: 1 + fields], *[[]] * (4 - fields)) for row in points]
+    return validate(NAMES, NAMES, 0, points)
 
 
 @pytest.mark.parametrize("suffix", files.SUFFIXES)
@@ -68,69 +64,79 @@ def test_csv_columns_may_be_in_any_order_with_blanks_and_empty_lines(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "field", "value"),
     [
-        ("", r"motion\.csv: empty: give a header t,q1\.\.q2"),
-        ("t,q1,q2\n", r"motion\.csv:1: no points below the header"),
-        ("t,q1\n0,0\n", r"motion\.csv:1: no column q2: wanted t,q1\.\.q2"),
-        ("q1,q2\n0,0\n", r"motion\.csv:1: no column t"),
-        ("t,q1,q2,qd1\n0,0,0,0\n", r"motion\.csv:1: no column qd2"),
-        ("t,q1,q2,q3\n0,0,0,0\n", r"motion\.csv:1: unknown column 'q3'.*shoulder, elbow"),
-        ("t,q1,q2,q1\n0,0,0,0\n", r"motion\.csv:1: column q1 is there 2 times"),
-        ("t,q1,q2\n0,0\n", r"motion\.csv:2: 2 values for 3 columns"),
-        ("t,q1,q2\n0,0,0\n1,0,x\n", r"motion\.csv:3: q2 is 'x', not a number"),
-        ("t,q1,q2\n0,nan,0\n", r"motion\.csv:2: q1 is 'nan', not finite"),
-        ("t,q1,q2\n1e10,0,0\n", r"motion\.csv:2: t is 1e\+10 s"),
-        ("t,q1,q2\n0,0,0\n\n0,1,0\n", r"line 4\.time_from_start is 0 s, not later than line 2"),
-        ("t,q1,q2,qdd1,qdd2\n0,0,0,0,0\n", r"line 2 has accelerations but no velocities"),
-        ("t,q1,q2,qd1,qd2\n1,0,0,1,0\n", r"last point's velocity of joint shoulder is 1\.0 rad/s"),
-        ("t,q1,q2\n0,9,0\n", r"line 2: position of joint shoulder is 9 rad, beyond its limit of 4"),
+        ("", ":1", NOT_GIVEN),
+        ("t,q1,q2\n", ":1", NOT_GIVEN),
+        ("t,q1\n0,0\n", ":1", "q2"),
+        ("q1,q2\n0,0\n", ":1", "t"),
+        ("t,q1,q2,qd1\n0,0,0,0\n", ":1", "qd2"),
+        ("t,q1,q2,q3\n0,0,0,0\n", ":1", "q3"),
+        ("t,q1,q2,q1\n0,0,0,0\n", ":1", "q1"),
+        ("t,q1,q2\n0,0\n", ":2", 2),
+        ("t,q1,q2\n0,0,0\n1,0,x\n", ":3: q2", "x"),
+        ("t,q1,q2\n0,nan,0\n", ":2: q1", "nan"),
+        ("t,q1,q2\n1e10,0,0\n", ":2: t", 1e10),
+        ("t,q1,q2\n0,0,0\n\n0,1,0\n", ": line 4.time_from_start", 0.0),
+        ("t,q1,q2,qdd1,qdd2\n0,0,0,0,0\n", ": line 2", NOT_GIVEN),
+        ("t,q1,q2,qd1,qd2\n1,0,0,1,0\n", ": line 2.velocities of joint shoulder", 1.0),
+        ("t,q1,q2\n0,9,0\n", ": line 2.positions of joint shoulder", 9.0),
     ],
 )
-def test_a_csv_that_cant_be_used_is_refused_naming_line_and_column(tmp_path, text, message):
+def test_a_csv_that_cant_be_used_is_refused_naming_line_and_column(tmp_path, text, field, value):
     path = tmp_path / "motion.csv"
     path.write_text(text)
-    with pytest.raises(TrajectoryError, match=message):
+    with pytest.raises(TrajectoryError) as error:
         files.read(path, NAMES, position_high=[4.0, 4.0])
+    assert (error.value.field, error.value.value) == (f"{path}{field}", value)
+
+
+def test_a_refused_csv_is_written_out_with_lines_for_points(tmp_path):
+    path = tmp_path / "motion.csv"
+    path.write_text("t,q1,q2\n1,0,0\n\n1,1,0\n")
+    with pytest.raises(TrajectoryError) as error:
+        files.read(path, NAMES)
+    assert str(error.value) == (
+        f"{path}: line 4.time_from_start: 1.0 s is not later than line 2 at 1 s; times must strictly increase"
+    )
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "field", "value"),
     [
-        ("", r"motion\.yaml: 0 trajectories"),
-        ("a: [", r"motion\.yaml:\d: not YAML"),
-        ("[1]", r"motion\.yaml: the file is \[1\]: give header, joint_names, points"),
-        ("joint_name: [a]", r"has 'joint_name': known are"),
-        ("joint_names: [a]\npoints: 3", r"points is 3: give a list"),
-        ("joint_names: [shoulder]\npoints: []", r"motion\.yaml: joint_names lacks 'elbow'"),
-        ("{joint_names: [shoulder, elbow], points: []}", r"motion\.yaml: empty trajectory"),
-        ("{joint_names: [a], points: [{position: [0]}]}", r"points\[0\] has 'position'"),
-        ("{joint_names: [a], points: [{positions: 0}]}", r"points\[0\]\.positions is 0: give a l"),
-        (
-            "{joint_names: [a], points: [{positions: [0, x]}]}",
-            r"points\[0\]\.positions\[1\] is 'x'",
-        ),
-        ("{joint_names: [a], points: [{positions: [on]}]}", r"points\[0\]\.positions\[0\] is True"),
+        ("", "", 0),
+        ("a: [", ":2", NOT_GIVEN),
+        ("[1]", "", [1]),
+        ("joint_name: [a]", "", "joint_name"),
+        ("joint_names: [a]\npoints: 3", ": points", 3),
+        ("joint_names: [shoulder]\npoints: []", ": joint_names", "elbow"),
+        ("{joint_names: [shoulder, elbow], points: []}", ": points", NOT_GIVEN),
+        ("{joint_names: [a], points: [{position: [0]}]}", ": points[0]", "position"),
+        ("{joint_names: [a], points: [{positions: 0}]}", ": points[0].positions", 0),
+        ("{joint_names: [a], points: [{positions: [0, x]}]}", ": points[0].positions[1]", "x"),
+        ("{joint_names: [a], points: [{positions: [on]}]}", ": points[0].positions[0]", True),
         (
             "{joint_names: [a], points: [{positions: [0], time_from_start: {sec: 0.5}}]}",
-            r"points\[0\]\.time_from_start\.sec is 0\.5: give an integer",
+            ": points[0].time_from_start.sec",
+            0.5,
         ),
     ],
 )
-def test_a_yaml_that_cant_be_used_is_refused_naming_point_and_field(tmp_path, text, message):
+def test_a_yaml_that_cant_be_used_is_refused_naming_point_and_field(tmp_path, text, field, value):
     path = tmp_path / "motion.yaml"
     path.write_text(text)
-    with pytest.raises(TrajectoryError, match=message):
+    with pytest.raises(TrajectoryError) as error:
         files.read(path, NAMES)
+    assert (error.value.field, error.value.value) == (f"{path}{field}", value)
 
 
 def test_a_file_that_is_not_there_or_of_another_kind_is_refused(tmp_path):
     with pytest.raises(TrajectoryError, match=r"none\.csv: No such file"):
         files.read(tmp_path / "none.csv", NAMES)
-    with pytest.raises(TrajectoryError, match=r"motion\.txt: a trajectory's file ends in \.csv"):
+    with pytest.raises(TrajectoryError, match=r"motion\.txt' has the wrong suffix \(\.csv"):
         files.read(tmp_path / "motion.txt", NAMES)
-    with pytest.raises(TrajectoryError, match=r"ends in \.csv"):
+    with pytest.raises(TrajectoryError, match="wrong suffix"):
         files.write(tmp_path / "motion", trajectory())
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(TrajectoryError, match=r"binary\.csv: not a text file"):
+    with pytest.raises(TrajectoryError, match=r"binary\.csv' is no text file"):
         files.read(tmp_path / "binary.csv", NAMES)

@@ -128,9 +128,9 @@ def test_one_angle_stands_for_all_joints_and_a_list_for_each():
         (["--to", "nan"], r"--to 'nan': 1 finite angles"),
         (["--from", "inf"], r"--from 'inf': 1 finite angles"),
         (["--from", "0;1"], r"--from '0;1': write numbers"),
-        (["--duration", "0"], r"duration is 0\.0 s"),
-        (["--duration", "-2"], r"duration is -2\.0 s"),
-        (["--duration", "nan"], r"duration is nan s"),
+        (["--duration", "0"], r"duration: 0\.0 s"),
+        (["--duration", "-2"], r"duration: -2\.0 s"),
+        (["--duration", "nan"], r"duration: nan s"),
     ],
 )
 @pytest.mark.parametrize("kind", ["paper", "quintic"])
@@ -163,20 +163,20 @@ def test_a_line_leads_the_tip_from_where_the_reference_is():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["smooth", "--smoothness", "1"], "smoothness is 1: give an integer from 2"),
-        (["quintic", "--smoothness", "3"], "quintic has no smoothness"),
-        (["quintic", "--torque-limit", "3"], "quintic has no torque-limit"),
-        (["paper", "--shape-modes", "1"], "shape-modes without shaper"),
+        (["smooth", "--smoothness", "1"], "smoothness: 1 is not possible"),
+        (["quintic", "--smoothness", "3"], "quintic: 'smoothness' is no setting"),
+        (["quintic", "--torque-limit", "3"], "quintic: 'torque-limit' is no setting"),
+        (["paper", "--shape-modes", "1"], "shape-modes: is given without shaper"),
         (
             ["paper", "--shaper", "zv", "--shape-modes", "3"],
-            "R: a shaper of 3 modes; the arm has 2",
+            "shaper modes: 3 are not possible for R",
         ),
-        (["line"], "line wants tip"),
+        (["line"], "line: tip is missing"),
         (["line", "--tip", "1,2"], r"--tip '1,2': 3 finite coordinates are wanted, x,y,z"),
         (["line", "--tip", "1"], r"--tip '1': 3 finite coordinates are wanted"),
-        (["line", "--tip", "1,0,0", "--to", "1"], "line has no to: it takes tip"),
-        (["line", "--tip", "3,0,0"], "R: the tip can't follow its path|the tip is already at"),
-        (["least-exciting", "--torque-limit", "-1"], r"torque_limit\[0\] is -1"),
+        (["line", "--tip", "1,0,0", "--to", "1"], "line: 'to' is no setting"),
+        (["line", "--tip", "3,0,0"], "tip path: R can't follow it|is where the tip is already"),
+        (["least-exciting", "--torque-limit", "-1"], r"torque_limit\[0\]: -1"),
     ],
 )
 def test_families_that_cant_be_are_refused_naming_the_option(words, message):
@@ -205,7 +205,7 @@ def test_a_torque_that_will_be_clipped_is_said(capsys):
 
 def test_a_file_of_another_kind_is_refused(capsys):
     assert exit_code(["publish", "paper", "--out", "motion.txt"]) == 1
-    assert "motion.txt: a trajectory's file ends in .csv" in capsys.readouterr().err
+    assert "'motion.txt' has the wrong suffix (.csv" in capsys.readouterr().err
 
 
 # --------------------------------------------------------------------------- progress

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a motion excites: the linear response of the fast subsystem (11) along it.
+r"""Excitation by a motion: the linear response of the fast subsystem (11) along it.
 
 The slow torque of the motion is that of the reduced model (10), :math:`\bar u = B^{-1}(\ddot q - a)`; with it the
-deflections have the quasi-steady state :math:`\bar\delta` (9). What is left, :math:`z_f = z - \bar z`, follows
-(11) with nothing but the motion of that state to drive it,
+deflections have the quasi-steady state :math:`\bar\delta` (9). The deviation :math:`z_f = z - \bar z` follows
+(11), driven only by the motion of that state,
 
 .. math:: \dot z_f = A_2 z_f - \frac{d}{dt}\begin{bmatrix}\bar\delta\\0\end{bmatrix},\qquad z_f(0) = 0,
 
 with :math:`A_2` along the motion, or at one configuration. It is measured by its energy,
 :math:`E = \frac12\delta_f^T K\delta_f + \frac12\dot\delta_f^T H_{22}^{-1}\dot\delta_f` (joints free), which
-counts metres and radians of all modes alike. The fast control is taken as absent: this is what it has to do.
+treats metres and radians of all modes alike. There is no fast control here: the energy is what it has to remove.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from flexarm_dynamics.singular_perturbation import (
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """What a motion does to the modes, by the linear theory.
+    """Excitation of the modes by a motion, by the linear theory.
 
     Attributes
     ----------
@@ -66,17 +66,17 @@ class Excitation:
 
 
 def along(model, profile, configuration=None, points=801) -> Excitation:
-    """Return what a motion excites.
+    """Return the excitation by a motion.
 
     Parameters
     ----------
     model : ArmModel
     profile : Profile
-        Or what has its methods and duration; from rest to rest.
+        From rest to rest; or an object with its methods and duration.
     configuration : (n,) array_like, optional
         Where (11) is taken [rad]; along the motion if not given.
     points : int
-        Of time; the quasi-steady state is taken as linear between them.
+        Of time; the quasi-steady state is linear between them.
 
     Returns
     -------
@@ -128,7 +128,7 @@ class FastResponse:
         self.m = m = model.n_modes
         if not m:
             return
-        # Half way through each step; one that stands for all stays.
+        # The middle of each step; a single row stands for all.
         q, qd = (0.5 * (x[1:] + x[:-1]) if len(x) > 1 else x for x in (q, qd))
         A2 = np.zeros((len(q), 2 * m, 2 * m))
         self.root = np.zeros((len(q), 2 * m, 2 * m))  # E = |root z|^2 / 2
@@ -142,8 +142,9 @@ class FastResponse:
             self.propagate, integral = sampled(A2, np.eye(2 * m), step)
         if not (np.isfinite(self.propagate).all() and np.isfinite(integral).all()):
             raise DesignError(
-                f"{model.arm.name}: on this motion the joints get so fast that the links lose their stiffness in"
-                " this model: take a longer duration"
+                f"of {model.arm.name} makes the joints so fast that the links lose their stiffness in this model",
+                field="motion",
+                hint="take a longer duration",
             )
         self.drive = -integral[:, :, :m] / step
 

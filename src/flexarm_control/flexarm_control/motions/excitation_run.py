@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shakes an arm sample by sample: waits for rest, applies an `ExcitationTorque`, stops at a limit. No ROS."""
+"""Excites an arm sample by sample: waits for rest, applies an `ExcitationTorque`, stops at a limit."""
 
 from enum import Enum
 
@@ -30,16 +30,16 @@ LIMITS = (
 PARAMETERS = (*excitation_torque.PARAMETERS, *LIMITS)
 #: At rest a joint stays within this [rad], and two encoder counts.
 REST = 0.005
-#: Share of full scale that a gauge may read where no limit is given [-].
-SHARE = 0.8
-#: The difference of joint angles is filtered with this share of the spring's 1/omega [-].
+#: Default limit of a gauge's reading, as a fraction of its full scale [-].
+FULL_SCALE_FRACTION = 0.8
+#: Time constant of the filtered difference of joint angles, as a fraction of the spring's 1/omega [-].
 FILTER = 0.1
 #: Damping ratio of the spring.
 DAMPING = 0.7
 
 
 class Stage(Enum):
-    """How far an excitation has come."""
+    """Stage of an excitation."""
 
     SETTLING = "waiting for rest"
     SHAKING = "shaking"
@@ -70,16 +70,16 @@ class ExcitationRun:
         self.settings = dict(settings)
         names = {p.name for p in excitation_torque.PARAMETERS}
         self._shape = {k: v for k, v in self.settings.items() if k in names}
-        # What can't be done is said before the arm moves.
+        # Impossible settings are refused before the arm moves.
         ExcitationTorque(model, self._shape)
         self.stage, self.reason = Stage.SETTLING, ""
         self.torque = np.zeros(model.n_joints)
         self._order, self._enabled = SampleOrder(), False
         self._limits = np.array([j.limits.position for j in arm.joints]).T
-        self._most = np.array([j.limits.torque for j in arm.joints])
+        self._max_torque = np.array([j.limits.torque for j in arm.joints])
         self._bias = np.array([g.bias for g in arm.gauges])
         limit = self.settings["strain_limit"]
-        self._strain = np.array([limit or SHARE * g.full_scale for g in arm.gauges])
+        self._strain = np.array([limit or FULL_SCALE_FRACTION * g.full_scale for g in arm.gauges])
         counts = np.array([j.encoder_counts or np.inf for j in arm.joints])
         self._rest = REST + 4.0 * np.pi / counts
         self._first = self._begin = self._before = None
@@ -87,13 +87,13 @@ class ExcitationRun:
 
     @property
     def duration(self):
-        """Of the shaking [s]; as planned at the straight arm before it begins."""
+        """Duration of the excitation [s]; until it begins, as planned for the straight arm."""
         if self._begin is None:
             return ExcitationTorque(self.model, self._shape).duration
         return self._push.duration
 
     def step(self, sample):
-        """Take a sample; whether its answer is `torque`, enabled.
+        """Take a sample; return whether to answer it with `torque`, enabled.
 
         Parameters
         ----------
@@ -119,13 +119,13 @@ class ExcitationRun:
         return self._enabled
 
     def stop(self, reason):
-        """End it; nothing after it has ended."""
+        """Stop the excitation, unless it has ended."""
         if self.stage in (Stage.SETTLING, Stage.SHAKING):
             self.stage, self.reason = Stage.STOPPED, reason
             self._enabled = False
 
     def _settle(self, sample):
-        """Until the arm has been at rest for long enough; then the torque is planned about where it is."""
+        """Wait until the arm has been at rest for long enough; then plan the torque about its position."""
         if self._first is None:
             self._first = (sample.stamp_ns, sample.position.copy())
         moved = np.abs(sample.position - self._first[1])
@@ -148,7 +148,7 @@ class ExcitationRun:
             self.stage = Stage.SHAKING
 
     def _shake(self, sample):
-        """The torque of this sample, unless the end or a limit has come."""
+        """Set the torque of this sample; return False at the end or at a limit."""
         time = 1e-9 * (sample.stamp_ns - self._begin)
         if time >= self._push.duration:
             self.stage = Stage.DONE
@@ -157,7 +157,7 @@ class ExcitationRun:
             return False
         self.torque[:] = self._push.torque(time)
         self._hold(sample)
-        np.clip(self.torque, -self._most, self._most, out=self.torque)
+        np.clip(self.torque, -self._max_torque, self._max_torque, out=self.torque)
         return True
 
     def _hold(self, sample):
@@ -169,14 +169,14 @@ class ExcitationRun:
         if sample.velocity_known:
             self._speed[:] = sample.velocity
         elif step > 0.0:
-            share = step / (step + FILTER / omega)
-            self._speed += share * ((sample.position - self._before[1]) / step - self._speed)
+            gain = step / (step + FILTER / omega)
+            self._speed += gain * ((sample.position - self._before[1]) / step - self._speed)
         self._before = (sample.stamp_ns, sample.position.copy())
         pull = omega**2 * (sample.position - self._start) + 2.0 * DAMPING * omega * self._speed
         self.torque -= self._push.inertia * pull
 
     def _beyond(self, sample, start):
-        """Stop at a limit; whether it did."""
+        """Stop at a limit; return whether one is exceeded."""
         names, q = self.model.joint_names, sample.position
         if not np.isfinite(q).all():
             self.stop(f"the position of {names[int(np.argmin(np.isfinite(q)))]} is not finite")

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Torques that shake an arm so that its motion tells its parameters: pulse, ring-down, sweep; and what stops them.
+r"""Torques that excite an arm, for identifying its parameters: pulse, ring-down and sweep.
 
-Of amplitude A, joint by joint, each with a time of rest after it, in which the arm rings freely:
+The joints are excited one after the other, with amplitude A and a pause in which the arm rings freely:
 
 - pulse: :math:`A` for half of the duration, then :math:`-A`: the rigid arm comes to rest again;
 - ring_down: :math:`A\sin(2\pi f t)`, some periods at the first bending frequency f with the joints free;
 - sweep: :math:`A\,w(t)\sin 2\pi(f_0 t + (f_1 - f_0)t^2/2T)`, from f_0 to f_1, faded in and out by w.
 
-Beside it acts what holds the arm's weight where it stood, and, where asked for, a soft spring and damper about that
-place: :math:`-B^{-1}_{jj}(\omega_h^2\,\Delta q + 1.4\,\omega_h\,\dot q)`. The recorded torque is the sum: a fit needs
-to know no more.
+A torque that holds the arm's weight where it stood is added, and optionally a soft spring and damper about that
+position: :math:`-B^{-1}_{jj}(\omega_h^2\,\Delta q + 1.4\,\omega_h\,\dot q)`. The recorded torque is the sum, which
+is all that a fit needs.
 """
 
 from collections.abc import Mapping
@@ -43,12 +43,12 @@ PARAMETERS = (
         "Where a sweep ends; 0: at 1.3 times the highest bending frequency of the arm file."
     ),
 )
-#: Share of a sweep over which it fades in, and out [-].
+#: Fraction of a sweep over which it fades in, and out [-].
 FADE = 0.05
 #: Periods of a ring-down's push.
 PUSHES = 3
-#: Least duration of a sweep [s], and in periods of the slowest mode.
-SHORTEST, SWEEP_PERIODS = 4.0, 12.0
+#: Minimum duration of a sweep [s], and in periods of the slowest mode.
+MIN_SWEEP, SWEEP_PERIODS = 4.0, 12.0
 
 
 class ExcitationTorque:
@@ -58,21 +58,21 @@ class ExcitationTorque:
     ----------
     model : ArmModel
     settings : mapping
-        Values of `PARAMETERS`; what is missing takes its default.
+        Values of `PARAMETERS`; a missing one takes its default.
     position : ndarray, shape (n,), optional
-        Where the arm stands [rad]; zero if not given.
+        Where the arm is at rest [rad]; zero if not given.
 
     Attributes
     ----------
     duration : float
-        Of the whole [s].
+        Of the whole torque [s].
     hold : ndarray, shape (n,)
-        What holds the arm's weight [N m].
+        Torque that holds the arm's weight [N m].
 
     Raises
     ------
     ParameterError, DesignError
-        For a joint that is not there, an amplitude beyond its limit, and a sweep that ends where it begins.
+        For an unknown joint, an amplitude beyond the joint's limit, and a sweep whose end is not above its start.
     """
 
     def __init__(self, model, settings: Mapping, position=None):
@@ -81,7 +81,7 @@ class ExcitationTorque:
         position = np.zeros(n) if position is None else np.asarray(position, float)
         a, B = slow_subsystem(model.terms(position, np.zeros(n)))
         self.hold = -np.linalg.solve(B, a)
-        #: Inertia that each joint moves alone [kg m^2].
+        #: Inertia that each joint moves by itself [kg m^2].
         self.inertia = 1.0 / np.diag(B)
         self.joints = _joints(model, s["joint"])
         self.amplitude = np.array(
@@ -93,10 +93,13 @@ class ExcitationTorque:
         self.first = modes[0]
         if s["kind"] == "sweep" and not self.high > self.low:
             raise DesignError(
-                f"sweep from frequency_low {self.low:g} Hz to frequency_high {self.high:g} Hz: the end must be above"
+                "Hz, the end of the sweep, is not above its start",
+                field="frequency_high",
+                value=float(self.high),
+                limit=f"above frequency_low, {self.low:g}",
             )
         default = {
-            "sweep": max(SHORTEST, SWEEP_PERIODS / modes[0]),
+            "sweep": max(MIN_SWEEP, SWEEP_PERIODS / modes[0]),
             "pulse": 0.5 / modes[0],
             "ring_down": PUSHES / modes[0],
         }
@@ -129,7 +132,9 @@ def _joints(model, name):
     if not name:
         return list(range(model.n_joints))
     if name not in model.joint_names:
-        raise DesignError(f"joint: {name!r} is none of {', '.join(model.joint_names)}")
+        raise DesignError(
+            "is unknown", field="joint", value=name, limit=", ".join(model.joint_names)
+        )
     return [model.joint_names.index(name)]
 
 
@@ -139,12 +144,17 @@ def _amplitude(joint, wanted, hold):
     if not wanted:
         if not np.isfinite(left):
             raise DesignError(
-                f"amplitude: give one [N m]: the arm file has no torque limit for {joint.name}"
+                f"is needed, for the arm file has no torque limit of {joint.name}",
+                field="amplitude",
+                hint="give one [N m]",
             )
         wanted = 0.2 * left
     if not 0.0 < wanted <= left:
         raise DesignError(
-            f"amplitude {wanted:g} N m: {joint.name} may have {joint.limits.torque:g} N m and needs"
-            f" {abs(hold):.3g} N m of it to hold the arm's weight"
+            f"N m is too much: {joint.name} needs {abs(hold):.3g} N m of its {joint.limits.torque:g} N m to hold the"
+            " arm's weight",
+            field="amplitude",
+            value=wanted,
+            limit=f"above 0, at most {left:.4g}",
         )
     return wanted

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The time law that excites the links least, for a given duration and torque limit.
+r"""Computes the time law that excites the links least, for a given duration and torque limit.
 
 The joints go in a straight line of joint space, :math:`q = q_0 + \Delta\,\sigma(t)`, and :math:`\sigma` is a spline of
 degree five with rest and no jerk at both ends, whose coefficients x are found by a convex programme
@@ -9,12 +9,12 @@ degree five with rest and no jerk at both ends, whose coefficients x are found b
 
 E the energy of the deviation from the quasi-steady state that the fast subsystem (11) has along the motion,
 linear in x before it is squared (`excitation`); :math:`E_5, J_5` those of a quintic of the same duration. The torque
-:math:`\bar u` of (10) and the quasi-steady state (9) are linearised along the last solution and the programme is
-solved anew until it changes no more: sequential convex programming. For one joint without gravity and
-friction a single solution is exact but for what the rate of the joint does to the stiffness.
+:math:`\bar u` of (10) and the quasi-steady state (9) are linearised along the last solution, and the programme is
+solved again until it no longer changes (sequential convex programming). For one joint without gravity and friction
+a single solution is exact, except for the effect of the joint's rate on the stiffness.
 
-The quadratic programme is solved by an interior-point method (`least_squares`). Whether there is a solution at all,
-and the least torque or duration if not, a linear programme says.
+An interior-point method solves the quadratic programme (`least_squares`). A linear programme decides whether there
+is a solution at all, and finds the least torque or duration if there is none.
 """
 
 from dataclasses import dataclass
@@ -30,21 +30,21 @@ from .profiles import Profile, quintic
 
 #: Pieces of the spline. Points at multiples of T / INTERVALS make the sampled motion exact.
 INTERVALS = 25
-#: Times at which limits hold and the response is taken, per piece.
+#: Times per piece at which limits are enforced and the response is computed.
 PER_INTERVAL = 6
 _DEGREE = 5
-_REST = 4  # coefficients at either end that rest without jerk fixes
-#: Weight w of what is left at the end, beside the mean along the way.
+_REST = 4  # coefficients at either end, fixed by rest without jerk
+#: Weight w of the energy left at the end, relative to the mean along the way.
 RESIDUAL_WEIGHT = 100.0
-#: Weight epsilon of the jerk: of what excites alike the smoother is taken.
+#: Weight epsilon of the jerk: of motions that excite alike, it selects the smoother.
 JERK_WEIGHT = 1e-4
 _ROUNDS = 40
-#: Rounds after which the fast subsystem stays that of the motion found so far: fast motions swing with it.
+#: The fast subsystem is updated in this many rounds only: with it, fast motions would not settle.
 _REFRESHED = 10
 _ITERATIONS = 100
 _SETTLED = 1e-5  # of sigma, between two rounds
 _STEP = 1e-5  # of the differences that linearise the torque
-#: How far the torque may be above its limit between the times at which it is held [-].
+#: How far the torque may exceed its limit between the times at which it is enforced [-].
 _SLACK = 1e-6
 
 
@@ -57,9 +57,9 @@ class LeastExciting:
     profile : Profile
         The motion.
     excitation : Excitation
-        What it excites, and its torque, by the full reduced model.
+        Its excitation and torque, by the full reduced model.
     quintic : Excitation
-        The same of the quintic of the same duration, which may go beyond the limits.
+        The same for the quintic of the same duration, which may exceed the limits.
     rounds : int
         Convex programmes solved.
     """
@@ -83,8 +83,8 @@ def least_exciting(
     duration : float
         T [s].
     torque_limit, velocity_limit : (n,) array_like, optional
-        Of the slow torque [N m] and of the speeds [rad/s]; the arm file's limits if not given. The fast
-        control wants torque beside it: leave it some.
+        Of the slow torque [N m] and of the speeds [rad/s]; the arm file's limits if not given. Leave some
+        torque for the fast control.
     configuration : (n,) array_like, optional
         Where (11) is taken [rad]; along the motion if not given.
 
@@ -95,7 +95,7 @@ def least_exciting(
     Raises
     ------
     TrajectoryError
-        If no time law keeps within the limits; names the least torque and the least duration that would do.
+        If no time law stays within the limits; with the least torque and the least duration that would do.
     DesignError
         If the programme does not settle.
     ShapeError
@@ -103,12 +103,12 @@ def least_exciting(
     """
     base = quintic(start, end, duration)
     if base.start.shape != (model.n_joints,):
-        raise ShapeError(f"start has shape {base.start.shape}, wanted {(model.n_joints,)}")
+        raise ShapeError(f"has shape {base.start.shape}", field="start", limit=(model.n_joints,))
     joints = [joint.limits for joint in model.arm.joints]
     torque = _limit("torque_limit", torque_limit, [j.torque for j in joints])
     speed = _limit("velocity_limit", velocity_limit, [j.velocity for j in joints])
     if not np.any(base.angle):
-        raise TrajectoryError("start and end are the same: there is nothing to move")
+        raise TrajectoryError("is the start: there is nothing to move", field="end")
     problem = _Problem(model, base, torque, speed, configuration)
     problem.check_feasible()
     x, rounds = problem.solve()
@@ -125,10 +125,12 @@ def least_exciting(
 def _limit(name, given, default):
     values = np.array(default if given is None else given, float)
     if values.shape != (len(default),):
-        raise ShapeError(f"{name} has shape {values.shape}, wanted {(len(default),)}")
+        raise ShapeError(f"has shape {values.shape}", field=name, limit=(len(default),))
     if not (values > 0.0).all():
         i = int(np.argmin(values > 0.0))
-        raise TrajectoryError(f"{name}[{i}] is {values[i]}: it must be above 0")
+        raise TrajectoryError(
+            "is out of range", field=f"{name}[{i}]", value=float(values[i]), limit="above 0"
+        )
     return values
 
 
@@ -180,7 +182,7 @@ class _Problem:
     # Limits ------------------------------------------------------------------------------------
 
     def linearised(self, x, duration):
-        """Torque and quasi-steady amplitudes at the grid's times: r + A x, exact in value at x, and in slope.
+        """Torque and quasi-steady amplitudes at the grid's times: r + A x, exact at x in value and gradient.
 
         Returns
         -------
@@ -190,17 +192,17 @@ class _Problem:
         b, T = self.basis, duration
         states = [(r + A @ x) for r, A in zip(b.constants[:3], b.matrices[:3], strict=True)]
         value = self._reduced(*states, T)
-        slopes = []
+        gradients = []
         for i in range(3):
-            # Forward differences: exact for the acceleration, which is linear, and near enough for the
+            # Forward differences: exact for the acceleration, which is linear, and accurate enough for the
             # others, whose change between two rounds goes to zero.
             step = 1.0 if i == 2 else _STEP
             ahead = list(states)
             ahead[i] = states[i] + step
-            slopes.append((self._reduced(*ahead, T) - value) / step)
+            gradients.append((self._reduced(*ahead, T) - value) / step)
         A = sum(
-            slope[:, :, None] * matrix[:, None, :]
-            for slope, matrix in zip(slopes, b.matrices[:3], strict=True)
+            gradient[:, :, None] * matrix[:, None, :]
+            for gradient, matrix in zip(gradients, b.matrices[:3], strict=True)
         )
         return value - A @ x, A
 
@@ -219,13 +221,16 @@ class _Problem:
             ]
         except np.linalg.LinAlgError:
             raise DesignError(
-                f"{self.model.arm.name}: in {duration:g} s the joints get so fast that the links lose their stiffness"
-                " in this model, and the quasi-steady state does not exist: take a longer duration"
+                f"s makes the joints of {self.model.arm.name} so fast that the links lose their stiffness in this"
+                " model, and the quasi-steady state does not exist",
+                field="duration",
+                value=duration,
+                hint="take a longer one",
             ) from None
         return np.array(rows)
 
     def torque_rows(self, r, A):
-        """Torque over its limit at all times and for all joints that have one: r (k,), A (k, c)."""
+        """Torque divided by its limit, at all times, for all joints that have one: r (k,), A (k, c)."""
         n = self.model.n_joints
         bounded = np.flatnonzero(np.isfinite(self.torque_limit))
         scale = self.torque_limit[bounded]
@@ -233,12 +238,12 @@ class _Problem:
         return r.ravel(), A.reshape(r.size, A.shape[2])
 
     def speed_bound(self, duration):
-        """Largest sigma' by s that all joints' speeds allow."""
+        """Largest sigma' by s that the speed limits of all joints allow."""
         moving = self.base.angle != 0.0
         return float(np.min(self.speed_limit[moving] / np.abs(self.base.angle[moving])) * duration)
 
     def check_feasible(self):
-        """Refuse limits that no time law keeps, saying what would do."""
+        """Refuse limits that no time law keeps, with limits that would do."""
         T = self.base.duration
         shortest = T / self.speed_bound(T) if np.isfinite(self.speed_bound(T)) else 0.0
         # The quintic's peak speed is 15/8 of the mean.
@@ -247,35 +252,36 @@ class _Problem:
         need = np.inf if shortest >= T else self._least_factor(T)
         if need <= 1.0:
             return
-        raise TrajectoryError(self._why_not(T, shortest, need))
+        why, hint = self._why_not(T, shortest, need)
+        raise TrajectoryError(
+            f"s is too short for the limits: {why}", field="duration", value=T, hint=hint
+        )
 
     def _why_not(self, T, shortest, need):
+        """Why no motion keeps the limits, and what would do."""
         limits = self.torque_limit
-        what = f"no motion of {T:g} s keeps within the limits: "
         if np.isfinite(need):
             enough = ", ".join(
                 f"{name} {need * limit:.4g}"
                 for name, limit in zip(self.model.joint_names, limits, strict=True)
                 if np.isfinite(limit)
             )
-            what += f"it wants {need:.4g} times the torque limits ({enough} N m)"
+            why = f"it needs {need:.4g} times the torque limits ({enough} N m)"
+        elif shortest >= T:
+            why = f"the speed limits alone need {shortest:.4g} s"
         else:
-            what += (
-                f"the speeds alone want {shortest:.4g} s"
-                if shortest >= T
-                else "the speed limits leave no time law"
-            )
+            why = "the speed limits leave no time law"
         hold = max(
             np.max(np.abs(excitation.reduced(self.model, q, 0 * q, 0 * q)[0]) / limits)
             for q in self.base.position(np.linspace(0.0, T, 33))
         )
         if hold >= 1.0:
-            return what + f"; holding the arm on the way takes {hold:.4g} times them, however slow"
+            return f"holding the arm on the way takes {hold:.4g} times the torque limits", ""
         duration = self._least_duration(max(T, shortest), need)
-        return what + (f"; a duration of {duration:.4g} s would do" if duration else "")
+        return why, f"take {duration:.4g} s" if duration else ""
 
     def _least_duration(self, below, need):
-        """A duration that does, within 1 % of the least; None if there is none to be found."""
+        """A duration that is long enough, within 1 % of the least; None if none is found."""
         # Torques of inertia fall as 1 / T^2.
         above = below * (1.005 * np.sqrt(need) if np.isfinite(need) else 1.005)
         for _ in range(12):
@@ -335,7 +341,7 @@ class _Problem:
             except TrajectoryError as error:
                 raise self._unsettled(f"round {count}: {error}") from None
             change = np.abs(self.basis.matrices[0] @ (new - x)).max()
-            # A full step where it comes to rest; parts of it where it swings to and fro.
+            # A full step while it converges, a part of it where it oscillates.
             part = max(0.5 * part, 0.1) if change > 0.7 * before else min(1.5 * part, 1.0)
             x, before = x + (part if change > _SETTLED else 1.0) * (new - x), change
             if change > _SETTLED:
@@ -343,15 +349,16 @@ class _Problem:
             excess = self._excess(x)
             if excess <= 1.0 + _SLACK:
                 return x, count
-            # Between the times at which it is held the torque is above its limit by a little.
+            # Between the times at which it is enforced, the torque exceeds its limit by a little.
             tighter *= (1.0 - 0.1 * _SLACK) / excess
         raise self._unsettled(f"it still changes after {_ROUNDS} rounds")
 
     @staticmethod
     def _unsettled(why):
         return DesignError(
-            f"the least-exciting motion does not settle ({why}): the torque changes too much along it; give a longer"
-            " duration, a higher torque limit, or one configuration"
+            f"does not settle ({why}): the torque changes too much along it",
+            field="least-exciting motion",
+            hint="give a longer duration, a higher torque limit, or one configuration",
         )
 
     def _response(self, x):
@@ -362,7 +369,7 @@ class _Problem:
         return excitation.FastResponse(self.model, times[1], *where)
 
     def _excess(self, x):
-        """Peak torque over its limit, by the full reduced model, between the grid's times as well."""
+        """Peak torque divided by its limit, by the full reduced model, also between the grid's times."""
         profile = self.profile(x)
         times = np.linspace(0.0, profile.duration, 2 * (self.basis.s.size - 1) + 1)
         motion = (f(times) for f in (profile.position, profile.velocity, profile.acceleration))
@@ -374,9 +381,9 @@ class _Problem:
         T, b, n = self.base.duration, self.basis, self.model.n_joints
         r, A = self.linearised(x, T)
         rows, sides = self._objective(r[:, n:], A[:, n:])
-        torque, slopes = self.torque_rows(r, A)
+        torque, gradients = self.torque_rows(r, A)
         G, h = (
-            [-slopes, slopes, b.matrices[1]],
+            [-gradients, gradients, b.matrices[1]],
             [torque - tighter, -torque - tighter, -b.constants[1]],
         )
         bound = self.speed_bound(T)
@@ -386,7 +393,7 @@ class _Problem:
         return least_squares(rows, sides, np.vstack(G), np.concatenate(h))
 
     def _objective(self, r, A):
-        """Rows and right-hand sides whose squared difference the programme makes least."""
+        """Rows and right-hand sides whose squared difference the programme minimises."""
         b, k = self.basis, self.basis.s.size
         quintics = self.first
         jerk = b.matrices[3] / np.sqrt(k)
@@ -427,13 +434,13 @@ def least_squares(E, f, G, h):
     TrajectoryError
         If it does not converge: the inequalities contradict each other.
     """
-    # Columns of Q in the place of those of E: the Hessian is the identity.
+    # With the columns of Q instead of those of E the Hessian is the identity.
     Q, R = np.linalg.qr(E)
     C = np.linalg.solve(R.T, G.T).T
     scale = np.linalg.norm(C, axis=1)
     empty = scale <= 1e-12 * scale.max()  # at the ends nothing is free
     if (h[empty] > 1e-9).any():
-        raise TrajectoryError("the limits leave no room at the ends: raise one of them")
+        raise TrajectoryError("the limits leave no room at the ends", hint="raise one of them")
     C, d = C[~empty] / scale[~empty, None], h[~empty] / scale[~empty]
     y = target = Q.T @ f
     if (C @ y >= d).all():
@@ -464,7 +471,7 @@ def least_squares(E, f, G, h):
         dy, ds, df = step(slack * force + ds * df - centre)
         reach = min(1.0, 0.995 * min(_reach(slack, ds), _reach(force, df)))
         y, slack, force = y + reach * dy, slack + reach * ds, force + reach * df
-    raise TrajectoryError("the limits contradict each other: raise one of them")
+    raise TrajectoryError("the limits contradict each other", hint="raise one of them")
 
 
 def _reach(values, change):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions in closed form, and their points for a `trajectory_msgs/JointTrajectory`.
 
-Each goes from rest to rest along theta(t) = start + angle sigma(s), s = t / T, sigma from 0 to 1.
+Each motion goes from rest to rest: theta(t) = start + angle sigma(s), s = t / T, sigma from 0 to 1.
 """
 
 from collections.abc import Callable
@@ -13,10 +13,10 @@ from scipy.special import beta, betainc
 
 from flexarm_dynamics.errors import TrajectoryError
 
-#: Beyond this the middle of the motion gets steep, and nothing is gained at its ends.
-MOST_SMOOTHNESS = 20
-#: A longer motion is a slip of the pen [s].
-LONGEST = 1e9
+#: With a higher smoothness the middle of the motion gets steeper and nothing is gained at its ends.
+MAX_SMOOTHNESS = 20
+#: A longer motion must be a typing error [s].
+MAX_DURATION = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,9 @@ def paper_profile(duration=2.0, angle=np.pi / 2, start=0.0) -> Profile:
     theta_dot = (angle / T) [1 + sin(2 pi t / T - pi / 2)] = (angle / T) [1 - cos(2 pi t / T)]
 
     which integrates to theta = angle [s - sin(2 pi s) / (2 pi)], s = t / T. With the defaults
-    this is 45 [1 + sin(2 pi t / T - pi / 2)] deg/s, from 0 to 90 deg in 2 s. The paper prints 90
-    in the place of 45: the mean of the bracket is 1, so 90 deg/s over 2 s would go to 180 deg,
-    while the text ends at 90 deg and designs the fast control for 90 deg.
+    this is 45 [1 + sin(2 pi t / T - pi / 2)] deg/s, from 0 to 90 deg in 2 s. The published paper
+    has 90 instead of 45. That must be a misprint: the mean of the bracket is 1, so that 90 deg/s
+    over 2 s would end at 180 deg, but the text ends at 90 deg and designs the fast control there.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
     duration : float
         T [s].
     smoothness : int
-        k, from 2 to `MOST_SMOOTHNESS`.
+        k, from 2 to `MAX_SMOOTHNESS`.
 
     Returns
     -------
@@ -169,10 +169,9 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
         If the smoothness is out of range, and as for `quintic`.
     """
     k = smoothness
-    if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 2 <= k <= MOST_SMOOTHNESS:
-        raise TrajectoryError(
-            f"smoothness is {k!r}: give an integer from 2 (quintic) to {MOST_SMOOTHNESS}"
-        )
+    if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 2 <= k <= MAX_SMOOTHNESS:
+        limit = f"integers from 2 to {MAX_SMOOTHNESS}"
+        raise TrajectoryError("is not possible", field="smoothness", value=k, limit=limit)
     start, end, duration = _checked(start, end, duration, "end")
     peak = 1.0 / beta(k + 1, k + 1)
     return Profile(
@@ -210,7 +209,7 @@ def sample(profile, n_points) -> SampledProfile:
     Parameters
     ----------
     profile : Profile
-        The motion; anything that has its methods and duration.
+        The motion, or an object with its methods and duration.
     n_points : int
         k, at least 2.
 
@@ -225,11 +224,28 @@ def sample(profile, n_points) -> SampledProfile:
         If there are fewer than 2 points.
     """
     if not isinstance(n_points, int | np.integer) or n_points < 2:
-        raise TrajectoryError(f"n_points is {n_points!r}: give an integer of at least 2")
+        limit = "integers from 2"
+        raise TrajectoryError("is not possible", field="n_points", value=n_points, limit=limit)
     times = np.linspace(0.0, profile.duration, n_points)
     return SampledProfile(
         times, profile.position(times), profile.velocity(times), profile.acceleration(times)
     )
+
+
+def rows(points):
+    """Return a `SampledProfile` as the points that `flexarm_control.trajectory.validate` takes.
+
+    Parameters
+    ----------
+    points : SampledProfile
+
+    Returns
+    -------
+    list of tuple
+        ``(time_from_start_ns, positions, velocities, accelerations, effort)`` each, effort empty.
+    """
+    lists = (values.tolist() for values in points)
+    return [(round(1e9 * t), *values, []) for t, *values in zip(*lists, strict=True)]
 
 
 def _checked(start, other, duration, other_name):
@@ -241,19 +257,27 @@ def _checked(start, other, duration, other_name):
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise TrajectoryError(
-            f"start, {other_name}, duration: {error}; give a number or one per joint for the "
-            "first two, a number of seconds for the duration"
+            str(error),
+            field=f"start, {other_name}, duration",
+            hint="give a number or one per joint for the first two, seconds for the duration",
         ) from None
     if start.ndim != 1:
         raise TrajectoryError(
-            f"start and {other_name} have shape {start.shape}: give (n,), one number per joint"
+            f"have shape {start.shape}",
+            field=f"start, {other_name}",
+            hint="give (n,), one number per joint",
         )
-    if not 0.0 < duration <= LONGEST:
+    if not 0.0 < duration <= MAX_DURATION:
         raise TrajectoryError(
-            f"duration is {duration} s: it must be above 0, and {LONGEST:g} at most"
+            "s is out of range",
+            field="duration",
+            value=duration,
+            limit=f"above 0, at most {MAX_DURATION:g}",
         )
     for name, values in (("start", start), (other_name, other)):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
-            raise TrajectoryError(f"{name}[{bad[0]}] is {values[bad[0]]} rad: it must be finite")
+            raise TrajectoryError(
+                "rad is not finite", field=f"{name}[{bad[0]}]", value=float(values[bad[0]])
+            )
     return start, other, duration

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Input shapers: a motion that is delayed copies of itself, so that what one copy excites the next cancels.
+r"""Input shapers: a motion becomes delayed copies of itself; what one copy excites, the next cancels.
 
-Of a mode :math:`\omega,\zeta` at rest before, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,
-:math:`\sum A_i = 1`, leaves after its last impulse :math:`t_n` the part
+In a mode :math:`\omega,\zeta` at rest before, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,
+:math:`\sum A_i = 1`, leaves after its last impulse :math:`t_n` the fraction
 
 .. math:: V(\omega,\zeta) = e^{-\zeta\omega t_n}\sqrt{C^2 + S^2},\quad
     C = \sum_i A_i e^{\zeta\omega t_i}\cos\omega_d t_i,\quad S = \sum_i A_i e^{\zeta\omega t_i}\sin\omega_d t_i
 
-of the vibration that a single impulse makes (Singer & Seering 1990), :math:`\omega_d=\omega\sqrt{1-\zeta^2}`;
-and of any motion convolved with it the same part. With :math:`K = e^{-\zeta\pi/\sqrt{1-\zeta^2}}`:
+of the vibration that a single impulse causes (Singer & Seering 1990), :math:`\omega_d=\omega\sqrt{1-\zeta^2}`.
+Any motion convolved with the train leaves the same fraction of its own vibration. With
+:math:`K = e^{-\zeta\pi/\sqrt{1-\zeta^2}}`:
 
 - ZV (zero vibration), half a period long: A = (1, K) / (1 + K), V = 0 at the design frequency;
 - ZVD (and zero derivative), one period: A = (1, 2K, K^2) / (1 + K)^2, dV/domega = 0 there as well. It is
   ZV convolved with itself.
 
-Several modes: the trains convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
-subsystem (11), whose input, the slow torque, is what the motion becomes: with a mass matrix and a
-configuration that do not change, the torque is shaped as the motion is, and V is exact.
+For several modes the trains are convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
+subsystem (11), whose input is the slow torque of the motion. While mass matrix and configuration do not change,
+the torque is shaped as the motion is, and V is exact.
 """
 
 from dataclasses import dataclass
@@ -26,8 +27,8 @@ import numpy as np
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
 
-#: Every sample of a shaped motion evaluates the motion once per impulse.
-MOST_IMPULSES = 1000
+#: A longer train is refused: every sample of a shaped motion evaluates the motion once per impulse.
+MAX_IMPULSES = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class Shaper:
         return Shaper(times[order], amplitudes[order])
 
     def residual(self, omega, zeta):
-        """Return V: the part of a mode's vibration that is left.
+        """Return V, the fraction of a mode's vibration that is left.
 
         Parameters
         ----------
@@ -82,9 +83,9 @@ class Shaper:
 
 
 class ShapedProfile:
-    """A motion convolved with a shaper: sum of its delayed copies, each with its amplitude.
+    """A motion convolved with a shaper: the sum of its delayed copies, each with its amplitude.
 
-    It has the methods of a `Profile`, with derivatives as exact as that one's.
+    It has the methods of a `Profile`; its derivatives are as exact as those of the profile.
 
     Parameters
     ----------
@@ -140,11 +141,16 @@ def zv(omega, zeta) -> Shaper:
     """
     omega, zeta = float(omega), float(zeta)
     if not 0.0 < omega < np.inf:
-        raise DesignError(f"shaper: a mode's frequency is {omega} rad/s: it must be above 0")
+        raise DesignError(
+            "rad/s is out of range", field="shaper frequency", value=omega, limit="finite, above 0"
+        )
     if not 0.0 <= zeta < 1.0:
         raise DesignError(
-            f"shaper: the damping ratio of the mode at {omega:g} rad/s is {zeta:g}: only one from 0 to below 1"
-            " makes vibrations to cancel; shape fewer modes"
+            f"of the mode at {omega:g} rad/s is not that of a vibration",
+            field="shaper damping ratio",
+            value=zeta,
+            limit="at least 0, below 1",
+            hint="shape fewer modes",
         )
     root = np.sqrt(1.0 - zeta**2)
     K = np.exp(-zeta * np.pi / root)
@@ -177,18 +183,21 @@ def for_modes(kind, omega, zeta) -> Shaper:
     Raises
     ------
     DesignError
-        If there is no such shaper, no mode, more impulses than `MOST_IMPULSES`, and as for `zv`.
+        If there is no such shaper, no mode, more impulses than `MAX_IMPULSES`, and as for `zv`.
     """
     if kind not in SHAPERS:
-        raise DesignError(f"shaper {kind!r}: there are {', '.join(SHAPERS)}")
+        raise DesignError("is unknown", field="shaper", value=kind, limit=", ".join(SHAPERS))
     trains = [SHAPERS[kind](w, z) for w, z in zip(omega, zeta, strict=True)]
     if not trains:
-        raise DesignError("shaper: no modes to shape for: give at least one")
+        raise DesignError("no modes", field="shaper modes", hint="give at least one")
     impulses = int(np.prod([train.times.size for train in trains]))
-    if impulses > MOST_IMPULSES:
+    if impulses > MAX_IMPULSES:
         raise DesignError(
-            f"shaper {kind} of {len(trains)} modes has {impulses} impulses, above {MOST_IMPULSES}:"
-            " shape fewer modes"
+            f"of {kind} for {len(trains)} modes are too many",
+            field="shaper impulses",
+            value=impulses,
+            limit=MAX_IMPULSES,
+            hint="shape fewer modes",
         )
     out = trains[0]
     for train in trains[1:]:
@@ -227,9 +236,11 @@ def for_arm(model, q, kind, modes=2) -> Shaper:
     """
     omega, zeta = modes_at(model, q)
     if not 1 <= modes <= omega.size:
+        arm = model.arm.name
         raise DesignError(
-            f"{model.arm.name}: a shaper of {modes} modes; the arm has {omega.size}: give 1 to {omega.size}"
-            if omega.size
-            else f"{model.arm.name}: a rigid arm has no modes to shape for"
+            f"are not possible for {arm}" if omega.size else f"are not possible: {arm} is rigid",
+            field="shaper modes",
+            value=modes,
+            limit=f"1 to {omega.size}" if omega.size else None,
         )
     return for_modes(kind, omega[:modes], zeta[:modes])

@@ -2,15 +2,15 @@
 r"""Paths of the tip in space, a straight line or a circular arc, as motions of the joints.
 
 The path :math:`x(s)`, s from 0 to 1, is turned into joint angles Q(s) by the inverse kinematics of the arm at rest
-(`flexarm_dynamics.models.inverse_kinematics`): bent by its weight, so that the *bent* arm's tip is on the path. Each
-solution begins at the one before, so that Q has no jumps; Q is the spline of degree five through them, with as
-many points as it takes for its tip to be within `TOLERANCE` of the path everywhere. With a time law
+(`flexarm_dynamics.models.inverse_kinematics`). That arm is bent by its weight, so that the *bent* arm's tip is on the
+path. Each solution begins at the previous one, so that Q has no jumps. Q is the spline of degree five through the
+solutions; points are added until its tip is within `TOLERANCE` of the path everywhere. With a time law
 :math:`\sigma(t)`,
 
 .. math:: q = Q(\sigma),\quad \dot q = Q'\dot\sigma,\quad
     \ddot q = Q''\dot\sigma^2 + Q'\ddot\sigma.
 
-What the motion itself bends is not compensated: it is the slower the less.
+The bending by the motion itself is not compensated; a slower motion bends less.
 """
 
 import numpy as np
@@ -22,11 +22,11 @@ from flexarm_dynamics.models.inverse_kinematics import TipKinematics, checked, n
 
 #: How far the resting tip may be from the path [m].
 TOLERANCE = 1e-7
-_FEWEST, _MOST = 32, 512
+_MIN_KNOTS, _MAX_KNOTS = 32, 512
 
 
 class TipPath:
-    """A motion that leads the tip along a path; it has the methods of a `Profile`.
+    """A motion of the tip along a path; it has the methods of a `Profile`.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class TipPath:
         return TipPath(self._curve, self._joints, law)
 
     def tip(self, t) -> np.ndarray:
-        """Return where on the path the tip is meant to be at t [s], scalar or (k,): (3,) or (k, 3) [m]."""
+        """Return the wanted position of the tip at t [s], scalar or (k,): (3,) or (k, 3) [m]."""
         return self._curve(self._law.position(t))
 
     def position(self, t) -> np.ndarray:
@@ -66,7 +66,7 @@ class TipPath:
 
 
 def line(model, start, end, law, bent=True) -> TipPath:
-    """Lead the tip along a straight line.
+    """Return the motion of the tip along a straight line.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def line(model, start, end, law, bent=True) -> TipPath:
     end : (3,) array_like
         Where it ends, in the base frame [m].
     law : Profile
-        Of one joint, from 0 to 1: how much of the path is done.
+        Of one joint, from 0 to 1: the fraction of the path.
     bent : bool
-        Whether the weight's deflections are compensated.
+        Whether to compensate the deflections by weight.
 
     Returns
     -------
@@ -87,19 +87,24 @@ def line(model, start, end, law, bent=True) -> TipPath:
     Raises
     ------
     TrajectoryError
-        If the path can't be followed to its end; names how far along, and how near the tip comes.
+        If the path can't be followed to its end; with the fraction that can, and how near the tip comes.
     """
     end, start = checked(model, end, start)
     kinematics = TipKinematics(model, bent)
     begin = kinematics.tip(start)
     way = end - begin
     if np.linalg.norm(way) < 1e-9:
-        raise TrajectoryError(f"the tip is already at {show(end)} m: give another point")
+        raise TrajectoryError(
+            "m is where the tip is already",
+            field="tip",
+            value=end.tolist(),
+            hint="give another point",
+        )
     return _follow(kinematics, start, lambda s: begin + np.multiply.outer(_scalar(s), way), law)
 
 
 def arc(model, start, via, end, law, bent=True) -> TipPath:
-    """Lead the tip along the circle from where it is, through `via`, to `end`.
+    """Return the motion of the tip along the circle from where it is, through `via`, to `end`.
 
     Parameters
     ----------
@@ -130,7 +135,8 @@ def circle(begin, via, end):
     square = normal @ normal
     if square < 1e-12 * (a @ a) * (b @ b) or not square:
         raise TrajectoryError(
-            f"arc: {show(begin)}, {show(via)} and {show(end)} m are on a line: they make no circle"
+            f"{show(begin)}, {show(via)} and {show(end)} m are on a line and make no circle",
+            field="arc",
         )
     to_centre = np.cross((a @ a) * b - (b @ b) * a, normal) / (2.0 * square)
     centre, first = begin + to_centre, -to_centre
@@ -154,7 +160,7 @@ def circle(begin, via, end):
 
 
 def _scalar(s):
-    """The path's parameter as laws of one joint give it, (k, 1), or plain, (k,)."""
+    """The path's parameter (k,), from the (k, 1) of a law of one joint or from (k,)."""
     s = np.asarray(s, float)
     return s[..., 0] if s.ndim and s.shape[-1] == 1 else s
 
@@ -166,26 +172,30 @@ def _follow(kinematics, start, curve, law):
     if outside.size:
         i = int(outside[0])
         raise TrajectoryError(
-            f"joint {kinematics.model.joint_names[i]} starts at {start[i]:.6g} rad, beyond its limits"
-            f" {low[i]:g} to {high[i]:g} rad: start within"
+            "rad is out of range",
+            field=f"start of joint {kinematics.model.joint_names[i]}",
+            value=float(start[i]),
+            limit=f"{low[i]:g} to {high[i]:g}",
         )
-    count = _FEWEST
+    count = _MIN_KNOTS
     while True:
         knots = np.linspace(0.0, 1.0, count + 1)
-        # The path is stepped through anew: points in between would end on another way through
-        # the joints of an arm with more of them than it needs.
+        # The path is solved anew from its start: solutions for added points alone could end in another
+        # branch, of an arm with more joints than it needs.
         angles = _solve_along(kinematics, knots, curve, start)
         joints = make_interp_spline(knots, angles, k=5)
         between = 0.5 * (knots[1:] + knots[:-1])
         off = [np.linalg.norm(kinematics.tip(joints(s)) - curve(s)) for s in between]
         if max(off) <= TOLERANCE:
             return TipPath(curve, joints, law)
-        if count >= _MOST:
+        if count >= _MAX_KNOTS:
             worst = int(np.argmax(off))
             raise TrajectoryError(
-                f"the joints can't follow the tip's path smoothly at {100 * between[worst]:.0f} % of it, near q ="
+                f"the joints can't follow it smoothly at {100 * between[worst]:.0f} % of it, near q ="
                 f" {show(joints(between[worst]))} rad ({max(off):.2g} m off): the arm is nearly singular there, or"
-                " a joint meets its limit; take another path or start"
+                " a joint meets its limit",
+                field="tip path",
+                hint="take another path or start",
             )
         count *= 2
 
@@ -197,8 +207,10 @@ def _solve_along(kinematics, knots, curve, start):
         found = kinematics.search(curve(knots[k]), angles[k - 1])
         if found.distance > 10.0 * ARRIVED:
             raise TrajectoryError(
-                f"{kinematics.model.arm.name}: the tip can't follow its path beyond {100 * knots[k - 1]:.0f} %:"
-                f" {show(curve(knots[k]))} m is out of reach from there; {nearest(found)}"
+                f"{kinematics.model.arm.name} can't follow it beyond {100 * knots[k - 1]:.0f} %:"
+                f" {show(curve(knots[k]))} m is out of reach from there",
+                field="tip path",
+                hint=nearest(found),
             )
         angles[k] = found.q
     return angles

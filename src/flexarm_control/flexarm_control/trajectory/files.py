@@ -15,7 +15,7 @@ CSV (``.csv``): a header, then one row per point, the joints numbered in the arm
     2.0,1.0,0.0,0.0
 
 Time in s from the start, angles in rad; rates (``qd``) and accelerations (``qdd``) may be left out, and
-choose the interpolation as in a message. What is read is what `validate` passes, nothing else.
+choose the interpolation as in a message. Every file that is read is checked by `validate`.
 """
 
 import csv
@@ -26,9 +26,10 @@ from pathlib import Path
 import yaml
 
 from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.shown import listed
 
 from .request import JointTrajectoryData, validate
-from .values import NOT_NUMBERS, SECOND, show
+from .values import NOT_NUMBERS, SECOND
 
 YAML_SUFFIXES = (".yaml", ".yml")
 SUFFIXES = (".csv", *YAML_SUFFIXES)
@@ -62,27 +63,29 @@ def read(
     Raises
     ------
     TrajectoryError
-        Naming the file, the line and column (CSV) or the point and field (YAML), the value, and what
-        is wanted.
+        With the file, the line and column (CSV) or the point and field (YAML), and the value.
     """
     path, joint_names = Path(path), tuple(joint_names)
     reader = _reader(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise TrajectoryError(f"{path}: {error.strerror or error}") from None
+        raise TrajectoryError(str(error.strerror or error), field=str(path)) from None
     except UnicodeDecodeError:
-        raise TrajectoryError(f"{path}: not a text file") from None
+        raise TrajectoryError("is no text file", field="path", value=str(path)) from None
     except ValueError as error:  # a path with a zero byte
-        raise TrajectoryError(f"{show(str(path))}: {error}") from None
+        raise TrajectoryError(f"can't be read: {error}", field="path", value=str(path)) from None
     try:
         names, points, lines = reader(text, joint_names)
     except TrajectoryError as error:
-        raise TrajectoryError(f"{path}{error}") from None
+        error.field = f"{path}{error.field}"
+        raise
     try:
         return validate(names, joint_names, 0, points, position_low, position_high, velocity_max)
     except TrajectoryError as error:
-        raise TrajectoryError(f"{path}: {_with_lines(str(error), lines)}") from None
+        error.field = f"{path}: {_with_lines(error.field, lines)}"
+        error.problem = _with_lines(error.problem, lines)
+        raise
 
 
 def write(path, trajectory):
@@ -110,19 +113,22 @@ def _reader(path):
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise TrajectoryError(
-            f"{path}: a trajectory's file ends in {', '.join(SUFFIXES)}: name it so"
+            "has the wrong suffix", field="path", value=str(path), limit=", ".join(SUFFIXES)
         )
     return _from_csv if suffix == ".csv" else _from_yaml
 
 
-def _with_lines(message, lines):
-    """Name the file's lines in the place of points, where it has lines."""
+def _with_lines(text, lines):
+    """Name the file's lines in place of points, if it has lines."""
     if not lines:
-        return message
-    return re.sub(r"points\[(\d+)\]", lambda match: f"line {lines[int(match[1])]}", message)
+        return text
+    return re.sub(r"points\[(\d+)\]", lambda match: f"line {lines[int(match[1])]}", text)
 
 
 # CSV -------------------------------------------------------------------------------------------
+
+
+# The fields of errors begin with what follows the file's name: ":3: q2", or ": points[0]".
 
 
 def _from_csv(text, joint_names):
@@ -130,21 +136,27 @@ def _from_csv(text, joint_names):
     try:
         rows = [(reader.line_num, [word.strip() for word in row]) for row in reader]
     except csv.Error as error:
-        raise TrajectoryError(f":{reader.line_num}: not a CSV table: {error}") from None
+        raise TrajectoryError(f"no CSV table: {error}", field=f":{reader.line_num}") from None
     rows = [(line, row) for line, row in rows if any(row)]
+    hint = f"give a header {_wanted(joint_names)}, then points"
     if not rows:
-        raise TrajectoryError(f": empty: give a header {_wanted(joint_names)}, then points")
+        raise TrajectoryError("empty", field=":1", hint=hint)
     line, header = rows[0]
     columns = _csv_columns(header, joint_names, line)
     points = []
     for line, row in rows[1:]:
         if len(row) != len(header):
-            raise TrajectoryError(f":{line}: {len(row)} values for {len(header)} columns")
+            raise TrajectoryError(
+                "is the wrong number of values",
+                field=f":{line}",
+                value=len(row),
+                limit=f"{len(header)} columns",
+            )
         values = [_csv_number(w, h, line) for w, h in zip(row, header, strict=True)]
         fields = [[values[i] for i in columns[field]] for field in _PREFIXES]
         points.append((_csv_time(values[columns["t"]], line), *fields, []))
     if not points:
-        raise TrajectoryError(f":{line}: no points below the header")
+        raise TrajectoryError("no points", field=f":{line}", hint=hint)
     return joint_names, points, [line for line, _ in rows[1:]]
 
 
@@ -162,19 +174,23 @@ def _csv_columns(header, joint_names, line):
         for field, prefix in _PREFIXES.items()
     }
     known = {"t"}.union(*fields.values())
-    hint = f"wanted {_wanted(joint_names)} for {', '.join(joint_names)}"
+    where, hint = f":{line}", f"give {_wanted(joint_names)} for {listed(joint_names)}"
     for word in header:
         if word not in known:
-            raise TrajectoryError(f":{line}: unknown column {show(word)}: {hint}")
+            raise TrajectoryError("is no known column", field=where, value=word, hint=hint)
         if header.count(word) > 1:
-            raise TrajectoryError(f":{line}: column {word} is there {header.count(word)} times")
-    for field, names in fields.items():
-        prefix = _PREFIXES[field]
-        if (names or field == "positions") and len(names) < len(joint_names):
-            lacks = next(f"{prefix}{i}" for i in count if f"{prefix}{i}" not in header)
-            raise TrajectoryError(f":{line}: no column {lacks}: {hint}")
-    if "t" not in header:
-        raise TrajectoryError(f":{line}: no column t: {hint}")
+            raise TrajectoryError(
+                f"is the name of {header.count(word)} columns", field=where, value=word
+            )
+    missing = [
+        f"{_PREFIXES[field]}{i}"
+        for field, names in fields.items()
+        for i in count
+        if (names or field == "positions") and f"{_PREFIXES[field]}{i}" not in header
+    ]
+    missing += [] if "t" in header else ["t"]
+    if missing:
+        raise TrajectoryError("is no column here", field=where, value=missing[0], hint=hint)
     return {"t": header.index("t")} | {
         field: [header.index(name) for name in names] for field, names in fields.items()
     }
@@ -184,15 +200,18 @@ def _csv_number(word, column, line):
     try:
         value = float(word)
     except ValueError:
-        raise TrajectoryError(f":{line}: {column} is {show(word)}, not a number") from None
-    if not math.isfinite(value):
-        raise TrajectoryError(f":{line}: {column} is {show(word)}, not finite")
+        value = None
+    if value is None or not math.isfinite(value):
+        problem = "is not a number" if value is None else "is not finite"
+        raise TrajectoryError(problem, field=f":{line}: {column}", value=word)
     return value
 
 
 def _csv_time(value, line):
     if abs(value) > 9e9:
-        raise TrajectoryError(f":{line}: t is {value:g} s, beyond 2^63 ns: use shorter times")
+        raise TrajectoryError(
+            "s is beyond 2^63 ns", field=f":{line}: t", value=value, hint="use shorter times"
+        )
     return round(value * SECOND)
 
 
@@ -220,57 +239,61 @@ def _from_yaml(text, joint_names):
         # `ros2 topic echo` ends each message with a line of dashes.
         documents = [d for d in yaml.load_all(text, _LOADER) if d is not None]
     except Exception as error:
-        # Not YAML's own errors alone: PyYAML lets others through on a scalar that is not what its tag says, and
-        # on endless nesting.
+        # Not only YAML's own errors: PyYAML raises others on a scalar that its tag does not fit, and on endless
+        # nesting.
         mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark else ""
         raise TrajectoryError(
-            f"{line}: not YAML: {getattr(error, 'problem', None) or error}"
+            f"no YAML: {getattr(error, 'problem', None) or error}",
+            field=f":{mark.line + 1}" if mark else "",
         ) from None
     if len(documents) != 1:
-        raise TrajectoryError(f": {len(documents)} trajectories: give one")
-    top = _mapping(documents[0], ": the file", ("header", "joint_names", "points"))
+        raise TrajectoryError("trajectories", field="", value=len(documents), hint="give one")
+    top = _mapping(documents[0], "", ("header", "joint_names", "points"))
     for key in ("joint_names", "points"):
         if not isinstance(top.get(key), list):
-            raise TrajectoryError(f": {key} is {show(top.get(key))}: give a list")
+            raise TrajectoryError("is no list", field=f": {key}", value=top.get(key))
     points = [_yaml_point(point, f": points[{i}]") for i, point in enumerate(top["points"])]
     return top["joint_names"], points, None
 
 
-def _mapping(value, where, keys):
+def _mapping(value, field, keys):
+    """Return a mapping with known keys, or refuse the value."""
+    known = ", ".join(keys)
     if not isinstance(value, dict):
-        raise TrajectoryError(f"{where} is {show(value)}: give {', '.join(keys)}")
+        raise TrajectoryError("is no mapping", field=field, value=value, hint=f"give {known}")
     for key in value:
         if key not in keys:
-            raise TrajectoryError(f"{where} has {show(key)}: known are {', '.join(keys)}")
+            raise TrajectoryError("is no known key", field=field, value=key, limit=known)
     return value
 
 
-def _yaml_point(point, where):
-    _mapping(point, where, _POINT_KEYS)
-    fields = [_yaml_values(point.get(f), f"{where}.{f}") for f in (*_PREFIXES, "effort")]
+def _yaml_point(point, field):
+    _mapping(point, field, _POINT_KEYS)
+    values = [_yaml_values(point.get(f), f"{field}.{f}") for f in (*_PREFIXES, "effort")]
     time = point.get("time_from_start", {})
-    time = _mapping(time, f"{where}.time_from_start", ("sec", "nanosec"))
+    time = _mapping(time, f"{field}.time_from_start", ("sec", "nanosec"))
     for key, value in time.items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise TrajectoryError(
-                f"{where}.time_from_start.{key} is {show(value)}: give an integer"
+                "is no integer", field=f"{field}.time_from_start.{key}", value=value
             )
-    return time.get("sec", 0) * SECOND + time.get("nanosec", 0), *fields
+    return time.get("sec", 0) * SECOND + time.get("nanosec", 0), *values
 
 
-def _yaml_values(values, where):
+def _yaml_values(values, field):
     if values is None:
         return []
     if not isinstance(values, list):
-        raise TrajectoryError(f"{where} is {show(values)}: give a list, one number per joint")
+        raise TrajectoryError(
+            "is no list", field=field, value=values, hint="give one number per joint"
+        )
     out = []
     for i, value in enumerate(values):
         try:
             # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
             out.append(value if isinstance(value, float) else _yaml_number(value))
         except NOT_NUMBERS:
-            raise TrajectoryError(f"{where}[{i}] is {show(value)}, not a number") from None
+            raise TrajectoryError("is not a number", field=f"{field}[{i}]", value=value) from None
     return out
 
 

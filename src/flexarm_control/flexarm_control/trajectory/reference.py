@@ -17,14 +17,14 @@ from .values import (
     SPEED_ROUNDING,
     joint_limit,
     per_joint,
+    refuse_joint,
     seconds,
-    show,
 )
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of an offered trajectory.
+    """The decision on an offered trajectory.
 
     Attributes
     ----------
@@ -78,7 +78,10 @@ class ReferenceGenerator:
         self.joint_names = tuple(joint_names)
         if not 0.0 <= start_tolerance < np.inf:
             raise TrajectoryError(
-                f"start_tolerance is {start_tolerance} rad: it must be finite and at least 0"
+                "rad is out of range",
+                field="start_tolerance",
+                value=start_tolerance,
+                limit="finite, at least 0",
             )
         self._start_tolerance = float(start_tolerance)
         self._velocity_max = (
@@ -121,20 +124,17 @@ class ReferenceGenerator:
         TrajectoryError
             If the position has another shape or is not finite.
         """
-        position = per_joint("the position to hold", position, self.joint_names)
-        if not np.isfinite(position).all():
-            joint = int(np.argmin(np.isfinite(position)))
-            raise TrajectoryError(
-                f"the position of joint {self.joint_names[joint]} is {position[joint]} rad: "
-                "a finite measurement is needed to hold it"
-            )
+        position = per_joint("joint_position", position, self.joint_names)
+        lost = ~np.isfinite(position)
+        problem, hint = "rad is not finite", "it is needed to hold the joint"
+        refuse_joint("joint_position", lost, position, self.joint_names, problem, hint=hint)
         self._drop_all()
         self._state[:] = 0.0
         self._state[0] = position
         self._last_ns = stamp_ns
 
     def offer(self, trajectory: JointTrajectoryData) -> Verdict:
-        """Take a validated trajectory, or say why not.
+        """Accept a validated trajectory, or return why it is refused.
 
         Parameters
         ----------
@@ -144,31 +144,17 @@ class ReferenceGenerator:
         Returns
         -------
         Verdict
-            The decision. What is refused changes nothing.
+            The decision. A refused trajectory changes nothing.
         """
-        if self._last_ns is None:
-            return Verdict(False, "no state yet: offer it once the arm's state is known", 0)
-        if trajectory.joint_names != self.joint_names:
-            return Verdict(
-                False,
-                f"the trajectory is for {', '.join(trajectory.joint_names)}, this is "
-                f"{', '.join(self.joint_names)}: validate it for this arm",
-                0,
-            )
         if self._last_accepted is not None and trajectory.repeats(self._last_accepted):
             return Verdict(
                 False, f"repeat of trajectory {self.accepted_id}", self.accepted_id, repeat=True
             )
-        if 0 < trajectory.stamp_ns < self._last_ns:
-            late_ns = self._last_ns - trajectory.stamp_ns
-            return Verdict(
-                False,
-                f"starts at {seconds(trajectory.stamp_ns)}, {seconds(late_ns)} in the past; "
-                "use stamp 0 for now",
-                0,
-            )
-        jump = self._refuse_jump(trajectory)
-        return Verdict(False, jump, 0) if jump else self._accept(trajectory)
+        try:
+            self._check(trajectory)
+        except TrajectoryError as error:
+            return Verdict(False, str(error), 0)
+        return self._accept(trajectory)
 
     @property
     def path(self):
@@ -196,39 +182,52 @@ class ReferenceGenerator:
         """Whether a trajectory with an explicit start waits, and a stamp is past that start."""
         return self._pending is not None and stamp_ns > self._pending.start_ns
 
-    def _refuse_jump(self, trajectory):
-        """Return why the first point can't be reached from the reference at the start, or ''."""
-        if trajectory.stamp_ns == 0:
-            self._reference_at(self._path, self._last_ns)
-        else:
-            path = self._path
-            if self._starting is not None:  # as if the next sample were at the last one's stamp
-                self._reference_at(path, self._last_ns)
-                path = self._starting
-                path.begin(self._last_ns, self._scratch)
-            self._reference_at(path, trajectory.stamp_ns)
-        distance = np.abs(trajectory.positions[0] - self._scratch[0])
-        first = int(trajectory.times_ns[0]) / SECOND
-        if first == 0.0:
-            joint = int(np.argmax(distance))
-            if distance[joint] <= self._start_tolerance:
-                return ""
-            return (
-                f"points[0] at time_from_start 0 is {distance[joint]:.6g} rad from the reference "
-                f"of joint {self.joint_names[joint]} at the start, more than start_tolerance "
-                f"{self._start_tolerance:g} rad: give the first point a time_from_start > 0"
+    def _check(self, trajectory):
+        """Refuse a trajectory that can't be followed from here."""
+        if self._last_ns is None:
+            raise TrajectoryError("no state yet", hint="offer it once the arm's state is known")
+        if trajectory.joint_names != self.joint_names:
+            raise TrajectoryError(
+                "are not the joints of this arm",
+                field="joint_names",
+                value=trajectory.joint_names,
+                limit=", ".join(self.joint_names),
+                hint="validate it for this arm",
             )
-        if self._velocity_max is None:
-            return ""
-        fast = np.flatnonzero(distance > first * self._velocity_max * (1.0 + SPEED_ROUNDING))
-        if not fast.size:
-            return ""
-        joint = int(fast[0])
-        return (
-            f"joint {self.joint_names[joint]} would move at {distance[joint] / first:.6g} rad/s on "
-            f"average to reach points[0], beyond its limit of {self._velocity_max[joint]:g} "
-            "rad/s: give the first point a later time_from_start"
-        )
+        if 0 < trajectory.stamp_ns < self._last_ns:
+            raise TrajectoryError(
+                f"ns is {seconds(self._last_ns - trajectory.stamp_ns)} in the past",
+                field="header.stamp",
+                value=trajectory.stamp_ns,
+                hint="use stamp 0 for now",
+            )
+        self._reference_at_start(trajectory.stamp_ns)
+        distance = np.abs(trajectory.positions[0] - self._scratch[0])
+        time = int(trajectory.times_ns[0]) / SECOND
+        field, names = "points[0].positions", self.joint_names
+        if time == 0.0:
+            far = distance > self._start_tolerance
+            problem = "rad away from the reference, at time_from_start 0, is beyond start_tolerance"
+            hint = "give the first point a time_from_start > 0"
+            refuse_joint(field, far, distance, names, problem, self._start_tolerance, hint)
+        elif self._velocity_max is not None:
+            limit = self._velocity_max
+            fast = distance > time * limit * (1.0 + SPEED_ROUNDING)
+            problem = "rad/s on average from the reference is beyond the speed limit"
+            hint = "give the first point a later time_from_start"
+            refuse_joint(field, fast, distance / time, names, problem, limit, hint)
+
+    def _reference_at_start(self, stamp_ns):
+        """Fill the scratch state with the reference that a trajectory of this stamp starts from."""
+        if stamp_ns == 0:
+            self._reference_at(self._path, self._last_ns)
+            return
+        path = self._path
+        if self._starting is not None:  # as if the next sample were at the last one's stamp
+            self._reference_at(path, self._last_ns)
+            path = self._starting
+            path.begin(self._last_ns, self._scratch)
+        self._reference_at(path, stamp_ns)
 
     def _accept(self, trajectory):
         derivatives = [
@@ -267,7 +266,9 @@ class ReferenceGenerator:
             If there is no state yet.
         """
         if self._last_ns is None:
-            raise TrajectoryError("no state yet: call start with the measured position first")
+            raise TrajectoryError(
+                "no state yet", hint="call start with the measured position first"
+            )
         pending = self._pending
         if pending is not None and stamp_ns >= pending.start_ns:
             # One that still waits for its first sample would begin after this: it never does.
@@ -336,7 +337,7 @@ class ReferenceGenerator:
             If there is no state yet, or a deceleration is not finite and above 0.
         """
         if self._last_ns is None:
-            raise TrajectoryError("no state yet: there is no reference to stop")
+            raise TrajectoryError("no state yet", hint="there is no reference to stop")
         bound = _decelerations(deceleration, self.joint_names)
         self._reference_at(self._path, stamp_ns)
         path = _braking_path(self._scratch, bound, self.joint_names)
@@ -352,15 +353,14 @@ def _decelerations(deceleration, joint_names):
         values = np.broadcast_to(np.asarray(deceleration, dtype=float), (len(joint_names),))
     except NOT_NUMBERS:
         raise TrajectoryError(
-            f"deceleration is {show(deceleration)}: give a number, or one per joint"
+            "is no number",
+            field="deceleration",
+            value=deceleration,
+            hint="give a number, or one per joint",
         ) from None
-    good = (values > 0.0) & (values < np.inf)
-    if not good.all():
-        joint = int(np.argmin(good))
-        raise TrajectoryError(
-            f"deceleration of joint {joint_names[joint]} is {values[joint]} rad/s^2: it must be "
-            "finite and above 0"
-        )
+    bad = ~((values > 0.0) & (values < np.inf))
+    problem, limit = "rad/s^2 is out of range", "finite, above 0"
+    refuse_joint("deceleration", bad, values, joint_names, problem, limit)
     return values
 
 
@@ -377,13 +377,10 @@ def _braking_path(state, deceleration, joint_names):
     # Rounded up, all segments have at least one step: in nanoseconds the differences of nearby
     # positions would leave no digits for the accelerations.
     steps = np.maximum(np.ceil(np.abs(velocity) / w / BRAKING_STEP), 1.0)
-    longest = int(np.argmax(steps))
-    if not steps[longest] * BRAKING_STEP <= MAX_BRAKING:
-        raise TrajectoryError(
-            f"joint {joint_names[longest]} would take {steps[longest] * BRAKING_STEP:.6g} s to "
-            f"stop from {velocity[longest]:.6g} rad/s, more than {MAX_BRAKING:g} s: give a higher "
-            "deceleration"
-        )
+    times = steps * BRAKING_STEP
+    slow = ~(times <= MAX_BRAKING)
+    problem, hint = "s to stop is too long", "give a higher deceleration"
+    refuse_joint("braking time", slow, times, joint_names, problem, MAX_BRAKING, hint)
     durations_ns = np.rint(steps * (BRAKING_STEP * SECOND)).astype(np.int64)
     times_ns = np.unique(durations_ns)
     length = durations_ns / SECOND

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a `trajectory_msgs/JointTrajectory` asks for, checked and in the arm's joint order."""
+"""Checks a `trajectory_msgs/JointTrajectory` and brings it to the arm's joint order."""
 
 import operator
 from array import array
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.shown import listed
 
 from .values import (
     END_VELOCITY_TOLERANCE,
@@ -20,7 +21,6 @@ from .values import (
     UNITS,
     joint_limit,
     seconds,
-    show,
 )
 
 _FIELDS = ("time_from_start", "positions", "velocities", "accelerations", "effort")
@@ -83,7 +83,7 @@ def validate(
     position_high=None,
     velocity_max=None,
 ) -> JointTrajectoryData:
-    """Check a trajectory as it came from outside, and bring it to the arm's joint order.
+    """Check an untrusted trajectory, and bring it to the arm's joint order.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def validate(
     position_low, position_high : (n,) array_like, optional
         Limits of the positions in the arm's order [rad]; infinite where there is none.
     velocity_max : (n,) array_like, optional
-        Limit of the speeds in the arm's order [rad/s]. Held against the given velocities and
-        against the mean between two points, which no curve through both can stay below.
+        Limit of the speeds in the arm's order [rad/s]. It applies to the given velocities and to
+        the mean speed between two points, which no curve through both can stay below.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def validate(
     Raises
     ------
     TrajectoryError
-        Naming the joint, point or field, the value, the limit, and what to do.
+        With the point, field and joint, the value, the limit, and what to do.
     """
     arm_joint_names = tuple(arm_joint_names)
     order = _column_order(joint_names, arm_joint_names)
@@ -125,12 +125,13 @@ def validate(
     _refuse_effort(columns[4])
     if fields[0] is None:
         raise TrajectoryError(
-            "points[0].positions is empty: give the position of every joint in every point"
+            "is empty", field="points[0].positions", hint="give the position of every joint"
         )
     if fields[1] is None and fields[2] is not None:
         raise TrajectoryError(
-            "points[0] has accelerations but no velocities: give both, or leave out the "
-            "accelerations"
+            "has accelerations but no velocities",
+            field="points[0]",
+            hint="give both, or leave out the accelerations",
         )
     trajectory = JointTrajectoryData(stamp_ns, arm_joint_names, times_ns, *fields)
     _refuse_end_velocity(trajectory)
@@ -140,27 +141,29 @@ def validate(
 
 def _column_order(joint_names, arm_joint_names):
     """Return for each of the arm's joints its column in the message, as a list of int."""
+    field = "joint_names"
     try:
-        if isinstance(joint_names, Mapping | Set):  # which column is whose?
+        if isinstance(joint_names, Mapping | Set):  # they have no order
             raise TypeError
         names = list(joint_names)
     except TypeError:
-        raise TrajectoryError(f"joint_names is {show(joint_names)}: give a list of names") from None
-    listed = ", ".join(arm_joint_names)
+        raise TrajectoryError("is no list of names", field=field, value=joint_names) from None
+    known = listed(arm_joint_names)
     for name in names:
         if not isinstance(name, str) or name not in arm_joint_names:
             raise TrajectoryError(
-                f"joint_names has {show(name)}, which is no joint of this arm: give {listed}"
+                "is no joint of this arm", field=field, value=name, hint=f"give {known}"
             )
         if names.count(name) > 1:
             raise TrajectoryError(
-                f"joint_names has {name!r} {names.count(name)} times: give each joint once"
+                f"is given {names.count(name)} times",
+                field=field,
+                value=name,
+                hint="give each joint once",
             )
     for name in arm_joint_names:
         if name not in names:
-            raise TrajectoryError(
-                f"joint_names lacks {name!r}: give every joint of the arm ({listed})"
-            )
+            raise TrajectoryError("is missing", field=field, value=name, hint=f"give {known}")
     return [names.index(name) for name in arm_joint_names]
 
 
@@ -169,34 +172,40 @@ def _columns(points):
     try:
         points = list(points)
     except TypeError:
-        raise TrajectoryError(f"points is {show(points)}: give a list of points") from None
+        raise TrajectoryError("is no list of points", field="points", value=points) from None
     if not points:
-        raise TrajectoryError("empty trajectory: give at least one point")
+        raise TrajectoryError("empty trajectory", field="points", hint="give at least one point")
     if len(points) > MAX_POINTS:
         raise TrajectoryError(
-            f"{len(points)} points are more than the {MAX_POINTS} allowed: send fewer, "
-            "farther apart"
+            "are too many",
+            field="points",
+            value=len(points),
+            limit=MAX_POINTS,
+            hint="send fewer, farther apart",
         )
     if not set(map(type, points)) <= {tuple, list} or set(map(len, points)) != {len(_FIELDS)}:
         for index, point in enumerate(points):
             if not isinstance(point, tuple | list) or len(point) != len(_FIELDS):
                 raise TrajectoryError(
-                    f"points[{index}] is {show(point)}: give ({', '.join(_FIELDS)}) in each point"
+                    "is no point",
+                    field=f"points[{index}]",
+                    value=point,
+                    hint=f"give ({', '.join(_FIELDS)})",
                 )
     return [[point[i] for point in points] for i in range(len(_FIELDS))]
 
 
 def _stamp(stamp_ns):
     """Return the stamp as an int within the range of a ROS time [ns]."""
+    field, hint = "header.stamp", "give integer nanoseconds, 0 for now"
     try:
         stamp_ns = operator.index(stamp_ns)
     except TypeError:
-        raise TrajectoryError(
-            f"header.stamp is {show(stamp_ns)}: give integer nanoseconds, 0 for now"
-        ) from None
+        raise TrajectoryError("is no integer", field=field, value=stamp_ns, hint=hint) from None
     if not 0 <= stamp_ns <= _MAX_NS:
+        limit = f"0 to {_MAX_NS} ns"
         raise TrajectoryError(
-            f"header.stamp is {show(stamp_ns)} ns, outside 0 to {_MAX_NS} ns: use 0 for now"
+            "is out of range", field=field, value=stamp_ns, limit=limit, hint=hint
         )
     return stamp_ns
 
@@ -206,26 +215,31 @@ def _times(column, stamp_ns):
     try:
         times = np.fromiter(map(operator.index, column), np.int64, len(column))
     except NOT_NUMBERS:
-        index, value = _first_failure(column, lambda value: np.int64(operator.index(value)))
-        raise TrajectoryError(
-            f"points[{index}].time_from_start is {show(value)}: give an integer below 2^63 [ns]"
+        raise _unreadable(
+            "time_from_start",
+            column,
+            lambda value: np.int64(operator.index(value)),
+            "is no integer below 2^63 [ns]",
         ) from None
-    if times[0] < 0:
+
+    def refuse(index, problem, **rest):
         raise TrajectoryError(
-            f"points[0].time_from_start is {seconds(times[0])}: it must be at least 0 s"
+            f"s {problem}",
+            field=f"points[{index}].time_from_start",
+            value=int(times[index]) / SECOND,
+            **rest,
         )
+
+    if times[0] < 0:
+        refuse(0, "is negative", limit="at least 0 s")
     late = np.flatnonzero(times[1:] <= times[:-1])
     if late.size:
-        index = int(late[0]) + 1
-        raise TrajectoryError(
-            f"points[{index}].time_from_start is {seconds(times[index])}, not later than "
-            f"points[{index - 1}] at {seconds(times[index - 1])}: times must strictly increase"
-        )
+        index = int(late[0])
+        before = f"points[{index}] at {seconds(times[index])}"
+        refuse(index + 1, f"is not later than {before}", hint="times must strictly increase")
     if stamp_ns + int(times[-1]) > _MAX_NS:
-        raise TrajectoryError(
-            f"the trajectory ends {seconds(times[-1])} after {seconds(stamp_ns)}, beyond "
-            "2^63 ns: use an earlier stamp or shorter times"
-        )
+        hint = "use an earlier stamp or shorter times"
+        refuse(times.size - 1, f"after {seconds(stamp_ns)} is beyond 2^63 ns", hint=hint)
     times.flags.writeable = False
     return times
 
@@ -237,28 +251,28 @@ def _field(name, column, arm_joint_names, order):
     bad = np.flatnonzero((lengths != n) & (lengths != 0))
     if bad.size:
         index = int(bad[0])
-        allowed = f"{n}" if name == "positions" else f"{n} or none"
         raise TrajectoryError(
-            f"points[{index}].{name} has length {lengths[index]}, for {n} joints: give {allowed}"
+            "is the wrong number of values",
+            field=f"points[{index}].{name}",
+            value=int(lengths[index]),
+            limit=f"{n} joints",
+            hint=f"give {n}" if name == "positions" else f"give {n} or none",
         )
     uneven = np.flatnonzero(lengths != lengths[0])
     if uneven.size:
         index = int(uneven[0])
         has, lacks = (index, 0) if lengths[index] else (0, index)
         raise TrajectoryError(
-            f"points[{lacks}] has no {name}, points[{has}] has: give the same fields in every point"
+            f"is empty, that of points[{has}] is not",
+            field=f"points[{lacks}].{name}",
+            hint="give the same fields in every point",
         )
     if lengths[0] == 0:
         return None
     values = _numbers(name, column, n).reshape(len(column), n)[:, order]
-    wild = np.argwhere(~(np.abs(values) <= MAX_MAGNITUDE))  # so written, it finds nan too
-    if wild.size:
-        index, joint = (int(i) for i in wild[0])
-        raise TrajectoryError(
-            f"points[{index}].{name} of joint {arm_joint_names[joint]} is "
-            f"{values[index, joint]} {UNITS[name]}: it must be finite and at most "
-            f"{MAX_MAGNITUDE:g} in magnitude"
-        )
+    wild = ~(np.abs(values) <= MAX_MAGNITUDE)  # so written, it finds nan too
+    limit = np.full(n, MAX_MAGNITUDE)
+    _refuse(name, wild, values, arm_joint_names, f"{UNITS[name]} is not finite or too large", limit)
     values.flags.writeable = False
     return values
 
@@ -268,9 +282,8 @@ def _lengths(name, column):
     try:
         return np.fromiter(map(len, column), np.int64, len(column))
     except NOT_NUMBERS:
-        index, value = _first_failure(column, len)
-        raise TrajectoryError(
-            f"points[{index}].{name} is {show(value)}: give a sequence of numbers, empty for none"
+        raise _unreadable(
+            name, column, len, "is no sequence of numbers", "give an empty one for none"
         ) from None
 
 
@@ -279,54 +292,48 @@ def _numbers(name, column, n):
     # array() rather than numpy: it refuses None and strings, which numpy would convert; and it
     # copies the array('d') of a ROS message whole.
     numbers = array("d")
-
-    def read(column):
+    try:
         for values in column:
             numbers.extend(values)
-        if len(numbers) != n * len(column):  # its len() has lied
+        if len(numbers) != n * len(column):  # a len() that was wrong
             raise ValueError
-
-    try:
-        read(column)
     except NOT_NUMBERS:
-        index, value = _first_failure(column, lambda values: array("d", iter(values)))
-        raise TrajectoryError(
-            f"points[{index}].{name} is {show(value)}: give {n} numbers"
+        raise _unreadable(
+            name, column, lambda values: array("d", iter(values)), f"is no list of {n} numbers"
         ) from None
     return np.frombuffer(numbers)
 
 
-def _first_failure(column, convert):
-    """Return index and value of the first entry that `convert` can't take."""
+def _unreadable(name, column, convert, problem, hint=""):
+    """Return the error of the first point whose field `convert` can't take."""
     for index, value in enumerate(column):
         try:
             convert(value)
         except NOT_NUMBERS:
-            return index, value
-    raise TrajectoryError("a value can't be read as a number: give lists of plain numbers")
+            return TrajectoryError(problem, field=f"points[{index}].{name}", value=value, hint=hint)
+    return TrajectoryError(problem, field=f"points[].{name}", hint="give lists of plain numbers")
 
 
 def _refuse_effort(column):
     filled = np.flatnonzero(_lengths("effort", column))
     if filled.size:
         raise TrajectoryError(
-            f"points[{int(filled[0])}].effort is not empty: effort is not used here, the torque "
-            "is computed from the motion; leave it empty"
+            "is not empty",
+            field=f"points[{int(filled[0])}].effort",
+            hint="leave it empty: the torque is computed from the motion",
         )
 
 
 def _refuse_end_velocity(trajectory):
     # As the joint_trajectory_controller by default: the hold after the last point has velocity
-    # zero, and a step down to it would shake the links.
+    # zero, and a step down to it would excite the links.
     if trajectory.velocities is None:
         return
-    moving = np.flatnonzero(np.abs(trajectory.velocities[-1]) > END_VELOCITY_TOLERANCE)
-    if moving.size:
-        joint = int(moving[0])
-        raise TrajectoryError(
-            f"the last point's velocity of joint {trajectory.joint_names[joint]} is "
-            f"{trajectory.velocities[-1, joint]} rad/s: it must be 0, the arm holds there"
-        )
+    end = trajectory.velocities[-1:]
+    moving = np.abs(end) > END_VELOCITY_TOLERANCE
+    problem, first = "rad/s is not zero at the last point", trajectory.times_ns.size - 1
+    zero, hint = np.zeros(end.shape[1]), "the arm holds there"
+    _refuse("velocities", moving, end, trajectory.joint_names, problem, zero, hint, first)
 
 
 def _check_limits(trajectory, position_low, position_high, velocity_max):
@@ -334,33 +341,32 @@ def _check_limits(trajectory, position_low, position_high, velocity_max):
     names, positions = trajectory.joint_names, trajectory.positions
     if position_low is not None:
         low = joint_limit("position_low", position_low, names)
-        _refuse_outside("position", positions, positions < low, low, names)
+        _refuse("positions", positions < low, positions, names, "rad is below the limit", low)
     if position_high is not None:
         high = joint_limit("position_high", position_high, names)
-        _refuse_outside("position", positions, positions > high, high, names)
+        _refuse("positions", positions > high, positions, names, "rad is above the limit", high)
     if velocity_max is None:
         return
     limit = joint_limit("velocity_max", velocity_max, names)
     if trajectory.velocities is not None:
-        velocities = trajectory.velocities
-        _refuse_outside("velocity", velocities, np.abs(velocities) > limit, limit, names)
+        speeds = np.abs(trajectory.velocities)
+        problem = "rad/s is beyond the speed limit"
+        _refuse("velocities", speeds > limit, trajectory.velocities, names, problem, limit)
     mean = np.diff(positions, axis=0) / (np.diff(trajectory.times_ns) / SECOND)[:, None]
-    fast = np.argwhere(np.abs(mean) > limit * (1.0 + SPEED_ROUNDING))
-    if fast.size:
-        index, joint = (int(i) for i in fast[0])
+    fast = np.abs(mean) > limit * (1.0 + SPEED_ROUNDING)
+    problem = "rad/s on average from the point before is beyond the speed limit"
+    _refuse("positions", fast, mean, names, problem, limit, "give it more time", 1)
+
+
+def _refuse(field, bad, values, names, problem, limit, hint="", first=0):
+    """Refuse the first bad one of the values (k, n) of points from `first` on; `limit` is (n,)."""
+    found = np.argwhere(bad)
+    if found.size:
+        index, joint = (int(i) for i in found[0])
         raise TrajectoryError(
-            f"from points[{index}] to points[{index + 1}] joint {names[joint]} would move at "
-            f"{mean[index, joint]:.6g} rad/s on average, beyond its limit of "
-            f"{limit[joint]:g} rad/s: give it more time"
+            problem,
+            field=f"points[{first + index}].{field} of joint {names[joint]}",
+            value=float(values[index, joint]),
+            limit=float(limit[joint]),
+            hint=hint,
         )
-
-
-def _refuse_outside(what, values, outside, limit, names):
-    if not outside.any():
-        return
-    index, joint = (int(i) for i in np.argwhere(outside)[0])
-    unit = "rad" if what == "position" else "rad/s"
-    raise TrajectoryError(
-        f"points[{index}]: {what} of joint {names[joint]} is {values[index, joint]:.9g} {unit}, "
-        f"beyond its limit of {limit[joint]:.9g} {unit}: stay within"
-    )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions written in a line: ``quintic:to=1.57,duration=2``, as `flexarm simulate --trajectory` takes them.
+"""Motions written in one line: ``quintic:to=1.57,duration=2``, as for `flexarm simulate --trajectory`.
 
-A family's name, a colon, and its settings; where a setting has a value per joint (or per axis), they are
-separated by semicolons. Everything but a family's required settings may be left out:
+A family's name, a colon, and its settings. The values of a setting per joint (or per axis) are separated by
+semicolons. All settings are optional except the tip and via of tip paths:
 
 ============== ============================== ==========================================================
 family         settings                       motion
@@ -16,8 +16,8 @@ line           tip, duration, smoothness      the tip on a straight line, `tip_p
 arc            tip, via, duration, smoothness the tip on a circle through a point on the way
 ============== ============================== ==========================================================
 
-All of them take ``from`` (joint angles where the motion starts), ``shaper`` (zv, zvd), ``shape-modes`` (how many of
-the arm's lowest modes it is for) and ``points``.
+All families take ``from`` (joint angles at the start), ``shaper`` (zv, zvd), ``shape-modes`` (for how many of the
+arm's lowest modes) and ``points``.
 """
 
 import math
@@ -30,7 +30,7 @@ from flexarm_dynamics.errors import TrajectoryError
 from ..motions import profiles, shapers
 from . import files
 from .request import JointTrajectoryData, validate
-from .values import MAX_POINTS, SECOND
+from .values import MAX_POINTS
 
 _COMMON = ("from", "duration", "shaper", "shape-modes", "points")
 FAMILIES = {
@@ -42,17 +42,18 @@ FAMILIES = {
     "arc": ("tip", "via", "smoothness"),
 }
 REQUIRED = {"line": ("tip",), "arc": ("tip", "via")}
-#: Points of a motion that is turned into a trajectory. Between them the jerk is right to 1e-6 of its peak for the
-#: closed forms; where copies of a shaped quintic begin, with a step of jerk, the acceleration is off by 4e-4.
+#: Default number of points of a trajectory. Between them the jerk of the closed forms is right to 1e-6 of its peak.
+#: Where the copies of a shaped quintic begin, with a step of jerk, the acceleration is off by 4e-4.
 POINTS = 401
-#: How far a tip's path is asked for: C^3, as the path itself is smooth.
+#: Default smoothness of `smooth` and of the time law of tip paths.
 TIP_SMOOTHNESS = 3
-#: Modes that a shaper is for unless told otherwise; fewer where the arm has fewer.
+#: Default number of modes of a shaper; fewer if the arm has fewer.
 SHAPE_MODES = 2
+POINTS_RANGE = f"2 to {MAX_POINTS}"
 
 
 def load(text, model, start=None) -> JointTrajectoryData:
-    """Return the trajectory of a file, or of a motion written in a line.
+    """Return the trajectory of a file, or of a motion written in one line.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def load(text, model, start=None) -> JointTrajectoryData:
 
 
 def from_spec(text, model, start=None) -> JointTrajectoryData:
-    """Return the trajectory of a motion written in a line.
+    """Return the trajectory of a motion written in one line.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
         ``family`` or ``family:setting=value,...`` (module docstring).
     model : ArmModel
     start : (n,) array_like, optional
-        Joint angles where it starts, unless it says ``from`` [rad]; zero if not given.
+        Joint angles at the start, unless the text sets ``from`` [rad]; zero if not given.
 
     Returns
     -------
@@ -91,9 +92,9 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
     Raises
     ------
     TrajectoryError
-        Naming the family or setting, its value, and what is wanted.
+        With the family or setting, and its value.
     FlexarmError
-        What the families raise of motions that can't be.
+        As the families raise it.
     """
     family, settings = parse(text)
     settings, points = dict(settings), integer(settings.get("points", str(POINTS)), "points")
@@ -105,12 +106,9 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
 def sampled(profile, model, points=POINTS) -> JointTrajectoryData:
     """Return a motion as a trajectory of so many points, checked against the arm's limits."""
     if not 2 <= points <= MAX_POINTS:
-        raise TrajectoryError(f"points is {points}: give 2 to {MAX_POINTS}")
-    rows = [
-        (round(t * SECOND), *values, [])
-        for t, *values in zip(*(a.tolist() for a in profiles.sample(profile, points)), strict=True)
-    ]
-    return validate(model.joint_names, model.joint_names, 0, rows, *limits(model))
+        raise TrajectoryError("is out of range", field="points", value=points, limit=POINTS_RANGE)
+    names, rows = model.joint_names, profiles.rows(profiles.sample(profile, points))
+    return validate(names, names, 0, rows, *limits(model))
 
 
 def limits(model):
@@ -129,32 +127,43 @@ def parse(text):
         key, equals, value = (word.strip() for word in item.partition("="))
         key = key.replace("_", "-")
         if not equals or not value:
-            raise TrajectoryError(f"{text!r}: {item!r} is no setting: write name=value")
+            raise TrajectoryError(
+                "is no setting", field=family, value=item, hint="write name=value"
+            )
         if key in settings:
-            raise TrajectoryError(f"{text!r}: {key} is given twice")
+            raise TrajectoryError("is given twice", field=family, value=key)
         settings[key] = value
     check_settings(family, settings)
     return family, settings
 
 
 def check_family(family):
-    """Refuse a name that is no family's."""
+    """Refuse an unknown family."""
     if family not in FAMILIES:
         raise TrajectoryError(
-            f"motion {family!r}: give a file that ends in {', '.join(files.SUFFIXES)}, or one of"
-            f" {', '.join(FAMILIES)}, as quintic:to=1.57,duration=2"
+            "is no family of motions",
+            field="motion",
+            value=family,
+            limit=", ".join(FAMILIES),
+            hint=f"or give a file that ends in {', '.join(files.SUFFIXES)}",
         )
 
 
 def check_settings(family, settings):
-    """Refuse settings that a family has not, and those that it lacks."""
+    """Refuse settings that a family does not have, and required ones that are missing."""
     known = (*FAMILIES[family], *_COMMON)
     for key in settings:
         if key not in known:
-            raise TrajectoryError(f"{family} has no {key}: it takes {', '.join(known)}")
+            raise TrajectoryError(
+                "is no setting of this family", field=family, value=key, limit=", ".join(known)
+            )
     for key in REQUIRED.get(family, ()):
         if key not in settings:
-            raise TrajectoryError(f"{family} wants {key}: {key}=x;y;z in the base frame [m]")
+            raise TrajectoryError(
+                f"{key} is missing",
+                field=family,
+                hint=f"give {key}=x;y;z in the base frame [m]",
+            )
 
 
 def needs_model(family, settings):
@@ -171,16 +180,16 @@ def motion(family, settings, model, start):
     settings : mapping of str to str
         As `parse` returns them.
     model : ArmModel or None
-        None will do where `needs_model` says so.
+        May be None unless `needs_model`.
     start : (n,) array_like
-        Where it starts, unless the settings say ``from`` [rad].
+        Joint angles at the start, unless the settings have ``from`` [rad].
 
     Raises
     ------
     TrajectoryError
-        Naming the setting, its value, and what is wanted.
+        With the setting and its value.
     FlexarmError
-        What the family raises of a motion that can't be.
+        As the family raises it.
     """
     check_family(family)
     check_settings(family, settings)
@@ -238,7 +247,11 @@ def shaper_of(settings, model, end):
     """Return the shaper that the settings ask for, for the modes where the motion ends, or None."""
     if "shaper" not in settings:
         if "shape-modes" in settings:
-            raise TrajectoryError("shape-modes without shaper: give shaper=zv or shaper=zvd too")
+            raise TrajectoryError(
+                "is given without shaper",
+                field="shape-modes",
+                hint=f"give shaper={' or shaper='.join(shapers.SHAPERS)} too",
+            )
         return None
     modes = min(SHAPE_MODES, model.n_modes)
     if "shape-modes" in settings:
@@ -252,27 +265,27 @@ def _smoothness(settings):
 
 def number(text, name):
     """Read a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise TrajectoryError(f"{name} {text!r}: write a number") from None
+    return _read(float, text, name, "is not a number")
 
 
 def integer(text, name):
     """Read an integer."""
-    try:
-        return int(text)
-    except ValueError:
-        raise TrajectoryError(f"{name} {text!r}: write an integer") from None
+    return _read(int, text, name, "is no integer")
 
 
-def numbers(text, count, name, what, spread=True, separator=";"):
-    """Read so many finite numbers; one stands for all where it may be spread."""
-    try:
-        values = [float(word) for word in text.split(separator)]
-    except ValueError:
-        raise TrajectoryError(f"{name} {text!r}: write numbers, separated by {separator}") from None
+def numbers(text, count, name, what, spread=True):
+    """Read so many finite numbers, (count,); with `spread` one number stands for all."""
+    hint = f"give {count} finite {what}, separated by semicolons"
+    words = text.split(";")
+    values = [_read(float, word, name, "is not a number", hint) for word in words]
     values = values * count if spread and len(values) == 1 else values
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise TrajectoryError(f"{name} {text!r}: {count} finite {what} are wanted")
+        raise TrajectoryError("can't be used", field=name, value=text, hint=hint)
     return np.array(values)
+
+
+def _read(kind, text, name, problem, hint=""):
+    try:
+        return kind(text)
+    except ValueError:
+        raise TrajectoryError(problem, field=name, value=text, hint=hint) from None

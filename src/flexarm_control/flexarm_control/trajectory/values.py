@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits, and values as messages show and check them; shared by this package."""
+"""Limits of trajectories, and checks of their values; shared by this package."""
 
 import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
-from flexarm_dynamics.shown import show
 
 MAX_POINTS = 10**6
-# Beyond this a double resolves less than 1e-7 of the unit: no joint's value, but a wrong one.
+# Beyond this a double resolves less than 1e-7 of the unit: the value must be wrong.
 MAX_MAGNITUDE = 1e9  # [rad], [rad/s], [rad/s^2]
 # The joint_trajectory_controller's own bound: one step of single precision at 1.
 END_VELOCITY_TOLERANCE = float(np.finfo(np.float32).eps)  # [rad/s]
@@ -20,30 +19,42 @@ UNITS = {"positions": "rad", "velocities": "rad/s", "accelerations": "rad/s^2"}
 SECOND = 1_000_000_000  # [ns]
 NOT_NUMBERS = (TypeError, ValueError, OverflowError)  # what conversions to numbers raise
 
-__all__ = ["joint_limit", "per_joint", "seconds", "show"]
-
 
 def joint_limit(name, values, joint_names):
     """Return limits as an (n,) float array without nan."""
     values = per_joint(name, values, joint_names)
-    if np.isnan(values).any():
-        joint = joint_names[int(np.argmax(np.isnan(values)))]
-        raise TrajectoryError(f"{name} of joint {joint} is nan: give inf where there is no limit")
+    hint = "give inf where there is no limit"
+    refuse_joint(name, np.isnan(values), values, joint_names, "is no limit", hint=hint)
     return values
 
 
 def per_joint(name, values, joint_names):
     """Return one float per joint, (n,)."""
     try:
-        values = np.array(values, dtype=float)
+        array = np.array(values, dtype=float)
     except NOT_NUMBERS:
-        raise TrajectoryError(f"{name} is {show(values)}: give one number per joint") from None
-    if values.shape != (len(joint_names),):
+        raise TrajectoryError("is no list of numbers", field=name, value=values) from None
+    if array.shape != (len(joint_names),):
         raise TrajectoryError(
-            f"{name} has shape {values.shape}, the joints have ({len(joint_names)},): give one "
-            "number per joint"
+            f"has shape {array.shape}, the joints have ({len(joint_names)},)",
+            field=name,
+            hint="give one number per joint",
         )
-    return values
+    return array
+
+
+def refuse_joint(name, bad, values, joint_names, problem, limit=None, hint=""):
+    """Refuse the first of the values (n,) that is bad, by its joint; `limit` may be (n,)."""
+    if np.any(bad):
+        joint = int(np.argmax(bad))
+        limit = float(limit[joint]) if isinstance(limit, np.ndarray) else limit
+        raise TrajectoryError(
+            problem,
+            field=f"{name} of joint {joint_names[joint]}",
+            value=float(values[joint]),
+            limit=limit,
+            hint=hint,
+        )
 
 
 def seconds(time_ns):
