@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from flexarm_bringup import cli
 from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_studies.analysis import attraction, bound, margins, scales, trial
-from flexarm_studies.analysis import subject as subjects
+from flexarm_studies.analysis import case as cases
 from flexarm_studies.loop.scenario import Scenario, parameters
 
 PAPER = parameters("paper_composite")
@@ -23,12 +23,12 @@ EXACT = {"observer.type": "true_rates"}
 
 @pytest.fixture(scope="module")
 def paper():
-    return subjects.of(Scenario("R", PAPER | EXACT))
+    return cases.of(Scenario("R", PAPER | EXACT))
 
 
 @pytest.fixture(scope="module")
 def default():
-    return subjects.of(Scenario("R", DEFAULT))
+    return cases.of(Scenario("R", DEFAULT))
 
 
 # --------------------------------------------------------------------------- time scales
@@ -55,7 +55,7 @@ def test_gain_sweep_holds_the_design_itself_and_a_slow_loop_leaves_the_bending_a
 
 
 def test_a_slow_law_without_gains_and_one_that_leaves_the_joints_free_are_said_to_be(paper):
-    free = subjects.of(Scenario("R", {"slow.type": "none", "fast.type": "none"}))
+    free = cases.of(Scenario("R", {"slow.type": "none", "fast.type": "none"}))
     assert "free" in scales.study(free, 2)["reason"]
     assert scales.gain_sweep(free)["reason"]
     assert "free" in margins.study(free, False)["reason"]
@@ -112,12 +112,12 @@ def test_for_one_slow_and_one_fast_state_the_bound_is_the_limit():
 
 @pytest.mark.parametrize("which", ["paper", "default"])
 def test_the_bound_is_positive_and_below_what_the_loop_bears(which, request):
-    subject = request.getfixturevalue(which)
-    b = bound.blocks(subject)
+    case = request.getfixturevalue(which)
+    b = bound.blocks(case)
     first = bound.constants(b, np.eye(2), np.eye(4))["factor"]
     c = bound.optimised(b, 600)
     assert c["factor"] > 10.0 * first > 0.0
-    limit, redesigned = bound.stable_factor(b), bound.redesign_factor(subject)
+    limit, redesigned = bound.stable_factor(b), bound.redesign_factor(case)
     assert c["factor"] < limit
     assert c["factor"] < redesigned
     assert np.linalg.eigvals(b.matrix(0.99 * limit)).real.max() < 0.0
@@ -128,7 +128,7 @@ def test_the_bound_is_positive_and_below_what_the_loop_bears(which, request):
 
 
 def test_the_redesign_keeps_the_fast_loop_in_its_own_time(paper):
-    slower = subjects.of(subjects.slower_bending(paper.scenario, 2.0))
+    slower = cases.of(cases.slower_bending(paper.scenario, 2.0))
     one, two = bound.blocks(paper), bound.blocks(slower)
     assert_allclose(
         np.sort_complex(2.0 * np.linalg.eigvals(two.A_f)),
@@ -146,9 +146,9 @@ def test_an_unstable_part_has_no_bound(paper):
 # --------------------------------------------------------------------------- margins beside runs
 
 
-def margin(subject, name):
-    kind = next(k for k in margins.kinds(subject) if k.name == name)
-    value = margins.of_poles(subject, kind)["value"]
+def margin(case, name):
+    kind = next(k for k in margins.kinds(case) if k.name == name)
+    value = margins.of_poles(case, kind)["value"]
     low, high = sorted((kind.start, kind.end))
     assert low < value < high
     return kind, value
@@ -162,14 +162,14 @@ def test_margins_are_where_runs_become_unstable(paper, name, monkeypatch):
 
 
 def test_first_loss_finds_the_first_edge_and_says_where_there_is_none():
-    assert subjects.first_loss(lambda v: v < 3.0 or v > 5.0, 1.0, 30.0) == pytest.approx(3.0)
-    assert subjects.first_loss(lambda v: v > 0.25, 1.0, 0.0) == pytest.approx(0.25, abs=1e-5)
-    assert subjects.first_loss(lambda v: True, 1.0, 30.0) is None
-    assert subjects.first_loss(lambda v: False, 1.0, 30.0) == 1.0
+    assert cases.first_loss(lambda v: v < 3.0 or v > 5.0, 1.0, 30.0) == pytest.approx(3.0)
+    assert cases.first_loss(lambda v: v > 0.25, 1.0, 0.0) == pytest.approx(0.25, abs=1e-5)
+    assert cases.first_loss(lambda v: True, 1.0, 30.0) is None
+    assert cases.first_loss(lambda v: False, 1.0, 30.0) == 1.0
 
 
 def test_an_unstable_design_is_told_not_refused():
-    delayed = subjects.of(Scenario("R", DEFAULT | {"slow.kp": [62.5], "slow.kv": [15.8]}))
+    delayed = cases.of(Scenario("R", DEFAULT | {"slow.kp": [62.5], "slow.kv": [15.8]}))
     found = margins.study(delayed, True)
     assert found["stable"] is False
     assert found["decay_per_s"] < 0.0
@@ -178,7 +178,7 @@ def test_an_unstable_design_is_told_not_refused():
 
 def test_noise_of_an_arm_file_moves_the_tip(monkeypatch):
     monkeypatch.setattr(margins, "HELD", 1.2)
-    lab = subjects.of(Scenario("R_lab", PAPER))
+    lab = cases.of(Scenario("R_lab", PAPER))
     found = margins.noise(lab)
     assert 0.0 < found["tip_rms_mm"] < 10.0
     assert found["torque_rms_Nm"][0] > 0.0
@@ -188,7 +188,7 @@ def test_the_arm_comes_back_unless_the_torque_is_too_small(paper):
     off, straight = np.array([0.5]), np.zeros(2)
     assert attraction.comes_back(paper, off, straight, 2.0)
     limited = paper.scenario.controller | {"torque_limit": [0.1]}
-    weak = subjects.of(replace(paper.scenario, controller=limited))
+    weak = cases.of(replace(paper.scenario, controller=limited))
     assert not attraction.comes_back(weak, off, straight, 2.0)
 
 
@@ -263,8 +263,8 @@ def test_wrong_options_are_said(capsys, words, said):
 def test_a_fast_law_with_states_has_no_bound_but_margins(paper):
     scenario = replace(paper.scenario, controller=PAPER | {"fast.type": "output_feedback"})
     try:
-        subject = subjects.of(scenario)
+        case = cases.of(scenario)
     except FlexarmError as error:  # its own refusals are its own tests'
         pytest.fail(str(error))
-    assert "states of its own" in bound.study(subject, 1.0, True)["reason"]
-    assert margins.study(subject, False)["decay_per_s"] is not None
+    assert "states of its own" in bound.study(case, 1.0, True)["reason"]
+    assert margins.study(case, False)["decay_per_s"] is not None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm compare``: the rivals' laws, the tuner, the shipped controller files, and the tables of stored rows."""
+"""``flexarm compare``: the baselines' laws, the tuner, the shipped controller files, and the tables of stored rows."""
 
 import json
 from dataclasses import replace
@@ -14,17 +14,17 @@ from flexarm_control.composite.full_order import at_rest
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_dynamics.linear import linear_plant, sampled, static_torque
-from flexarm_studies.comparison import combinations, command, contenders, report, subjects, trial
-from flexarm_studies.comparison.rivals import FullStateLqr, JointPid, lqr_gain
+from flexarm_studies.comparison import cases, combinations, command, controllers, report, trial
+from flexarm_studies.comparison.baselines import FullStateLqr, JointPid, lqr_gain
 from flexarm_studies.comparison.tuning import Free, tune
 from flexarm_studies.loop import scenario
 
-R, ONE, TWO, LONG = subjects.SUBJECTS
+R, ONE, TWO, LONG = cases.CASES
 
 
 @pytest.fixture(scope="module")
 def two():
-    return subjects.model_of("two_link")
+    return cases.model_of("two_link")
 
 
 def reference(q, qd, qdd):
@@ -68,9 +68,9 @@ def test_pid_clamps_and_forgets_its_integral(two):
 
 
 def test_pid_carries_the_weight_of_the_straight_arm():
-    arm = subjects.model_of("long_reach")
-    law = JointPid(arm, contenders.pid_gains(LONG, [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]))
-    q = subjects.ends_of(LONG)[0]
+    arm = cases.model_of("long_reach")
+    law = JointPid(arm, controllers.pid_gains(LONG, [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]))
+    q = cases.ends_of(LONG)[0]
     zero = np.zeros(arm.n_modes)
     u = law.step(q, 0.0 * q, zero, zero, at_rest(q))
     assert np.abs(u[1]) > 50.0
@@ -79,8 +79,8 @@ def test_pid_carries_the_weight_of_the_straight_arm():
 
 
 def test_pid_gains_are_those_of_the_inertia_that_a_joint_turns(two):
-    gains = contenders.pid_gains(TWO, [4.0, 0.5, 0.1, 0.5, 1.0, 2.0, 3.0])
-    M = two.terms(subjects.ends_of(TWO)[1], np.zeros(2)).M
+    gains = controllers.pid_gains(TWO, [4.0, 0.5, 0.1, 0.5, 1.0, 2.0, 3.0])
+    M = two.terms(cases.ends_of(TWO)[1], np.zeros(2)).M
     w = np.array([4.0, 8.0])
     assert_allclose(gains["p"], np.diag(M)[:2] * w**2)
     assert_allclose(gains["d"], np.diag(M)[:2] * w * [1.0, 3.0])
@@ -91,45 +91,45 @@ def test_pid_gains_are_those_of_the_inertia_that_a_joint_turns(two):
 
 
 def test_a_shaped_motion_ends_where_it_should_and_its_shaper_is_for_the_closed_loop():
-    gains = contenders.pid_gains(R, [4.0, 1.0, 0.0, 0.0, 1.0])
-    end = subjects.ends_of(R)[1]
-    poles = JointPid(subjects.model_of("R"), gains).poles(end)
-    rings = poles[(poles.imag > 0.0) & (-poles.real < contenders.DAMPED * np.abs(poles))]
-    omega = np.sort(np.abs(rings.imag))[: contenders.SHAPED]
-    train = contenders.shaper_for(R, gains, "zvd")
+    gains = controllers.pid_gains(R, [4.0, 1.0, 0.0, 0.0, 1.0])
+    end = cases.ends_of(R)[1]
+    poles = JointPid(cases.model_of("R"), gains).poles(end)
+    rings = poles[(poles.imag > 0.0) & (-poles.real < controllers.DAMPED * np.abs(poles))]
+    omega = np.sort(np.abs(rings.imag))[: controllers.SHAPED]
+    train = controllers.shaper_for(R, gains, "zvd")
     assert_allclose(train.duration, (2.0 * np.pi / omega).sum(), rtol=1e-9)
-    later = contenders.shaped_motion(R, gains, "zvd", 0.0)
-    same = contenders.shaped_motion(R, gains, "zvd", 1.0)
+    later = controllers.shaped_motion(R, gains, "zvd", 0.0)
+    same = controllers.shaped_motion(R, gains, "zvd", 1.0)
     assert_allclose(1e-9 * later.times_ns[-1], R.duration + train.duration, atol=1e-8)
     assert_allclose(1e-9 * same.times_ns[-1], R.duration, atol=1e-8)
     assert_allclose(same.positions[-1], end)
 
 
 def test_no_shaper_where_nothing_rings(monkeypatch):
-    gains = contenders.pid_gains(R, [4.0, 1.0, 0.0, 0.0, 1.0])
-    monkeypatch.setattr(contenders, "DAMPED", 0.0)
+    gains = controllers.pid_gains(R, [4.0, 1.0, 0.0, 0.0, 1.0])
+    monkeypatch.setattr(controllers, "DAMPED", 0.0)
     with pytest.raises(DesignError, match="nothing rings"):
-        contenders.shaper_for(R, gains, "zv")
+        controllers.shaper_for(R, gains, "zv")
 
 
 # --------------------------------------------------------------------------- LQR
 
 
-@pytest.mark.parametrize("subject", [R, TWO], ids=lambda s: s.arm)
+@pytest.mark.parametrize("case", [R, TWO], ids=lambda s: s.arm)
 @pytest.mark.parametrize("decay", [0.0, 1.5])
-def test_lqr_stabilises_the_sampled_arm(subject, decay):
-    arm, end = subjects.model_of(subject.arm), subjects.ends_of(subject)[1]
-    K = lqr_gain(arm, end, subject.rate, [0.1, 10.0, 1.0], decay)
-    Phi, Gamma = sampled(*linear_plant(arm, end, coulomb=False), 1.0 / subject.rate)
+def test_lqr_stabilises_the_sampled_arm(case, decay):
+    arm, end = cases.model_of(case.arm), cases.ends_of(case)[1]
+    K = lqr_gain(arm, end, case.rate, [0.1, 10.0, 1.0], decay)
+    Phi, Gamma = sampled(*linear_plant(arm, end, coulomb=False), 1.0 / case.rate)
     open_loop = np.abs(np.linalg.eigvals(Phi)).max()
     assert open_loop > 1.0 - 1e-9  # the joints drift
-    assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < np.exp(
-        -decay / subject.rate
-    ) - 1e-5 * (decay == 0.0)
+    assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < np.exp(-decay / case.rate) - 1e-5 * (
+        decay == 0.0
+    )
 
 
 def test_lqr_asks_for_no_more_than_the_rigid_torque_on_the_bent_arm(two):
-    end = subjects.ends_of(TWO)[1]
+    end = cases.ends_of(TWO)[1]
     law = FullStateLqr(two, end, 1000.0, [0.1, 10.0, 1.0])
     wanted = reference(end, [0.3, -0.1], [1.0, 2.0])
     terms = two.terms(wanted.position, wanted.velocity)
@@ -175,7 +175,7 @@ def test_what_can_be_judged_without_simulation_is_judged_first():
 
 def test_the_screen_of_pid_is_the_sampled_loop():
     """A damping that the sampled elbow does not stand is told from one that it does."""
-    screen = contenders.CONTENDERS[contenders.PID].screen
+    screen = controllers.CONTROLLERS[controllers.PID].screen
     soft, hard = (screen(TWO, [1.5, z, 0.0, 0.0, 1.0, 1.0, 1.0]) for z in (0.01, 5.0))
     assert soft < 0.0 < hard
 
@@ -186,28 +186,28 @@ def test_a_budget_of_one_is_the_first_guess():
     assert history == [best]
 
 
-@pytest.mark.parametrize("subject", subjects.SUBJECTS, ids=lambda s: s.arm)
-def test_first_guesses_are_within_their_ranges(subject):
-    for contender in contenders.CONTENDERS.values():
-        for free in contender.free(subject):
-            assert free.low <= free.first <= free.high, (contender.name, free.name)
+@pytest.mark.parametrize("case", cases.CASES, ids=lambda s: s.arm)
+def test_first_guesses_are_within_their_ranges(case):
+    for candidate in controllers.CONTROLLERS.values():
+        for free in candidate.free(case):
+            assert free.low <= free.first <= free.high, (candidate.name, free.name)
             assert free.at(free.place) == pytest.approx(free.first, abs=1e-12)
 
 
 # --------------------------------------------------------------------------- what is run
 
 
-@pytest.mark.parametrize("subject", subjects.SUBJECTS, ids=lambda s: s.arm)
-def test_shipped_controllers_load_and_design(subject):
+@pytest.mark.parametrize("case", cases.CASES, ids=lambda s: s.arm)
+def test_shipped_controllers_load_and_design(case):
     """Their own check of the sampled full-order poles is part of the design."""
-    values = scenario.parameters(subject.controller)
-    loop = scenario.loop_of(scenario.Scenario(subject.arm, values, rate=subject.rate))
+    values = scenario.parameters(case.controller)
+    loop = scenario.loop_of(scenario.Scenario(case.arm, values, rate=case.rate))
     law = loop.controller.law
     assert values["observer.type"] == "kalman"
     assert law.feedforward is not None
     assert law.fast.K_f.shape == (loop.model.n_joints, 2 * loop.model.n_modes)
     given = values.get("rate", 1000.0)
-    assert given == (1000.0 if subject in (R, ONE) else subject.rate)
+    assert given == (1000.0 if case in (R, ONE) else case.rate)
 
 
 def test_composite_yaml_is_the_nodes_defaults():
@@ -224,12 +224,12 @@ def test_composite_yaml_is_the_nodes_defaults():
 
 
 def test_arms_without_damping_or_noise_get_some_and_others_stay():
-    assert subjects.arm_of("R").links[0].flexible["y"].damping == (0.005, 0.005)
-    assert subjects.arm_of("two_link").links == arm_file.load("two_link").links
-    quiet, noisy = subjects.arm_of("R"), subjects.arm_of("R", noisy=True)
+    assert cases.arm_of("R").links[0].flexible["y"].damping == (0.005, 0.005)
+    assert cases.arm_of("two_link").links == arm_file.load("two_link").links
+    quiet, noisy = cases.arm_of("R"), cases.arm_of("R", noisy=True)
     assert {g.noise for g in quiet.gauges} == {0.0}
-    assert {g.noise for g in noisy.gauges} == {subjects.STRAIN_NOISE}
-    assert noisy.joints[0].encoder_counts == subjects.COUNTS
+    assert {g.noise for g in noisy.gauges} == {cases.STRAIN_NOISE}
+    assert noisy.joints[0].encoder_counts == cases.COUNTS
 
 
 def test_combinations_make_sense():
@@ -247,9 +247,9 @@ def test_combinations_make_sense():
 SHORT = replace(R, motion="quintic:to=0.02,duration=0.1", window=0.1, budget=2)
 
 
-def test_a_rival_runs_in_the_same_loop():
-    contender = contenders.CONTENDERS[contenders.PID]
-    row = trial.run(SHORT, contender.setup(SHORT, [f.first for f in contender.free(SHORT)]))
+def test_a_baseline_runs_in_the_same_loop():
+    candidate = controllers.CONTROLLERS[controllers.PID]
+    row = trial.run(SHORT, candidate.setup(SHORT, [f.first for f in candidate.free(SHORT)]))
     assert 0.0 < row["peak_joint_error_rad"] < 0.02
     assert 0.0 < row["peak_torque_Nm"][0] <= 13.56
     length = 4.0 * 0.3048
@@ -259,19 +259,19 @@ def test_a_rival_runs_in_the_same_loop():
     )
 
 
-def test_a_rival_has_the_shipped_controllers_peak_torque_and_no_more(monkeypatch):
-    shipped = contenders.prepared(SHORT, contenders.SHIPPED, ())
+def test_a_baseline_has_the_shipped_controllers_peak_torque_and_no_more(monkeypatch):
+    shipped = controllers.prepared(SHORT, controllers.SHIPPED, ())
     assert "torque_limit" not in shipped.controller
-    assert list(contenders.allowed(SHORT)) == trial.run(SHORT, shipped)["peak_torque_Nm"]
+    assert list(controllers.allowed(SHORT)) == trial.run(SHORT, shipped)["peak_torque_Nm"]
     stiff = [60.0, 5.0, 0.3, 0.0, 1.5]  # takes all it can get
-    free = trial.run(SHORT, contenders.CONTENDERS[contenders.PID].setup(SHORT, stiff))
+    free = trial.run(SHORT, controllers.CONTROLLERS[controllers.PID].setup(SHORT, stiff))
     assert free["peak_torque_Nm"][0] > 3.0
-    monkeypatch.setattr(contenders, "allowed", lambda subject: (1.5,))
-    held = trial.run(SHORT, contenders.prepared(SHORT, contenders.PID, stiff))
+    monkeypatch.setattr(controllers, "allowed", lambda case: (1.5,))
+    held = trial.run(SHORT, controllers.prepared(SHORT, controllers.PID, stiff))
     assert held["peak_torque_Nm"] == pytest.approx([1.5], rel=1e-12)
 
 
-def test_what_a_rival_works_out_along_the_motion_it_works_out_once(two):
+def test_what_a_baseline_works_out_along_the_motion_it_works_out_once(two):
     seen, calls = {}, []
     law = JointPid(two, pid(two).gains, seen)
     law._along = lambda reference: calls.append(reference) or np.array([0.1, 0.2])
@@ -284,17 +284,17 @@ def test_what_a_rival_works_out_along_the_motion_it_works_out_once(two):
 
 def test_a_shaped_motion_is_judged_by_the_motion_that_was_asked_for():
     """Stiffly led along another motion, the joint is off by what the motions differ."""
-    contender = contenders.CONTENDERS["joint PID, ZV shaper"]
-    values = [f.first for f in contender.free(SHORT)]
-    setup = contender.setup(SHORT, values)
-    shaped = setup.motion(subjects.model_of("R"))
+    candidate = controllers.CONTROLLERS["joint PID, ZV shaper"]
+    values = [f.first for f in candidate.free(SHORT)]
+    setup = candidate.setup(SHORT, values)
+    shaped = setup.motion(cases.model_of("R"))
     assert 1e-9 * shaped.times_ns[-1] > 0.3
     row = trial.run(SHORT, setup)
     assert row["peak_joint_error_rad"] > 0.3 * 0.02
 
 
 def test_what_is_refused_is_a_result():
-    row = trial.run(SHORT, contenders.Setup({"slow.kp": [-1.0]}))
+    row = trial.run(SHORT, controllers.Setup({"slow.kp": [-1.0]}))
     assert row["cost"] == trial.REFUSED
     assert "slow.kp" in row["refused"]
 
@@ -327,8 +327,12 @@ def stored(residual=0.5, settling=0.1):
                 "window_s": 2.0,
                 "budget": 3,
                 "contenders": {
-                    contenders.SHIPPED: {"row": row, "noisy": row, **fill, "gains": {}},
-                    contenders.PID: {"row": pid, "noisy": {"lost": "far off", "cost": 1e3}, **fill},
+                    controllers.SHIPPED: {"row": row, "noisy": row, **fill, "gains": {}},
+                    controllers.PID: {
+                        "row": pid,
+                        "noisy": {"lost": "far off", "cost": 1e3},
+                        **fill,
+                    },
                     "full-state LQR": {"row": lqr, "noisy": lqr, **fill},
                 },
                 "combinations": [parts | {"row": {"refused": "a pole", "cost": 1e4}}],
@@ -350,23 +354,23 @@ def test_tables_of_stored_rows(tmp_path, capsys):
     assert "| a | none | c | d | refused |" in text
     assert "w [rad/s] = 4" in text
     assert "more than 20 times sooner" in text
-    assert "No rival beats" in text
+    assert "No baseline beats" in text
     assert capsys.readouterr().out.strip() in text
 
 
-def test_a_rival_that_is_better_in_both_is_named():
+def test_a_baseline_that_is_better_in_both_is_named():
     verdicts = report.verdicts(stored(residual=2.0)["subjects"][0])
-    assert verdicts[-1].endswith("alike to full-state LQR.")
+    assert verdicts[-1].endswith(" residual: full-state LQR.")
     half = stored(residual=2.0)["subjects"][0]
     half["contenders"]["full-state LQR"]["row"]["rms_tip_mm"] = 9.0
-    assert report.verdicts(half)[-1].startswith("No rival beats")
+    assert report.verdicts(half)[-1].startswith("No baseline beats")
     late = report.verdicts(stored(settling=None)["subjects"][0])
     assert late[0] == "The shipped controller does not settle within 2 s."
 
 
 def test_runs_are_merged_and_must_agree():
     one, other = stored(), stored()
-    del one["subjects"][0]["contenders"][contenders.PID]
+    del one["subjects"][0]["contenders"][controllers.PID]
     one["subjects"][0]["combinations"] = []
     whole = command.merged([one, other])
     assert set(whole["subjects"][0]["contenders"]) == set(other["subjects"][0]["contenders"])
@@ -386,10 +390,10 @@ def test_a_file_without_markers_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--arms", "P9"], "there are R"),
-        (["--contenders", "joint PID,nobody"], "nobody"),
-        (["--budget", "0"], "--budget 0"),
-        (["--workers", "0"], "--workers 0"),
+        (["--arms", "P9"], "--arms: 'P9' is unknown (R, "),
+        (["--contenders", "joint PID,other"], "--contenders: 'other' is unknown"),
+        (["--budget", "0"], "--budget: 0 is too small (1 or more)"),
+        (["--workers", "0"], "--workers: 0 is too small (1 or more)"),
     ],
 )
 def test_options_that_are_refused(words, message, capsys):
@@ -401,7 +405,7 @@ def test_options_that_are_refused(words, message, capsys):
 
 def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
     def interrupted(jobs, seed, workers):
-        yield 1, stored()["subjects"][0]["contenders"][contenders.PID]
+        yield 1, stored()["subjects"][0]["contenders"][controllers.PID]
         raise KeyboardInterrupt
 
     monkeypatch.setattr(command, "_results", interrupted)
@@ -409,19 +413,19 @@ def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
     words = ["--arms", "R", "--contenders", "composite (shipped),joint PID", "--no-combinations"]
     with pytest.raises(KeyboardInterrupt):
         command.main([*words, "--json", str(out)])
-    assert list(command.load(out)["subjects"][0]["contenders"]) == [contenders.PID]
+    assert list(command.load(out)["subjects"][0]["contenders"]) == [controllers.PID]
 
 
 def test_the_command_runs(tmp_path, capsys, monkeypatch):
     """The whole way with `--quick`, on a motion that is over soon."""
-    monkeypatch.setattr(subjects, "SUBJECTS", (SHORT,))
+    monkeypatch.setattr(cases, "CASES", (SHORT,))
     monkeypatch.setattr(command, "QUICK_WINDOW", 0.1)
     out = tmp_path / "rows.json"
     words = ["--quick", "--workers", "1", "--no-combinations", "--json", str(out)]
     command.main([*words, "--contenders", "composite (shipped),joint PID, ZV shaper"])
     found = json.loads(out.read_text())
-    (subject,) = found["subjects"]
-    assert set(subject["contenders"]) == {contenders.SHIPPED, "joint PID, ZV shaper"}
-    assert subject["contenders"]["joint PID, ZV shaper"]["simulations"] == command.QUICK_BUDGET
-    assert "residual_mm" in subject["contenders"][contenders.SHIPPED]["row"]
+    (case,) = found["subjects"]
+    assert set(case["contenders"]) == {controllers.SHIPPED, "joint PID, ZV shaper"}
+    assert case["contenders"]["joint PID, ZV shaper"]["simulations"] == command.QUICK_BUDGET
+    assert "residual_mm" in case["contenders"][controllers.SHIPPED]["row"]
     assert "joint PID, ZV shaper" in capsys.readouterr().out

@@ -24,22 +24,22 @@ LATE = 0.25
 DECAYS, SHORTEST, LONGEST = 8.0, 1.0, 8.0
 
 
-def directions(subject):
+def directions(case):
     """Name, joint offset (n,) [rad] or deflection (m,) [m, rad], the largest scale and its unit, of each ray."""
-    model, n, m = subject.model, subject.model.n_joints, subject.model.n_modes
+    model, n, m = case.model, case.model.n_joints, case.model.n_modes
     for i, name in enumerate(model.joint_names):
         offset = np.zeros(n)
         offset[i] = 1.0
         yield name, offset, np.zeros(m), LARGEST_TURN, "rad"
-    shape = lowest_shape(subject)
+    shape = lowest_shape(case)
     if shape is not None:
-        reach = sum(link.length for link in subject.arm.links)
+        reach = sum(link.length for link in case.arm.links)
         yield "lowest fast mode", np.zeros(n), shape, LARGEST_BEND * reach, "m"
 
 
-def lowest_shape(subject):
+def lowest_shape(case):
     """Deflections of the lowest mode of the boundary layer, 1 m at the tip; None where the tip does not move."""
-    model, q = subject.model, subject.q
+    model, q = case.model, case.q
     m = model.n_modes
     if not m:
         return None
@@ -52,12 +52,12 @@ def lowest_shape(subject):
     return None if size < 1e-6 else shape * small / np.linalg.norm(moved)
 
 
-def comes_back(subject, joint, bend, watched):
+def comes_back(case, joint, bend, watched):
     """Whether the loop brings the arm back to the motion's end from an offset.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     joint : ndarray, shape (n,)
         [rad]
     bend : ndarray, shape (m,)
@@ -65,10 +65,10 @@ def comes_back(subject, joint, bend, watched):
     watched : float
         [s]
     """
-    q = subject.q
-    values = subject.scenario.controller | {"start_tolerance": 10.0}
+    q = case.q
+    values = case.scenario.controller | {"start_tolerance": 10.0}
     hold = {"times": [0.0, 0.01], "positions": [q.tolist()] * 2}
-    scenario = replace(subject.scenario, controller=values, trajectory=hold)
+    scenario = replace(case.scenario, controller=values, trajectory=hold)
     try:
         loop = scenarios.loop_of(scenario)
         motion = scenarios.trajectory_of(hold, loop.model, q)
@@ -90,12 +90,12 @@ def comes_back(subject, joint, bend, watched):
     return all(bool(v[late].max() < max(BACK * v.max(), FLOOR)) for v in (off, bent))
 
 
-def study(subject, steps=5, progress=None):
+def study(case, steps=5, progress=None):
     """Scale along each ray up to which the arm comes back.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     steps : int
         Bisections; the largest offset is tried before.
     progress : Progress, optional
@@ -106,21 +106,21 @@ def study(subject, steps=5, progress=None):
         ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
         ``searched``, with which `scale` is equal where the arm came back even from there.
     """
-    if subject.without_poles:
-        return {"reason": subject.without_poles, "rays": []}
-    decay = subject.decay()
+    if case.without_poles:
+        return {"reason": case.without_poles, "rays": []}
+    decay = case.decay()
     if decay <= 0.0:
         return {"reason": "the linear loop is not stable", "rays": []}
     watched = float(np.clip(DECAYS / decay, SHORTEST, LONGEST))
-    rays, every = [], list(directions(subject))
+    rays, every = [], list(directions(case))
     for i, (name, joint, bend, largest, unit) in enumerate(every):
         good, bad = 0.0, largest
-        if comes_back(subject, largest * joint, largest * bend, watched):
+        if comes_back(case, largest * joint, largest * bend, watched):
             good = largest
         else:
             for _ in range(steps):
                 middle = 0.5 * (good + bad)
-                back = comes_back(subject, middle * joint, middle * bend, watched)
+                back = comes_back(case, middle * joint, middle * bend, watched)
                 good, bad = (middle, bad) if back else (good, middle)
         rays.append({"direction": name, "scale": good, "unit": unit, "searched": largest})
         if progress is not None:

@@ -39,7 +39,7 @@ from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from ..loop import scenario as scenarios
-from . import subject as subjects
+from . import case as cases
 from . import trial
 
 #: How much slower bending is looked at: factor of mu [-].
@@ -63,15 +63,15 @@ class Blocks:
         return np.block([[self.A11, self.A12], [self.A21, self.A_f / factor + self.R]])
 
 
-def blocks(subject):
-    """The subject's loop as `Blocks`.
+def blocks(case):
+    """The case's loop as `Blocks`.
 
     Raises
     ------
     DesignError
         For a fast law with states of its own, and for an arm without modes.
     """
-    model, law, q = subject.model, subject.law, subject.q
+    model, law, q = case.model, case.law, case.q
     n, m = model.n_joints, model.n_modes
     K = law.fast.gain(q)
     if not m:
@@ -205,7 +205,7 @@ def _parameters(S):
 
 def stable_factor(b, until=SLOWEST):
     """Factor of mu up to which the linear loop of the theorem is in fact stable; None: all the way to `until`."""
-    return subjects.first_loss(
+    return cases.first_loss(
         lambda f: np.linalg.eigvals(b.matrix(f)).real.max() < -full_order.ROUNDING,
         1.0,
         until,
@@ -213,7 +213,7 @@ def stable_factor(b, until=SLOWEST):
     )
 
 
-def redesign_factor(subject, until=SLOWEST):
+def redesign_factor(case, until=SLOWEST):
     """Factor of mu up to which arms with slower bending are held by the design made for them; sampled poles.
 
     Returns
@@ -224,34 +224,34 @@ def redesign_factor(subject, until=SLOWEST):
 
     def stable(factor):
         try:
-            slower = subjects.slower_bending(subject.scenario, factor)
+            slower = cases.slower_bending(case.scenario, factor)
             slower = replace(slower, controller=slower.controller | {"feedforward": "none"})
             law = scenarios.loop_of(slower).controller.law
         except DesignError:
             return False
-        return full_order.poles(law, subject.q, subject.period)[0].real < -full_order.ROUNDING
+        return full_order.poles(law, case.q, case.period)[0].real < -full_order.ROUNDING
 
-    return subjects.first_loss(stable, 1.0, until, scan=10, steps=8)
+    return cases.first_loss(stable, 1.0, until, scan=10, steps=8)
 
 
-def simulated(subject, factor):
+def simulated(case, factor):
     """Nonlinear runs of redesigned loops on either side of a factor of mu, `redesign_factor`'s."""
     found = {}
     for name, beside in (("inside", 1.0 - BESIDE), ("beyond", 1.0 + BESIDE)):
         f = factor * beside
-        slower = subjects.slower_bending(subject.scenario, f)
+        slower = cases.slower_bending(case.scenario, f)
         watched = min(trial.WATCHED * max(f, 1.0), trial.LONGEST)
-        found[name] = trial.dies_out(slower, subject.q, watched=watched)
+        found[name] = trial.dies_out(slower, case.q, watched=watched)
         found[f"{name}_factor"] = f
     return found
 
 
-def study(subject, mu, quick=False):
+def study(case, mu, quick=False):
     """The bound beside what the loop bears.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     mu : float
         At present.
     quick : bool
@@ -266,20 +266,20 @@ def study(subject, mu, quick=False):
         bound.
     """
     found = {"mu": mu, "searched": SLOWEST * mu}
-    reason = subject.without_poles
+    reason = case.without_poles
     if not reason:
         try:
-            b = blocks(subject)
+            b = blocks(case)
             c = optimised(b, 600 if quick else 2500)
         except DesignError as error:
             reason = str(error)
     if reason:
         return found | {"bound": None, "reason": reason}
-    factors = {"linear_limit": stable_factor(b), "redesign_limit": redesign_factor(subject)}
+    factors = {"linear_limit": stable_factor(b), "redesign_limit": redesign_factor(case)}
     limits = {k: None if v is None else v * mu for k, v in factors.items()}
     runs = None
     if not quick and factors["redesign_limit"] is not None:
-        runs = simulated(subject, factors["redesign_limit"])
+        runs = simulated(case, factors["redesign_limit"])
         runs |= {f"{k}_mu": runs.pop(f"{k}_factor") * mu for k in ("inside", "beyond")}
     return found | {
         "bound": c["factor"] * mu,

@@ -9,7 +9,7 @@ from flexarm_dynamics.errors import FlexarmError
 from ..loop import scenario as scenarios
 from ..progress import Progress
 from . import attraction, bound, margins, monte_carlo, report, scales
-from . import subject as subjects
+from . import case as cases
 
 
 def add_arguments(parser):
@@ -98,23 +98,23 @@ def study(scenario, options, progress):
     """
     total = 3 + (not options.quick) + (options.monte_carlo is not None)
     progress.step("time scales and full-order poles", 1, total)
-    subject = subjects.of(scenario)
-    found = {"scenario": scenario.as_dict(), "rate_Hz": 1.0 / subject.period}
-    found["scales"] = s = scales.study(subject, options.configurations, options.seed)
+    case = cases.of(scenario)
+    found = {"scenario": scenario.as_dict(), "rate_Hz": 1.0 / case.period}
+    found["scales"] = s = scales.study(case, options.configurations, options.seed)
     progress.fraction(0.5)
-    found["gain_sweep"] = scales.gain_sweep(subject)
+    found["gain_sweep"] = scales.gain_sweep(case)
     progress.step("bound on mu", 2, total)
     if s["reason"]:
         found["bound"] = {"bound": None, "reason": s["reason"]}
     else:
-        mu = scales.at(subject, subject.q, 0.0 * subject.q, scales.slow_poles(subject))["mu"]
-        found["bound"] = bound.study(subject, mu, options.quick)
+        mu = scales.at(case, case.q, 0.0 * case.q, scales.slow_poles(case))["mu"]
+        found["bound"] = bound.study(case, mu, options.quick)
     progress.step("margins", 3, total)
-    found["margins"] = margins.study(subject, not options.quick, progress=progress)
+    found["margins"] = margins.study(case, not options.quick, progress=progress)
     found["attraction"] = None
     if not options.quick:
         progress.step("domain of attraction", 4, total)
-        found["attraction"] = attraction.study(subject, progress=progress)
+        found["attraction"] = attraction.study(case, progress=progress)
     found["monte_carlo"] = None
     if options.monte_carlo is not None:
         progress.step(f"Monte Carlo, {options.monte_carlo} runs", total, total)

@@ -16,7 +16,7 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import FlexarmError
 
 from ..loop import scenario as scenarios
-from . import subject as subjects
+from . import case as cases
 from . import trial
 
 #: How long the arm is held while noise is judged, the first part left out [s].
@@ -35,7 +35,7 @@ class Margin:
     start, end : float
         From the nominal value to the farthest that is looked at.
     poles : callable
-        Of the subject and the value: keywords of `Subject.poles`.
+        Of the case and the value: keywords of `Case.poles`.
     run : callable
         Of the scenario and the value: the scenario, and the gain, of a run.
     """
@@ -56,9 +56,9 @@ def _plant(name):
     )
 
 
-def kinds(subject):
-    """All margins of a subject."""
-    T = subject.period
+def kinds(case):
+    """All margins of a case."""
+    T = case.period
     delay = (lambda s, v: {"delay": v}, lambda c, v: (replace(c, delay=v), 1.0))
     gain = (lambda s, v: {"gain": v}, lambda c, v: (c, v))
     rate = (lambda s, v: {"period": 1.0 / v}, lambda c, v: (replace(c, rate=v), 1.0))
@@ -82,12 +82,12 @@ PLANTS = tuple(
 TRIED = ("delay", "gain_high")
 
 
-def study(subject, runs=True, tried=TRIED, progress=None):
+def study(case, runs=True, tried=TRIED, progress=None):
     """All margins.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     runs : bool
         Whether nonlinear runs confirm those of `tried`, and noise is judged.
     tried : sequence of str
@@ -99,42 +99,40 @@ def study(subject, runs=True, tried=TRIED, progress=None):
         ``reason``; ``decay_per_s``; per margin ``value`` (None: none up to ``searched``) and, where tried,
         ``confirmed`` and ``simulated``; ``plants``: how fast the loop dies out on other arms; ``noise``.
     """
-    if subject.without_poles:
-        return {"reason": subject.without_poles, "stable": None}
-    nominal = subject.decay()
+    if case.without_poles:
+        return {"reason": case.without_poles, "stable": None}
+    nominal = case.decay()
     found = {"reason": "", "stable": nominal > -full_order.ROUNDING, "decay_per_s": nominal}
-    every = {kind.name: of_poles(subject, kind) for kind in kinds(subject)}
+    every = {kind.name: of_poles(case, kind) for kind in kinds(case)}
     found["margins"] = every
     found["plants"] = [
         {
             "what": name,
             "factor": v,
-            "decay_per_s": subject.decay(plant=scaled(subject.arm, **{name: v})),
+            "decay_per_s": case.decay(plant=scaled(case.arm, **{name: v})),
         }
         for name, v in PLANTS
     ]
     if runs and found["stable"]:
-        names = [
-            k for k in kinds(subject) if k.name in tried and every[k.name]["value"] is not None
-        ]
+        names = [k for k in kinds(case) if k.name in tried and every[k.name]["value"] is not None]
         for i, kind in enumerate(names):
-            every[kind.name] |= by_runs(subject, kind, every[kind.name]["value"])
+            every[kind.name] |= by_runs(case, kind, every[kind.name]["value"])
             if progress is not None:
                 progress.fraction((i + 1) / (len(names) + 1))
-    found["noise"] = noise(subject) if runs else {"reason": "not asked for: --quick"}
+    found["noise"] = noise(case) if runs else {"reason": "not asked for: --quick"}
     return found
 
 
-def of_poles(subject, kind):
+def of_poles(case, kind):
     """A margin by the poles of the sampled full-order loop."""
 
     def stable(value):
         try:
-            return subject.decay(**kind.poles(subject, value)) > full_order.ROUNDING
+            return case.decay(**kind.poles(case, value)) > full_order.ROUNDING
         except FlexarmError:
             return False
 
-    value = subjects.first_loss(stable, kind.start, kind.end, scan=24, steps=12)
+    value = cases.first_loss(stable, kind.start, kind.end, scan=24, steps=12)
     return {"value": value, "searched": kind.end, "unit": kind.unit, "text": kind.text}
 
 
@@ -145,7 +143,7 @@ def _beside(kind, value, share):
     return kind.start * (value / kind.start) ** share if value > 0.0 else value
 
 
-def by_runs(subject, kind, value):
+def by_runs(case, kind, value):
     """What nonlinear runs say of a margin.
 
     `kind` is the margin's name, `value` what the linear loop says.
@@ -157,12 +155,12 @@ def by_runs(subject, kind, value):
         where the loop with its observer loses stability if it is elsewhere, else None; ``at_least``: whether
         that is only how far was looked.
     """
-    unstable = kind.poles(subject, _beside(kind, value, 1.02))
-    watched = trial.long_enough(subject.poles(**unstable)[0])
+    unstable = kind.poles(case, _beside(kind, value, 1.02))
+    watched = trial.long_enough(case.poles(**unstable)[0])
 
     def stable(share):
-        scenario, gain = kind.run(subject.scenario, _beside(kind, value, share))
-        return trial.dies_out(scenario, subject.q, gain, watched)
+        scenario, gain = kind.run(case.scenario, _beside(kind, value, share))
+        return trial.dies_out(scenario, case.q, gain, watched)
 
     inside, beyond = stable(0.9), stable(1.1)
     if inside and not beyond:
@@ -176,14 +174,14 @@ def by_runs(subject, kind, value):
     return {"confirmed": False, "simulated": _beside(kind, value, good), "at_least": False}
 
 
-def noise(subject):
+def noise(case):
     """Rms motion of the tip while the arm is held at the motion's end, with the noise that the arm file states."""
-    gauges = subject.arm.gauges
+    gauges = case.arm.gauges
     if not any(g.noise or g.drift for g in gauges):
-        return {"reason": f"the arm file of {subject.arm.name} states none", "tip_rms_mm": None}
-    q = subject.q.tolist()
+        return {"reason": f"the arm file of {case.arm.name} states none", "tip_rms_mm": None}
+    q = case.q.tolist()
     hold = {"times": [0.0, 0.1], "positions": [q, q]}
-    scenario = replace(subject.scenario, trajectory=hold, noise=True, duration=HELD, repeat=1)
+    scenario = replace(case.scenario, trajectory=hold, noise=True, duration=HELD, repeat=1)
     record, metrics, loop = scenarios.run_loop(scenario)
     if metrics["lost"]:
         return {"reason": metrics["reason"], "tip_rms_mm": None}

@@ -16,7 +16,7 @@ from flexarm_dynamics.singular_perturbation import (
     time_scales,
 )
 
-from . import subject as subjects
+from . import case as cases
 
 #: Joints without limits are taken to turn this far either way [rad].
 TURN = np.pi
@@ -29,9 +29,9 @@ def pairs(values):
     return [[float(v.real), float(v.imag)] for v in np.atleast_1d(values).astype(complex)]
 
 
-def slow_poles(subject):
+def slow_poles(case):
     """Poles of the slow subsystem under its control, at the motion's end [1/s]; None for a law that has none."""
-    law, n = subject.law, subject.model.n_joints
+    law, n = case.law, case.model.n_joints
     if law.slow.drifts:
         return None
     gains = law.slow.error_gains()
@@ -40,10 +40,10 @@ def slow_poles(subject):
         return np.concatenate([np.roots([1.0, v, p]) for p, v in zip(kp, kv, strict=True)])
     from .bound import blocks
 
-    return np.linalg.eigvals(blocks(subject).A11)
+    return np.linalg.eigvals(blocks(case).A11)
 
 
-def at(subject, q, qd, slow):
+def at(case, q, qd, slow):
     """Time scales and reachability at one state.
 
     Returns
@@ -51,16 +51,16 @@ def at(subject, q, qd, slow):
     dict
         ``mu``, ``mu_closed`` (of the controlled boundary layer), ``singular_value`` of Hautus' test.
     """
-    terms = subject.model.terms(q, qd)
+    terms = case.model.terms(q, qd)
     A2, B2 = fast_subsystem(terms)
     speed = np.abs(slow).max()
     smallest = np.abs(np.linalg.eigvals(A2)).min()
     if smallest == 0.0:
         raise DesignError("a fast eigenvalue is zero: the deflections have no stiffness here")
-    K = subject.law.fast.gain(q)
+    K = case.law.fast.gain(q)
     closed = None if K is None else np.abs(np.linalg.eigvals(A2 + B2 @ K)).min()
     # Every mode that does not decay on its own, and those that decay slower than asked for.
-    alpha = float(subject.law.fast.parameters.get("alpha", 0.0))
+    alpha = float(case.law.fast.parameters.get("alpha", 0.0))
     ok, worst = is_stabilisable(A2, B2, alpha)
     return {
         "mu": float(speed / smallest),
@@ -82,12 +82,12 @@ def configurations(model, count, seed):
     return np.random.default_rng(seed).uniform(low, high, (count, len(ranges)))
 
 
-def study(subject, count=200, seed=0):
+def study(case, count=200, seed=0):
     """Time scales along the motion and over the workspace.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     count : int
         Configurations of the workspace.
     seed : int
@@ -97,22 +97,19 @@ def study(subject, count=200, seed=0):
     dict
         Ready for JSON; without a slow loop or modes only ``reason``.
     """
-    slow = slow_poles(subject)
-    if slow is None or not subject.model.n_modes:
-        why = subject.without_poles or f"{subject.model.arm.name} has no modes"
+    slow = slow_poles(case)
+    if slow is None or not case.model.n_modes:
+        why = case.without_poles or f"{case.model.arm.name} has no modes"
         return {"reason": f"{why}: there are no two time scales"}
-    along = [
-        at(subject, q, qd, slow)
-        for q, qd in zip(subject.positions, subject.velocities, strict=True)
-    ]
-    n = subject.model.n_joints
-    everywhere = configurations(subject.model, count, seed)
-    over = [at(subject, q, np.zeros(n), slow) for q in everywhere]
+    along = [at(case, q, qd, slow) for q, qd in zip(case.positions, case.velocities, strict=True)]
+    n = case.model.n_joints
+    everywhere = configurations(case.model, count, seed)
+    over = [at(case, q, np.zeros(n), slow) for q in everywhere]
     return {
         "reason": "",
-        "spectra": spectra(subject, slow),
-        "along": {"time_s": subject.times.tolist(), **_columns(along)},
-        "along_worst": _worst(along, subject.positions),
+        "spectra": spectra(case, slow),
+        "along": {"time_s": case.times.tolist(), **_columns(along)},
+        "along_worst": _worst(along, case.positions),
         "workspace": {"count": count, **_worst(over, everywhere)},
     }
 
@@ -135,10 +132,10 @@ def _worst(rows, positions):
     }
 
 
-def spectra(subject, slow):
+def spectra(case, slow):
     """Poles of the slow and the fast subsystem, open and closed, and of the whole, at the motion's end."""
-    model, q = subject.model, subject.q
-    terms, K = model.terms(q, np.zeros(model.n_joints)), subject.law.fast.gain(q)
+    model, q = case.model, case.q
+    terms, K = model.terms(q, np.zeros(model.n_joints)), case.law.fast.gain(q)
     opened = time_scales(terms).fast
     closed = None if K is None else time_scales(terms, K_f=K).fast
     smallest = None if closed is None else np.abs(closed).min()
@@ -148,13 +145,13 @@ def spectra(subject, slow):
         "slow_closed": pairs(slow),
         "fast_open": pairs(opened),
         "fast_closed": None if closed is None else pairs(closed),
-        "full_order": pairs(subject.poles()),
+        "full_order": pairs(case.poles()),
         "separation_open": float(np.abs(opened).min() / np.abs(slow).max()),
         "separation_closed": None if smallest is None else float(smallest / np.abs(slow).max()),
     }
 
 
-def gain_sweep(subject, factors=GAINS):
+def gain_sweep(case, factors=GAINS):
     """What a faster slow loop does to the bending: full-order poles over slow.kp, kv critically damped.
 
     `factors` are of slow.kp [-].
@@ -165,27 +162,27 @@ def gain_sweep(subject, factors=GAINS):
         ``reason``, or ``rows``: per factor of kp the fast modes' frequency [rad/s] and damping ratio (those of
         the 2m fastest poles), the slowest pole's real part and the poles; a row whose design fails has None.
     """
-    parameters = subject.law.slow.parameters
+    parameters = case.law.slow.parameters
     if not {"kp", "kv"} <= set(parameters):
         return {"reason": "the slow law has no gains slow.kp, slow.kv", "rows": []}
-    if subject.without_poles:
-        return {"reason": subject.without_poles, "rows": []}
+    if case.without_poles:
+        return {"reason": case.without_poles, "rows": []}
     kp, rows = np.asarray(parameters["kp"], float), []
     for factor in factors:
         row = {"factor": float(factor), "kp": (factor * kp).tolist()}
         row["kv"] = (2.0 * np.sqrt(factor * kp)).tolist()
-        rows.append(row | _swept(subject, row["kp"], row["kv"]))
+        rows.append(row | _swept(case, row["kp"], row["kv"]))
     return {"reason": "", "rows": rows}
 
 
-def _swept(subject, kp, kv):
+def _swept(case, kp, kv):
     nothing = {"fast_frequencies": None, "fast_damping": None, "slowest": None, "poles": None}
     try:
-        law = subjects.redesigned(subject, slow__kp=kp, slow__kv=kv)
+        law = cases.redesigned(case, slow__kp=kp, slow__kv=kv)
     except FlexarmError:
         return nothing
-    s = full_order.poles(law, subject.q, subject.period)
-    fast = s[np.argsort(np.abs(s))][-2 * subject.model.n_modes :]
+    s = full_order.poles(law, case.q, case.period)
+    fast = s[np.argsort(np.abs(s))][-2 * case.model.n_modes :]
     omega, zeta = frequencies_and_damping(fast)
     return {
         "fast_frequencies": omega.tolist(),

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Composite control beside its rivals on the same arms, motions, limits, sensors and observers: ``flexarm compare``."""
+"""``flexarm compare``: composite control and baselines with the same arms, motions, limits, sensors and observers."""

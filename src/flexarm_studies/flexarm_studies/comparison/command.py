@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm compare``: tunes everyone alike, runs everyone, and writes the table."""
+"""``flexarm compare``: tunes all controllers alike, runs them, and writes the table."""
 
 import argparse
 import json
@@ -14,12 +14,12 @@ from flexarm_dynamics.errors import FlexarmError
 
 from ..progress import Progress
 from ..workers import processes
-from . import combinations, report, subjects
-from .contenders import CONTENDERS, PREVIEW, prepared
+from . import cases, combinations, report
+from .controllers import CONTROLLERS, PREVIEW, prepared
 from .trial import run
 from .tuning import tune
 
-#: Of `--quick`: one arm, so many simulations each, watched so long [s].
+#: For `--quick`: the one arm, the number of simulations, and the window after the motion [s].
 QUICK, QUICK_BUDGET, QUICK_WINDOW = "R", 2, 0.2
 
 
@@ -30,14 +30,22 @@ def add_arguments(parser):
     )
     parser.epilog = "example: flexarm compare --arms R --json results/compare.json"
     add = parser.add_argument
-    arms = ",".join(s.arm for s in subjects.SUBJECTS)
-    add("--arms", default=arms, help=f"which, separated by commas ({arms})")
-    add("--contenders", help="which, separated by commas; none (all)")
-    add("--budget", type=int, metavar="N", help="simulations per contender (by arm)")
-    add("--seed", type=int, default=0, help="of the tuning and of the noise (0)")
+    arms = ",".join(s.arm for s in cases.CASES)
+    add("--arms", default=arms, help=f"arms, separated by commas ({arms})")
+    add("--contenders", help="controllers, separated by commas; or none (all)")
+    add("--budget", type=int, metavar="N", help="simulations per controller (depends on the arm)")
+    add("--seed", type=int, default=0, help="seed of tuning and noise (0)")
     add("--workers", type=int, metavar="N", help="processes (one per core)")
-    add("--quick", action="store_true", help=f"{QUICK} alone, next to no tuning: that it works")
-    add("--no-combinations", action="store_true", help="the rivals alone")
+    add(
+        "--quick",
+        action="store_true",
+        help=f"{QUICK} alone, hardly any tuning: to see that it works",
+    )
+    add(
+        "--no-combinations",
+        action="store_true",
+        help="no combinations of the composite control's parts",
+    )
     add("--json", metavar="FILE", help="write rows and gains")
     add("--write", metavar="FILE", help="write the tables between the markers of this file")
     add(
@@ -45,7 +53,7 @@ def add_arguments(parser):
         dest="stored",
         nargs="+",
         metavar="FILE",
-        help="take what --json wrote, of one run or of several for different rows; nothing is run",
+        help="take results that --json wrote, from one run or several with different rows; run nothing",
     )
 
 
@@ -54,7 +62,7 @@ def compare(options):
     if options.stored:
         found = merged([load(path) for path in options.stored])
     else:
-        # After every job: what an interrupted run has done is not lost.
+        # After every job, so that an interrupted run loses nothing.
         found = study(options, Progress(), lambda rows: store(rows, options.json))
     store(found, options.json)
     if options.write:
@@ -75,36 +83,34 @@ def load(path):
     Raises
     ------
     FlexarmError
-        For a file that is none of ours.
+        For a file that --json did not write.
     """
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         found["subjects"][0]["contenders"]
         return found
     except (ValueError, LookupError, TypeError) as error:
-        raise FlexarmError(f"{path}: not what --json wrote: {error}") from None
+        raise FlexarmError(f"was not written by --json: {error}", field=str(path)) from None
 
 
 def merged(runs):
-    """One comparison from several: rows of an arm that is in more than one of them are put together.
+    """Merge comparisons into one: rows of the same arm are put together.
 
     Raises
     ------
     FlexarmError
-        When they differ in more than which rows they have.
+        When runs on the same arm differ in motion, rate, window, budget or seed.
     """
     by_arm = {}
     for run_ in runs:
-        for subject in run_["subjects"]:
-            whole = by_arm.setdefault(
-                subject["arm"], subject | {"contenders": {}, "combinations": []}
-            )
+        for case in run_["subjects"]:
+            whole = by_arm.setdefault(case["arm"], case | {"contenders": {}, "combinations": []})
             for name in ("motion", "rate_Hz", "window_s", "budget"):
-                if whole[name] != subject[name] or runs[0]["seed"] != run_["seed"]:
-                    raise FlexarmError(f"{subject['arm']}: the runs differ in {name} or seed")
-            whole["contenders"] |= subject["contenders"]
-            whole["combinations"] += subject["combinations"]
-    order = [s.arm for s in subjects.SUBJECTS]
+                if whole[name] != case[name] or runs[0]["seed"] != run_["seed"]:
+                    raise FlexarmError(f"{case['arm']}: the runs differ in {name} or seed")
+            whole["contenders"] |= case["contenders"]
+            whole["combinations"] += case["combinations"]
+    order = [s.arm for s in cases.CASES]
     return {
         "seed": runs[0]["seed"],
         "subjects": sorted(by_arm.values(), key=lambda s: order.index(s["arm"])),
@@ -112,21 +118,21 @@ def merged(runs):
 
 
 def chosen(options):
-    """Subjects and contenders that were asked for."""
-    if options.budget is not None and options.budget < 1:
-        raise FlexarmError(f"--budget {options.budget}: 1 or more is wanted")
-    if options.workers is not None and options.workers < 1:
-        raise FlexarmError(f"--workers {options.workers}: 1 or more is wanted")
-    if options.seed < 0:
-        raise FlexarmError(f"--seed {options.seed}: 0 or more is wanted")
-    names = list(CONTENDERS)
+    """The requested cases, and names of controllers."""
+    for name, least in (("budget", 1), ("workers", 1), ("seed", 0)):
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise FlexarmError(
+                "is too small", field=f"--{name}", value=value, limit=f"{least} or more"
+            )
+    names = list(CONTROLLERS)
     if options.contenders == "none":
         names = []
     elif options.contenders:
         names = [name.strip() for name in options.contenders.split(",")]
         # "joint PID, ZV shaper" has a comma of its own.
         names = _joined(names)
-    wanted = subjects.find([QUICK] if options.quick else options.arms.split(","))
+    wanted = cases.find([QUICK] if options.quick else options.arms.split(","))
     if options.quick:
         wanted = [replace(s, window=QUICK_WINDOW, depth="star") for s in wanted]
     budget = options.budget or (QUICK_BUDGET if options.quick else None)
@@ -142,17 +148,19 @@ def _joined(words):
     while rest:
         for count in (2, 1):
             name = ", ".join(rest[:count])
-            if name in CONTENDERS:
+            if name in CONTROLLERS:
                 names.append(name)
                 del rest[:count]
                 break
         else:
-            raise FlexarmError(f"--contenders {rest[0]}: there are {'; '.join(CONTENDERS)}")
+            raise FlexarmError(
+                "is unknown", field="--contenders", value=rest[0], limit="; ".join(CONTROLLERS)
+            )
     return names
 
 
 def jobs_of(wanted, names):
-    """What there is to do, the longest first: (subject, contender's name or combination)."""
+    """All jobs, the longest first: (case, controller's name or combination)."""
     tuned = [
         (s, name)
         for s in reversed(wanted)
@@ -163,28 +171,28 @@ def jobs_of(wanted, names):
     return tuned + parts
 
 
-def contend(subject, name, seed):
-    """Tune a contender and run it, without noise and with; for other processes, too.
+def evaluate(case, name, seed):
+    """Tune a controller and run it without and with noise; also called in other processes.
 
     Returns
     -------
     dict
         ``row`` and ``noisy`` as `trial.run` has them, ``gains`` by name, ``simulations``, ``first`` and ``best`` cost.
     """
-    contender = CONTENDERS[name]
-    free = contender.free(subject)
+    candidate = CONTROLLERS[name]
+    free = candidate.free(case)
 
     def result(values, **noise):
         try:
-            return run(subject, prepared(subject, name, values), **noise)
+            return run(case, prepared(case, name, values), **noise)
         except FlexarmError as error:
             return {"refused": str(error), "cost": 1e4}
 
-    screen = contender.screen and partial(contender.screen, subject)
+    screen = candidate.screen and partial(candidate.screen, case)
     values, history = [], []
     if free:
         values, _, history = tune(
-            lambda values: result(values)["cost"], free, subject.budget, seed, screen
+            lambda values: result(values)["cost"], free, case.budget, seed, screen
         )
     row = result(values)
     return {
@@ -198,27 +206,27 @@ def contend(subject, name, seed):
 
 
 def _do(job, seed):
-    subject, what = job
+    case, what = job
     if isinstance(what, str):
-        return contend(subject, what, seed)
-    return {"row": run(subject, combinations.setup(subject, what))}
+        return evaluate(case, what, seed)
+    return {"row": run(case, combinations.setup(case, what))}
 
 
 def study(options, progress, each=lambda found: None):
-    """Tune and run everyone.
+    """Tune and run all controllers.
 
     Parameters
     ----------
     options : namespace
     progress : Progress
     each : callable, optional
-        Of what there is, called after every job.
+        Called with the results so far after every job.
 
     Returns
     -------
     dict
-        Ready for JSON: ``seed``, and ``subjects``, a list of ``arm``, ``motion``, ``rate_Hz``, ``budget``,
-        ``contenders`` by name and ``combinations``, a list.
+        As in docs/comparison.json: ``seed``, and a list of cases, each with ``arm``, ``motion``, ``rate_Hz``,
+        ``window_s``, ``budget``, the controllers by name, and the list ``combinations``.
     """
     wanted, names = chosen(options)
     jobs = jobs_of(wanted, names)
@@ -226,9 +234,9 @@ def study(options, progress, each=lambda found: None):
     workers = min(options.workers or os.cpu_count() or 1, len(jobs))
     for i, found in _results(jobs, options.seed, workers):
         results[i] = found
-        subject, what = jobs[i]
+        case, what = jobs[i]
         label = what if isinstance(what, str) else " + ".join(what)
-        progress.step(f"{subject.arm}: {label}", len(results), len(jobs))
+        progress.step(f"{case.arm}: {label}", len(results), len(jobs))
         each(_gathered(options.seed, wanted, jobs, results))
     progress.done()
     return _gathered(options.seed, wanted, jobs, results)
@@ -247,18 +255,18 @@ def _results(jobs, seed, workers):
 
 
 def _gathered(seed, wanted, jobs, results):
-    """Rows by arm, of the jobs that are done; in the jobs' order, whichever came first."""
+    """Rows by arm of the finished jobs, in the jobs' order."""
     return {"seed": seed, "subjects": [_of_arm(s, jobs, results) for s in wanted]}
 
 
-def _of_arm(subject, jobs, results):
-    mine = [(w, results[i]) for i, (s, w) in enumerate(jobs) if s == subject and i in results]
+def _of_arm(case, jobs, results):
+    mine = [(w, results[i]) for i, (s, w) in enumerate(jobs) if s == case and i in results]
     return {
-        "arm": subject.arm,
-        "motion": subject.motion,
-        "rate_Hz": subject.rate,
-        "window_s": subject.window,
-        "budget": subject.budget,
+        "arm": case.arm,
+        "motion": case.motion,
+        "rate_Hz": case.rate,
+        "window_s": case.window,
+        "budget": case.budget,
         "contenders": {what: found for what, found in mine if isinstance(what, str)},
         "combinations": [
             dict(zip(combinations.PARTS, what, strict=True)) | found

@@ -2,7 +2,7 @@
 """Tables of a comparison, for the terminal and for docs/comparison.md."""
 
 from ..markdown import write_between
-from .contenders import OWN, PID, SHIPPED
+from .controllers import OWN, PID, SHIPPED
 
 BEGIN, END = "<!-- comparison: begin -->", "<!-- comparison: end -->"
 HEAD = (
@@ -13,8 +13,6 @@ HEAD = (
     "settled after [s]",
     "torque, peak [N m]",
 )
-#: How much sooner than the joints' PID the shipped controller is to settle, on soft arms.
-SOONER = 5.0
 
 
 def cells(row, window):
@@ -34,7 +32,7 @@ def cells(row, window):
 
 
 def settled(row, window):
-    """Settling time as a word."""
+    """Settling time as text."""
     if "cost" not in row or "refused" in row or "lost" in row:
         return ""
     return f"> {window:g}" if row["settling_s"] is None else f"{row['settling_s']:.2f}"
@@ -42,35 +40,35 @@ def settled(row, window):
 
 def text(found):
     """All tables, Markdown."""
-    return "\n\n".join(part for subject in found["subjects"] for part in _subject(subject))
+    return "\n\n".join(part for case in found["subjects"] for part in _case(case))
 
 
-def _subject(subject):
-    window = subject["window_s"]
+def _case(case):
+    window = case["window_s"]
     yield (
-        f"## {subject['arm']}\n\n`{subject['motion']}`, {subject['rate_Hz']:g} Hz,"
-        f" {subject['budget']} simulations per tuning."
+        f"## {case['arm']}\n\n`{case['motion']}`, {case['rate_Hz']:g} Hz,"
+        f" {case['budget']} simulations per tuning; residual: 0 to {window:g} s after the motion."
     )
-    if subject["contenders"]:
+    if case["contenders"]:
         yield _table(
             ("controller", *HEAD, "with noise: residual [mm]", "settled [s]", "cost"),
-            [_contender(name, c, window) for name, c in subject["contenders"].items()],
+            [_candidate(name, c, window) for name, c in case["contenders"].items()],
         )
-        yield _gains(subject["contenders"])
-        yield "\n".join(f"- {line}" for line in verdicts(subject))
-    if subject["combinations"]:
+        yield _gains(case["contenders"])
+        yield "\n".join(f"- {line}" for line in verdicts(case))
+    if case["combinations"]:
         parts = ("slow", "fast", "manifold", "feedforward")
-        rows = sorted(subject["combinations"], key=lambda c: c["row"]["cost"])
+        rows = sorted(case["combinations"], key=lambda c: c["row"]["cost"])
         yield _table(
             (*parts, *HEAD, "cost"),
             [(*(c[p] for p in parts), *cells(c["row"], window), _cost(c["row"])) for c in rows],
         )
 
 
-def _contender(name, c, window):
+def _candidate(name, c, window):
     noisy = c["noisy"]
-    heard = "residual_mm" in noisy
-    residual = f"{noisy['residual_mm']:.3g}" if heard else cells(noisy, window)[0]
+    complete = "residual_mm" in noisy
+    residual = f"{noisy['residual_mm']:.3g}" if complete else cells(noisy, window)[0]
     return (name, *cells(c["row"], window), residual, settled(noisy, window), _cost(c["row"]))
 
 
@@ -78,9 +76,9 @@ def _cost(row):
     return "" if "refused" in row or "lost" in row else f"{row['cost']:.3g}"
 
 
-def _gains(contenders):
+def _gains(controllers):
     lines = []
-    for name, c in contenders.items():
+    for name, c in controllers.items():
         if c["gains"]:
             gains = ", ".join(f"{k} = {v:.4g}" for k, v in c["gains"].items())
             lines.append(
@@ -90,31 +88,31 @@ def _gains(contenders):
     return "\n".join(lines)
 
 
-def verdicts(subject):
-    """What the rows say, a sentence each."""
-    contenders, window = subject["contenders"], subject["window_s"]
-    if SHIPPED not in contenders:
+def verdicts(case):
+    """Conclusions from the rows, one sentence each."""
+    controllers, window = case["contenders"], case["window_s"]
+    if SHIPPED not in controllers:
         return []
-    own = contenders[SHIPPED]["row"]
+    own = controllers[SHIPPED]["row"]
     if "residual_mm" not in own:
         return [f"The shipped controller fails: {own.get('lost') or own.get('refused')}."]
     lines = []
-    rivals = {
+    baselines = {
         name: c["row"]
-        for name, c in contenders.items()
+        for name, c in controllers.items()
         if name not in OWN and "residual_mm" in c["row"]
     }
-    if PID in rivals:
-        lines.append(_against_pid(own, rivals[PID], window))
+    if PID in baselines:
+        lines.append(_against_pid(own, baselines[PID], window))
     better = [
         name
-        for name, row in rivals.items()
+        for name, row in baselines.items()
         if row["rms_tip_mm"] < own["rms_tip_mm"] and row["residual_mm"] < own["residual_mm"]
     ]
     lines.append(
-        f"The shipped controller loses on tip tracking (rms) and residual alike to {', '.join(better)}."
+        f"Better than the shipped controller in both tip tracking (rms) and residual: {', '.join(better)}."
         if better
-        else "No rival beats the shipped controller on tip tracking (rms) and residual alike."
+        else "No baseline beats the shipped controller in both tip tracking (rms) and residual."
     )
     return lines
 
@@ -125,10 +123,10 @@ def _against_pid(own, pid, window):
     late = window if pid["settling_s"] is None else pid["settling_s"]
     more = "more than " if pid["settling_s"] is None else ""
     torques = zip(own["peak_torque_Nm"], pid["peak_torque_Nm"], strict=True)
-    share = max(a / b for a, b in torques if b)
+    ratio = max(a / b for a, b in torques if b)
     return (
         f"The shipped controller settles {more}{late / own['settling_s']:.2g} times sooner than the tuned joint PID,"
-        f" with at most {share:.2f} times its peak torque in any joint."
+        f" with at most {ratio:.2f} times its peak torque in any joint."
     )
 
 
@@ -140,7 +138,7 @@ def _table(head, rows):
 def write(found, file):
     """Put the tables between the markers of a Markdown file.
 
-    `found` is what the comparison gave, as in its JSON.
+    `found` is the comparison as in its JSON.
 
     Raises
     ------

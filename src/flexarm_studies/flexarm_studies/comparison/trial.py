@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of a contender, and the few numbers that are compared."""
+"""One run of a controller on a case, and the numbers that are compared."""
 
 from dataclasses import replace
 
@@ -10,22 +10,22 @@ from flexarm_dynamics.errors import FlexarmError, MessageError
 
 from ..loop import scenario as scenarios
 from ..loop.metrics import tracking_metrics
-from . import subjects
+from . import cases
 
-#: What the metric weighs against each other: one of each is as bad. Errors in parts of the arm's length [-], [-], [s].
+#: Weights of the cost: each of these costs 1. The errors are fractions of the arm's length [-], [-], [s].
 TRACKING, RESIDUAL, SETTLING = 1e-2, 1e-3, 1.0
-#: Cost of a run that loses the arm, more where it loses it earlier; of a design that is refused.
+#: Cost of a run that loses the arm (more the earlier it does), and of a refused design.
 LOST, REFUSED = 1e3, 1e4
-#: A joint so far off its reference has lost the arm [rad].
-OFF = 0.7
+#: The arm counts as lost at this joint error [rad].
+MAX_ERROR = 0.7
 
 
-def run(subject, setup, noisy=False, seed=0):
-    """Run a contender.
+def run(case, setup, noisy=False, seed=0):
+    """Run a controller on a case.
 
     Parameters
     ----------
-    subject : Subject
+    case : Case
     setup : Setup
     noisy : bool
         Whether the sensors have noise.
@@ -35,55 +35,55 @@ def run(subject, setup, noisy=False, seed=0):
     Returns
     -------
     dict
-        Ready for JSON; see `row_of`. Of a design that is refused: ``refused``, why.
+        Ready for JSON; see `row_of`. For a refused design ``refused``, the reason, and ``cost``.
     """
     try:
-        return _run(subject, setup, noisy, seed)
+        return _run(case, setup, noisy, seed)
     except FlexarmError as error:
         return {"refused": str(error), "cost": REFUSED}
 
 
-def _run(subject, setup, noisy, seed):
-    arm = subjects.arm_of(subject.arm, noisy)
+def _run(case, setup, noisy, seed):
+    arm = cases.arm_of(case.arm, noisy)
     scenario = scenarios.Scenario(
-        arm, setup.controller, noise=noisy, seed=seed, rate=subject.rate, window=subject.window
+        arm, setup.controller, noise=noisy, seed=seed, rate=case.rate, window=case.window
     )
     loop = scenarios.loop_of(scenario)
-    loop.LARGEST_ERROR = OFF
+    loop.LARGEST_ERROR = MAX_ERROR
     controller = loop.controller
     if setup.law is not None:
         controller.law = setup.law(loop.model)
-    wanted = scenarios.trajectory_of(subject.motion, loop.model, loop.simulator.position)
+    wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
     motion = wanted if setup.motion is None else setup.motion(loop.model)
     loop.simulator.reset(motion.positions[0])
     if controller.plans:
-        _share_plan(subject, setup.controller["feedforward"], controller)
+        _reuse_plan(case, setup.controller["feedforward"], controller)
     end = 1e-9 * int(wanted.times_ns[-1])
     try:
-        record = loop.follow(motion, end + subject.window)
+        record = loop.follow(motion, end + case.window)
     except MessageError as error:
         return {"refused": str(error), "cost": REFUSED}
     if loop.lost:
-        part = float(record.time[-1]) / (end + subject.window)
-        return {"lost": loop.lost, "cost": LOST * (2.0 - part)}
-    if setup.motion is not None:  # what is judged is the motion that was asked for
-        profile = subjects.profile_of(subject)
+        done = float(record.time[-1]) / (end + case.window)
+        return {"lost": loop.lost, "cost": LOST * (2.0 - done)}
+    if setup.motion is not None:  # judged by the case's motion, not by the shaped one
+        profile = cases.profile_of(case)
         time = np.clip(record.time, 0.0, profile.duration)
         record = replace(record, reference=profile.position(time).reshape(len(time), -1))
     with np.errstate(over="ignore", invalid="ignore"):
         plant = loop.simulator.plant_model
         # The vibration right after the motion counts, too: the cost, which has a term for settling, was tuned so.
-        found = tracking_metrics(record, loop.model, plant, end, subject.window, settle=0.0)
-    return row_of(found, subject, sum(link.length for link in arm.links))
+        found = tracking_metrics(record, loop.model, plant, end, case.window, settle=0.0)
+    return row_of(found, case, sum(link.length for link in arm.links))
 
 
-def row_of(found, subject, length):
-    """What is compared, from `tracking_metrics`.
+def row_of(found, case, length):
+    """The numbers that are compared, from `tracking_metrics`.
 
     Parameters
     ----------
     found : dict
-    subject : Subject
+    case : Case
     length : float
         Of the arm [m].
 
@@ -91,7 +91,8 @@ def row_of(found, subject, length):
     -------
     dict
         ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag where there is gravity),
-        ``residual_mm``, ``settling_s`` (None: not within the window), ``peak_torque_Nm`` (per joint),
+        ``residual_mm`` (from the motion's end on, over the case's window), ``settling_s`` (None: not within the
+        window), ``peak_torque_Nm`` (per joint),
         ``saturation_share`` and ``cost``.
     """
     about = "about_sag_mm" if "static_sag_mm" in found else "mm"
@@ -104,7 +105,7 @@ def row_of(found, subject, length):
         "peak_torque_Nm": found["peak_torque_Nm"],
         "saturation_share": found["saturation_share"],
     }
-    settling = subject.window if row["settling_s"] is None else row["settling_s"]
+    settling = case.window if row["settling_s"] is None else row["settling_s"]
     row["cost"] = (
         1e-3 * row["rms_tip_mm"] / length / TRACKING
         + 1e-3 * row["residual_mm"] / length / RESIDUAL
@@ -113,18 +114,18 @@ def row_of(found, subject, length):
     return row
 
 
-#: What feed-forwards prepared, by subject, kind and start.
+#: Plans that feed-forwards prepared, by case, kind and start.
 _PREPARED = {}
 
 
-def _share_plan(subject, kind, controller):
-    """Let a motion be prepared once: that depends on arm, motion and rate, on no gain that is tuned."""
+def _reuse_plan(case, kind, controller):
+    """Prepare a motion only once: its plan depends on arm, motion and rate, not on the tuned gains."""
 
     def prepare(trajectory, law):
         start = controller.reference.resting
         if start is None:
             return None
-        key = (subject, kind, start.tobytes())
+        key = (case, kind, start.tobytes())
         if key not in _PREPARED:
             law.limit = controller.torque_limit
             _PREPARED[key] = law.feedforward.prepare(trajectory, start)

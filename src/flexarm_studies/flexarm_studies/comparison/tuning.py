@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning by simulation: the same search, metric and number of simulations for everyone.
+"""Tuning by simulation: the same search, metric and number of simulations for every controller.
 
 A third of the budget goes to the first guess and a Latin hypercube, the rest to Nelder and Mead's simplex from the
-best of those; when that has converged, once more from the next best. Everything is decided by the seed.
+best of those; when that has converged, once more from the next best. The seed decides everything.
 
-Whoever can be judged without simulation, by the poles of a linear loop, is judged so first: of a large hypercube
-only the best are simulated. Else most of a small budget would go to loops that can't be stable.
+A controller that can be judged without simulation, by the poles of a linear loop, is screened first: only the best of
+a large hypercube are simulated. Without this most of a small budget would go to loops that can't be stable.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-#: Part of the budget that explores, edge of the first simplex in parts of the range, and when it has converged.
+#: Fraction of the budget that explores; edge of the first simplex and size at convergence, of the range [-].
 EXPLORING, EDGE, CLOSE = 1.0 / 3.0, 0.15, 1e-3
-#: How many are looked at without simulation.
+#: How many places are screened without simulation.
 SCREENED = 400
 
 
@@ -31,7 +31,7 @@ class Free:
     low, high, first : float
         Range, and the first guess.
     log : bool
-        Whether it is searched by its logarithm.
+        Whether its logarithm is searched.
     """
 
     name: str
@@ -65,13 +65,13 @@ def tune(cost, free, budget, seed=0, screen=None):
     Parameters
     ----------
     cost : callable
-        Of a list of values; a number, the less the better.
+        From a list of values: a number, smaller is better.
     free : sequence of Free
     budget : int
         Number of evaluations of `cost`.
     seed : int
     screen : callable, optional
-        Of a list of values; a number, the less the better, that takes no simulation.
+        As `cost`, but without a simulation.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def tune(cost, free, budget, seed=0, screen=None):
 
 
 def _explored(free, count, seed, screen):
-    """Places to begin with, `count` of them."""
+    """The first `count` places to try."""
     if not count:
         return ()
     places = qmc.LatinHypercube(len(free), seed=seed).random(SCREENED if screen else count)
@@ -132,7 +132,7 @@ def _explored(free, count, seed, screen):
 
 
 def _simplex(x):
-    """First simplex: the edges lead inwards."""
+    """First simplex; its edges point into the range."""
     corners = np.tile(x, (x.size + 1, 1))
     for i in range(x.size):
         corners[i + 1, i] += EDGE if x[i] < 0.5 else -EDGE

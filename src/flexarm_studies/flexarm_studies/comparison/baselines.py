@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Controllers that are no composite control, with its interface: what `ArmController` calls.
+r"""The baselines' laws: PID of each joint, and full-state LQR; `ArmController` calls them like a composite control.
 
 `JointPid`, as the joint_trajectory_controller of ros2_controllers has it, each joint by itself,
 
 .. math:: u_i = k_p e_i + \Big[k_i\!\int\! e_i\,dt\Big]_{\pm w} + k_d\dot e_i + f_v\dot q_{ref,i} + f_a\ddot q_{ref,i}
     + g_i(q_{ref}), \qquad e = q_{ref} - q,
 
-the integral clamped at w [N m]. The weight g of the rigid arm at the reference is more than that controller has: no
-arm under gravity could start without.
+the integral clamped at w [N m]. That controller has no term g, the weight of the rigid arm at the reference; it is
+added because no arm under gravity could start without it.
 
-`FullStateLqr`, optimal on the whole arm with its bending, linear at rest in one configuration, in discrete time:
+`FullStateLqr`, optimal for the whole arm with its bending, linearised at rest in one configuration, in discrete time:
 
 .. math:: u = u_{rigid}(q_{ref},\dot q_{ref},\ddot q_{ref}) + K\,(s_{ref} - s), \qquad
     \min\sum_k e^{2\alpha t_k}(s_k^TQs_k + u_k^TRu_k), \qquad s = (q, \delta, \dot q, \dot\delta),
 
-about the reference: its joints, the deflections that its inertia forces and weight bend the arm by, and the torque of
-the rigid arm's inverse dynamics.
+about the reference: its joint motion, the deflections under its inertia forces and weight, and the torque of the rigid
+arm's inverse dynamics.
 """
 
 import numpy as np
@@ -26,28 +26,28 @@ from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 
-class Rival:
-    """What `ArmController` and `ClosedLoop` want of a control law.
+class Baseline:
+    """What `ArmController` and `ClosedLoop` need from a control law.
 
     Parameters
     ----------
     model : ArmModel
     seen : dict, optional
-        What `along` has worked out; laws of the same arm may share one, for a motion that they all run.
+        Results of `along`; laws of the same arm that run the same motion may share them.
 
     Attributes
     ----------
     slow_torque, fast_torque, torque : ndarray, shape (n,)
-        [N m]; a rival has one torque, the slow one.
+        [N m]; a baseline has only the slow one.
     quasi_steady : ndarray, shape (m,)
-        Deflections that it holds the arm to [m, rad].
+        Deflections to which it controls the arm [m, rad].
     """
 
     feedforward = None
     needs_rates, free = True, False
     limit, fast_share = None, 1.0
-    #: No more points of a reference than this are remembered.
-    REMEMBERED = 20000
+    #: Number of points of a reference that `along` stores.
+    MAX_STORED = 20000
 
     def __init__(self, model, seen=None):
         n, m = model.n_joints, model.n_modes
@@ -60,7 +60,7 @@ class Rival:
         """A new session begins."""
 
     def resume(self, other):
-        """Nothing is taken over."""
+        """Take nothing over from another law."""
 
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample, (n,) [N m]; as `CompositeControl.step`."""
@@ -68,19 +68,19 @@ class Rival:
         return self.torque
 
     def along(self, reference):
-        """`_along` of a point of the reference, worked out once."""
+        """`_along` of a point of the reference, computed once."""
         key = b"".join(
             x.tobytes() for x in (reference.position, reference.velocity, reference.acceleration)
         )
         found = self._seen.get(key)
         if found is None:
             found = self._along(reference)
-            if len(self._seen) < self.REMEMBERED:
+            if len(self._seen) < self.MAX_STORED:
                 self._seen[key] = found
         return found
 
 
-class JointPid(Rival):
+class JointPid(Baseline):
     """PID of each joint; see the module.
 
     Parameters
@@ -90,7 +90,7 @@ class JointPid(Rival):
         ``p`` [N m/rad], ``i`` [N m/(rad s)], ``d`` [N m s/rad], ``i_clamp`` [N m], ``velocity`` [N m s/rad],
         ``acceleration`` [kg m^2].
     seen : callable, optional
-        As in `Rival`.
+        As in `Baseline`.
     """
 
     def __init__(self, model, gains, seen=None):
@@ -130,7 +130,7 @@ class JointPid(Rival):
         return np.linalg.eigvals(A - B @ self.K)
 
 
-class FullStateLqr(Rival):
+class FullStateLqr(Baseline):
     """Optimal feedback of joints and deflections; see the module.
 
     Parameters
@@ -141,13 +141,13 @@ class FullStateLqr(Rival):
     rate : float
         [Hz]
     sizes : sequence of float
-        What is as bad as the largest torque: joint error [rad], joint rate [rad/s], modal rate [m/s, rad/s].
+        Values that cost as much as the largest torque: joint error [rad], joint rate [rad/s], modal rate [m/s, rad/s].
     decay : float
         alpha, the prescribed degree of stability [1/s].
     feedforward : float
-        Share of the rigid arm's torque for the reference's acceleration [-].
+        Fraction of the rigid arm's torque for the reference's acceleration [-].
     seen : callable, optional
-        As in `Rival`.
+        As in `Baseline`.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class FullStateLqr(Rival):
 
     def __init__(self, model, q, rate, sizes, decay=0.0, feedforward=1.0, seen=None):
         super().__init__(model, seen)
-        self.K, self._share = lqr_gain(model, q, rate, sizes, decay), feedforward
+        self.K, self._feedforward = lqr_gain(model, q, rate, sizes, decay), feedforward
 
     def _torque(self, s, reference, dt):
         bent, still, moving = self.along(reference)
@@ -165,7 +165,7 @@ class FullStateLqr(Rival):
         wanted = np.concatenate(
             [reference.position, bent, reference.velocity, np.zeros(self.model.n_modes)]
         )
-        return still + self._share * moving + self.K @ (wanted - s)
+        return still + self._feedforward * moving + self.K @ (wanted - s)
 
     def _along(self, reference):
         """Quasi-static deflections (m,), torque without acceleration and what that takes, each (n,) [N m]."""

@@ -19,7 +19,7 @@ ALONG = 21
 
 
 @dataclass(frozen=True)
-class Subject:
+class Case:
     """A design and what it is for.
 
     Attributes
@@ -89,7 +89,7 @@ def unchecked(scenario):
 
 
 def of(scenario):
-    """The subject that a scenario describes.
+    """The case that a scenario describes.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def of(scenario):
     velocities = np.zeros_like(motion.positions) if motion.velocities is None else motion.velocities
     along = np.linspace(times[0], times[-1], ALONG)
     at = lambda values: np.column_stack([np.interp(along, times, v) for v in np.transpose(values)])  # noqa: E731
-    return Subject(
+    return Case(
         scenario,
         loop.model,
         loop.controller.law,
@@ -114,11 +114,11 @@ def of(scenario):
     )
 
 
-def redesigned(subject, **parameters):
+def redesigned(case, **parameters):
     """The composite control with other parameters, on the same arm (`slow.kp` is written `slow__kp`)."""
     given = {k.replace("__", "."): v for k, v in parameters.items()}
-    controller = subject.scenario.controller | given | {"feedforward": "none"}
-    return scenarios.loop_of(replace(subject.scenario, controller=controller)).controller.law
+    controller = case.scenario.controller | given | {"feedforward": "none"}
+    return scenarios.loop_of(replace(case.scenario, controller=controller)).controller.law
 
 
 def slower_bending(scenario, factor):

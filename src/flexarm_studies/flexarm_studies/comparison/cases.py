@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arms that are compared on, their motions, and the controller that flexarm ships for each."""
+"""Benchmark cases: an arm, a motion, and the controller that flexarm ships for the arm."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -11,18 +11,18 @@ from flexarm_dynamics.models import model
 
 from ..loop import scenario as scenarios
 
-#: Structural damping of arms whose file states none, of every mode [-].
+#: Damping ratio of every mode of arms whose file states no damping [-].
 DAMPING = 0.005
-#: Sensors where the arm file states no noise: rms strain of a gauge, encoder counts per turn.
+#: Sensors of arms whose file states no noise: rms strain of a gauge, encoder counts per turn.
 STRAIN_NOISE, COUNTS = 5e-7, 2**16
-#: Sixty degrees of every joint in two seconds; `long_reach` from where its torque limits let it.
+#: Sixty degrees of every joint in two seconds; `long_reach` starts where its torque limits allow it.
 SIXTY = "quintic:to=1.0472,duration=2"
 LONG_WAY = "quintic:from=0;1.2;0.8;-0.8,to=1.0472;0.1528;1.8472;0.2472,duration=2"
 
 
 @dataclass(frozen=True)
-class Subject:
-    """An arm and a motion.
+class Case:
+    """An arm, a motion and the shipped controller.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class Subject:
     rate : float
         [Hz]
     budget : int
-        Simulations per contender.
+        Simulations per controller.
     depth : str
-        What is tried of the composite control's components: see `combinations.of`.
+        Which combinations of the composite control's parts are tried: see `combinations.of`.
     window : float
-        Over how long after the motion the rest is judged [s].
+        How long the rest after the motion is judged [s].
     """
 
     arm: str
@@ -60,32 +60,34 @@ class Subject:
         return scenarios.parameters(self.controller)
 
 
-SUBJECTS = (
-    Subject("R", "composite", "paper:duration=2", 500.0, 32, "full"),
-    Subject("one_link", "composite", "paper:duration=2", 500.0, 32, "none"),
-    Subject("two_link", "two_link", SIXTY, 1000.0, 16, "star"),
-    Subject("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star"),
+CASES = (
+    Case("R", "composite", "paper:duration=2", 500.0, 32, "full"),
+    Case("one_link", "composite", "paper:duration=2", 500.0, 32, "none"),
+    Case("two_link", "two_link", SIXTY, 1000.0, 16, "star"),
+    Case("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star"),
 )
 
 
 def find(names):
-    """Subjects by the arms' names.
+    """Cases by arm name.
 
     Raises
     ------
     FlexarmError
-        For a name that there is none of.
+        For an unknown name.
     """
-    known = {s.arm: s for s in SUBJECTS}
+    known = {s.arm: s for s in CASES}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise FlexarmError(f"--arms {','.join(unknown)}: there are {', '.join(known)}")
+        raise FlexarmError(
+            "is unknown", field="--arms", value=",".join(unknown), limit=", ".join(known)
+        )
     return [known[name] for name in names]
 
 
 @lru_cache
 def arm_of(name, noisy=False):
-    """The arm, damped a little where its file has no damping; with `noisy`, with noise where it states none."""
+    """The arm, with a little damping where its file has none; with `noisy` also with noise where it states none."""
     arm = arm_file.load(name)
     arm = replace(arm, links=tuple(map(_damped, arm.links)))
     if not noisy:
@@ -105,20 +107,20 @@ def _damped(link):
 
 @lru_cache
 def model_of(name):
-    """The arm's model: what contenders are designed on."""
+    """The arm's model: for which controllers are designed."""
     return model.build(arm_of(name))
 
 
-def ends_of(subject):
-    """Where the motion begins and ends, each (n,) [rad]."""
-    profile = profile_of(subject)
+def ends_of(case):
+    """Start and end of the motion, each (n,) [rad]."""
+    profile = profile_of(case)
     return profile.position(0.0), profile.position(profile.duration)
 
 
-def profile_of(subject, duration=None):
-    """The motion's profile, if asked for of another duration [s]."""
-    family, settings = specs.parse(subject.motion)
+def profile_of(case, duration=None):
+    """The motion's profile; with another duration if one is given [s]."""
+    family, settings = specs.parse(case.motion)
     if duration is not None:
         settings = settings | {"duration": repr(float(duration))}
-    arm = model_of(subject.arm)
+    arm = model_of(case.arm)
     return specs.motion(family, settings, arm, [0.0] * arm.n_joints)
