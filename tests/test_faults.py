@@ -12,7 +12,7 @@ from harness import Arm, Bench, Drive, Source, trajectory
 
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import stamp_ns
-from flexarm_sim.nodes.simulator import ALONE_SAMPLES
+from flexarm_sim.nodes.pacing import ALONE_SAMPLES
 from flexarm_studies.loop import parameter_files
 
 NAN, INF = math.nan, math.inf

@@ -22,24 +22,24 @@ class TimedSimulator(simulator.SimulatorNode):
     def build(self):
         super().build()
         self._pending, self._latencies, self._latencies_enabled, self._lost_before = {}, [], 0, 0
-        self._paused = True
+        self.paused = True
 
-    def _publish(self):
-        if not self._paused:
-            self._pending[self.sim.sequence] = perf_counter()
-        super()._publish()
+    def publish(self, sample):
+        if not self.paused:
+            self._pending[sample.number] = perf_counter()
+        super().publish(sample)
 
     def _on_torque(self, msg):
         now = perf_counter()
-        if msg.session == self._session:
+        if msg.session == self.gate.session:
             sent = self._pending.pop(msg.sequence, None)
             if sent is not None:
                 self._latencies.append(now - sent)
                 self._latencies_enabled += msg.mode == msg.ENABLED
         super()._on_torque(msg)
 
-    def _on_pause(self, request, response):
-        if request.data:
+    def pause(self, paused):
+        if paused:
             late = sum(wait > self.line.period for wait in self._latencies) if self.line else 0
             found = {
                 "latencies": self._latencies,
@@ -51,7 +51,7 @@ class TimedSimulator(simulator.SimulatorNode):
             print(json.dumps(found), flush=True)
         self._pending, self._latencies, self._latencies_enabled = {}, [], 0
         self._lost_before = self.line.lost if self.line else 0
-        return super()._on_pause(request, response)
+        return super().pause(paused)
 
 
 def timed(kind, key):

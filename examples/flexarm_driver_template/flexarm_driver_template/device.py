@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm's electronics at the end of a serial line: lines in and out, and when they were measured."""
+"""The arm's electronics behind a serial line: frames in, commands out, and the time of measurement."""
 
 import os
 import select
@@ -22,7 +22,12 @@ class Device:
     ----------
     port : str
     joints, gauges : int
-        Numbers in a frame.
+        How many values of each a frame has.
+
+    Attributes
+    ----------
+    damaged : int
+        Lines that were no frame.
 
     Raises
     ------
@@ -34,21 +39,26 @@ class Device:
         try:
             self._file = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             tty.setraw(self._file, termios.TCSANOW)
-            termios.tcflush(self._file, termios.TCIFLUSH)  # what was measured before we came
+            termios.tcflush(self._file, termios.TCIFLUSH)  # old measurements
         except (OSError, termios.error) as error:
-            raise DeviceError(
-                f"port {port}: {error}: is the device on, and may you open it?"
-            ) from None
+            hint = "is the device on, and may you open it?"
+            raise DeviceError(f"{port}: {error}", field="port", hint=hint) from None
         self._lines = protocol.Lines()
         self.damaged = 0
 
     def frames(self, wait):
-        """The frames that have come, after at most `wait` seconds; none is a sign that the device is gone."""
+        """Wait at most `wait` seconds for data; the whole frames that have come.
+
+        Raises
+        ------
+        DeviceError
+            When the line is gone.
+        """
         try:
             ready, _, _ = select.select([self._file], [], [], wait)
             lines = self._lines.feed(os.read(self._file, 65_536)) if ready else []
         except OSError as error:
-            raise DeviceError(f"port {self._port}: {error}") from None
+            raise DeviceError(f"{self._port}: {error}", field="port") from None
         found = [protocol.frame(line, *self._sizes) for line in lines]
         self.damaged += found.count(None)
         return [f for f in found if f]
@@ -67,30 +77,33 @@ class Device:
         except BlockingIOError:
             pass  # the device does not read: its own watchdog will act
         except OSError as error:
-            raise DeviceError(f"port {self._port}: {error}") from None
+            raise DeviceError(f"{self._port}: {error}", field="port") from None
 
     def close(self):
+        """Close the line."""
         os.close(self._file)
 
 
 class MeasurementTime:
-    """Times of the device's clock on the host's: the way here takes at least as long as the quickest frame's.
+    """Moves times of the device's clock to this machine's clock.
 
-    A frame that was late on the line keeps the time it was measured at, so that stamps have no jitter.
+    A frame takes at least as long to arrive as the quickest one: the smallest difference between arrival and
+    measurement is the offset of the clocks. A frame that was late on the line keeps its time of measurement, so
+    that stamps have no jitter. A device clock that goes back has restarted, and is measured anew.
     """
 
-    #: Device time over which the first quickest frame is looked for [ns].
+    #: Device time in which the first quickest frame is looked for [ns].
     SETTLE = 500_000_000
-    #: The clocks drift apart by less than this [-], and stamps are drawn to a quicker frame's by this [-].
+    #: The clocks drift apart by less than DRIFT [-]; stamps move towards those of a quicker frame by DRAW [-].
     DRIFT, DRAW = 2e-4, 0.5
 
     def __init__(self):
         self._offset = self._last = self._first = None
 
     def stamp(self, device_ns, host_ns):
-        """Host time [ns] of a measurement at `device_ns`, which arrived at `host_ns`; None: not known yet."""
+        """Host time [ns] of a measurement at `device_ns` that arrived at `host_ns`; None: not known yet."""
         newest = host_ns - device_ns
-        if self._offset is None:
+        if self._offset is None or device_ns < self._last:
             self._offset, self._last, self._first = newest, device_ns, device_ns
         step, self._last = device_ns - self._last, device_ns
         if device_ns - self._first < self.SETTLE:

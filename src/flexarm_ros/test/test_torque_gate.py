@@ -118,14 +118,14 @@ def test_sequence_wraps_as_uint32(gate):
     np.testing.assert_array_equal(gate.torque(0.06), [2.0])
 
 
-def test_controllers_are_told_apart_in_whatever_unit_of_time():
-    heard = Controllers(alone=100)
-    assert not heard.heard(7, 0) and not heard.heard(8, 1)  # 8: the same one, restarted
-    assert heard.pair == ()
-    assert heard.heard(7, 2) and heard.pair == (7, 8)
-    assert heard.heard(7, 101) and not heard.heard(7, 102)
-    heard.forget()
-    assert heard.ids == set() and not heard.heard(8, 103)
+def test_controllers_are_distinguished_in_any_unit_of_time():
+    seen = Controllers(alone=100)
+    assert not seen.note(7, 0) and not seen.note(8, 1)  # 8: the same one, restarted
+    assert seen.pair == ()
+    assert seen.note(7, 2) and seen.pair == (7, 8)
+    assert seen.note(7, 101) and not seen.note(7, 102)
+    seen.forget()
+    assert seen.ids == set() and not seen.note(8, 103)
 
 
 def test_a_limit_clips_each_joint_and_counts_torques():

@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Base class of drivers: write how to read a sample, apply torque, make the arm safe and close; the rest is here.
+
+A driver publishes `arm_state` (and `joint_states`), takes `joint_torque`, and takes the safe action when in doubt:
+the rules are `TorqueGate`'s. The driver template, the adapter for ros2_control and the simulator are such drivers.
+"""
+
+import os
+import threading
+import time
+import traceback
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.parameters import parameter
+from flexarm_msgs.msg import ArmState, JointTorque
+
+from . import qos
+from .messages import SECOND, StateWriter, set_stamp
+from .node import ARM, ERROR, OK, WARN, ArmNode
+from .torque_gate import TorqueGate
+
+#: A driver whose `read` returns nothing for this long reports an error [s].
+SILENT = 0.5
+#: Sequence numbers and sessions on the topics are uint32.
+WRAP = 2**32
+
+TORQUE_TIMEOUT = parameter("torque_timeout", 0.05, "s", 0.001, 1.0, read_only=True).described(
+    "A torque that answers a state older than this is too late; the safe action follows."
+)
+JOINT_STATES_RATE = parameter(
+    "joint_states_rate", 50.0, "Hz", 0.1, 20000.0, read_only=True
+).described("Rate of joint_states; at most the rate of the samples.")
+#: Parameters of a driver; yours come after them. Without JOINT_STATES_RATE it does not publish joint_states.
+PARAMETERS = (ARM, TORQUE_TIMEOUT, JOINT_STATES_RATE)
+
+
+@dataclass(slots=True)
+class Sample:
+    """One measurement of the arm, in SI units and in the arm file's order; None: not measured.
+
+    Attributes
+    ----------
+    number : int
+        Counts the samples: a lost one leaves a gap, and a number that does not rise begins a new session.
+    stamp_ns : int or None
+        Time of measurement on this machine's ROS clock [ns]; None: not known yet, the sample is not published.
+    position : ndarray, shape (n,)
+        [rad]
+    velocity : ndarray, shape (n,), optional
+        [rad/s]
+    torque : ndarray, shape (n,), optional
+        Applied over the interval that ends at the stamp [N m].
+    strain : ndarray, shape (gauges,), optional
+        Surface strain, tension positive [m/m]; NaN for a reading that failed.
+    amplitude, rate : ndarray, shape (observed modes,), optional
+        Modal amplitudes [m, rad] and rates; without them the observer maps the strains.
+    """
+
+    number: int
+    stamp_ns: int | None
+    position: np.ndarray
+    velocity: np.ndarray | None = None
+    torque: np.ndarray | None = None
+    strain: np.ndarray | None = None
+    amplitude: np.ndarray | None = None
+    rate: np.ndarray | None = None
+
+
+def new_session():
+    """A random session number: each start of a driver is a session of its own."""
+    return int.from_bytes(os.urandom(4), "little")
+
+
+class Driver(ArmNode):
+    """A node between the topics and an arm. Subclasses implement the methods of the first group.
+
+    `read` runs in a thread of its own, all others in the node's thread, or in that one, under a lock: never two
+    at a time. A driver whose samples come as ROS messages, or that moves on its own grid of time, overrides
+    `connect`, `start` and `stop` and calls `publish` itself.
+
+    Parameters
+    ----------
+    name : str
+        Of the node.
+    parameters : sequence of Parameter
+        `PARAMETERS` and the driver's own.
+
+    Attributes
+    ----------
+    arm : Arm
+        From the parameter `arm`, when `open` is called.
+    gate : TorqueGate
+    fault : str
+        Why the device can't be used; empty where it can.
+    safe : bool
+        Whether the last action was the safe one.
+    """
+
+    def __init__(self, name="driver", parameters=PARAMETERS):
+        super().__init__(name, {"": parameters})
+
+    # What a driver implements ------------------------------------------------------------------
+
+    def open(self):
+        """Open the device, by `self.parameters` and `self.arm`; raise a FlexarmError to refuse."""
+
+    def read(self):
+        """Wait for the device, at most `SILENT` seconds; an iterable of the `Sample`s that have come.
+
+        Raises
+        ------
+        FlexarmError
+            When the device is gone: reading ends, and the error stands in `/diagnostics`.
+        """
+        raise NotImplementedError
+
+    def apply(self, torque):
+        """Apply torque, shape (n,) [N m], until the next call: finite and within the joints' limits."""
+        raise NotImplementedError
+
+    def make_safe(self):
+        """Take the joints' safe action; called again and again while there is no fresh torque."""
+        raise NotImplementedError
+
+    def close(self):
+        """Close the device."""
+
+    def details(self):
+        """More values for `/diagnostics`: name to value."""
+        return {}
+
+    def problem(self, samples):
+        """What is wrong with the device, `samples` of which came in the last second; empty: nothing."""
+        return self.fault
+
+    # Made from the parameters ------------------------------------------------------------------
+
+    def build(self):
+        parameters = self.parameters
+        self.arm = arm_file.load(parameters["arm"])
+        parameters.resolve({"joints": len(self.arm.joints), "gauges": len(self.arm.gauges)})
+        self.fault, self.safe = "", True
+        self._published, self._before = 0, 0
+        self._first = self._last = self._thread = None
+        self._reading = False
+        self._lock = threading.RLock()
+        self.open()
+        self._keep(lambda _: self.close(), self)
+        self.gate = self.make_gate()
+        self.gate.begin(new_session())
+        self.writer = StateWriter(self.arm)
+        options = {"qos_overriding_options": qos.overridable()}
+        self.state_publisher = self.make_publisher(ArmState, "arm_state", qos.LINE, **options)
+        self._joint_state = JointState(name=list(self.arm.joint_names))
+        rate = parameters.group("").get("joint_states_rate")
+        self._joint_publisher = rate and self.make_publisher(
+            JointState, "joint_states", 10, **options
+        )
+        self._joint_period, self._joint_due = rate and round(SECOND / rate), 0  # [ns]
+        self.connect(
+            self.make_subscription(
+                JointTorque, "joint_torque", self._on_torque, qos.LINE, **options
+            )
+        )
+
+    def make_gate(self):
+        """The rules with this driver's timeout."""
+        return TorqueGate(self.arm, self.parameters["torque_timeout"])
+
+    def connect(self, torques):
+        """Make the subscription of `joint_torque` the control path, and watch over its timeout."""
+        self.make_line(torques)
+        # If the samples stop as well, the torque still ends.
+        self.make_timer(self.gate.timeout / 2.0, self.watch)
+
+    def now(self):
+        """Steady clock of the freshness of torques [s]."""
+        return time.monotonic()
+
+    def start(self):
+        self._reading = True
+        self._thread = threading.Thread(target=self._read, name="device", daemon=True)
+        self._thread.start()
+        self.get_logger().info(f"arm {self.arm.name}")
+
+    def stop(self):
+        self._reading = False
+        if self._thread is not None:
+            self._thread.join()
+        with self._lock:
+            self.gate.begin(self.gate.session)
+            self.actuate()
+
+    # Device to topics --------------------------------------------------------------------------
+
+    def _read(self):
+        """In a thread: publish each sample as it comes."""
+        arrived = self.now()
+        while self._reading:
+            try:
+                for sample in self.read():
+                    arrived = self.now()
+                    self._number(sample)
+                    self.fault = ""
+            except Exception as error:  # a mistake in `read` must not pass unnoticed either
+                known = isinstance(error, FlexarmError)
+                self.fault = str(error) if known else traceback.format_exc()
+                self.get_logger().error(f"reading has ended: {self.fault}")
+                return
+            if self.now() - arrived >= SILENT:
+                self.fault = f"the device sends nothing for {SILENT:g} s"
+
+    def _number(self, sample):
+        """Publish a sample of the device under its sequence in the session."""
+        if self._last is not None and sample.number <= self._last:
+            self._first = None  # the device has restarted
+        self._last = sample.number
+        if sample.stamp_ns is None:
+            return
+        if self._first is None:
+            self._first = sample.number
+            with self._lock:
+                self.gate.begin(new_session())
+        sample.number = (sample.number - self._first) % WRAP
+        self.publish(sample)
+        self.watch()
+
+    def publish(self, sample):
+        """Publish a `Sample`, whose number is its sequence in the session, and note when."""
+        with self._lock:
+            self.fill(sample)
+            self.gate.sent(sample.number, self.now())
+            self.state_publisher.publish(self.writer.message)
+        self.publish_joints(sample)
+
+    def fill(self, sample):
+        """Write a sample into the message of `arm_state`."""
+        writer = self.writer
+        writer.head(sample.stamp_ns, self.gate.session, sample.number)
+        writer.write("joint_position", sample.position)
+        writer.write("joint_velocity", sample.velocity)
+        writer.write("joint_torque", sample.torque)
+        writer.write("strain", sample.strain)
+        writer.write("modal_amplitude", sample.amplitude)
+        writer.write("modal_rate", sample.rate)
+        self._published += 1
+
+    def publish_joints(self, sample):
+        """Publish `joint_states` where it is due, for RViz and the like."""
+        first, stamp = sample.number == 0, sample.stamp_ns
+        if self._joint_publisher is None or (stamp < self._joint_due and not first):
+            return
+        due = self._joint_due + self._joint_period
+        self._joint_due = due if due > stamp and not first else stamp + self._joint_period
+        if self._joint_publisher.get_subscription_count():
+            message = self._joint_state
+            set_stamp(message.header.stamp, stamp)
+            message.position = array("d", sample.position)
+            message.velocity = array("d", () if sample.velocity is None else sample.velocity)
+            message.effort = array("d", () if sample.torque is None else sample.torque)
+            self._joint_publisher.publish(message)
+
+    # Topic to device ---------------------------------------------------------------------------
+
+    def _on_torque(self, message):
+        if not self.active:
+            return
+        with self._lock:
+            refusal = self.gate.offer(message, self.now())
+            self.answered(message)
+        if refusal:
+            self.refused(refusal)
+
+    def answered(self, message):
+        """Act on a message that the gate has seen."""
+        self.actuate()
+
+    def refused(self, reason):
+        """Log why a message is not applied."""
+        self.report(reason)
+
+    def actuate(self):
+        """Apply the torque that acts now, or take the safe action."""
+        torque = self.gate.torque(self.now())
+        self.safe = torque is None
+        try:
+            if self.safe:
+                self.make_safe()
+            else:
+                self.apply(torque)
+        except FlexarmError as error:
+            self.fault = str(error)
+
+    def watch(self):
+        """Take the safe action when the torque has become too old."""
+        if self.active:
+            with self._lock:
+                if self.gate.torque(self.now()) is None:
+                    self.actuate()
+
+    def diagnose(self):
+        done, self._before = self._published - self._before, self._published
+        values = {
+            "samples per second": done,
+            "torques refused": self.gate.refused,
+            "torques clipped": self.gate.clipped,
+            **self.details(),
+        }
+        return *self.judge(done), values
+
+    def judge(self, samples):
+        """Level and message for `/diagnostics`; `samples` were published in the last second."""
+        gate = self.gate
+        problem = self.problem(samples)
+        if not problem and gate.controllers.several(self.now()):
+            problem = gate.SEVERAL
+        if problem:
+            return ERROR, problem
+        if gate.reason:
+            return WARN, f"{gate.reason}: the safe action is applied"
+        return OK, ""
