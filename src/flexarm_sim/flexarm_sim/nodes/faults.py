@@ -80,7 +80,7 @@ class Faults:
 def check(faults, parameters):
     """ROS callback: refuse faults that can't be set; types are checked elsewhere.
 
-    `faults` is the node's `Faults`, None before it is configured.
+    `faults` is the node's `Faults`, None before it is configured; `parameters` are those to be set.
     """
     for parameter in parameters:
         lines = parameter.value if parameter.name == "faults" else None
