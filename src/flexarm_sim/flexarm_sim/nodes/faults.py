@@ -82,8 +82,8 @@ def check(faults, parameters):
 
     `faults` is the node's `Faults`, None before it is configured; `parameters` are those to be set.
     """
-    for parameter in parameters:
-        lines = parameter.value if parameter.name == "faults" else None
+    for given in parameters:
+        lines = given.value if given.name == "faults" else None
         texts = isinstance(lines, list) and lines and all(isinstance(x, str) for x in lines)
         if faults is not None and texts:
             try:

@@ -26,7 +26,6 @@ from flexarm_ros.start import leave
 LAST_EFFORTS = Duration(seconds=0.2)
 
 
-
 def _fixed(name, default, unit="-", low=None, high=None, **options):
     return parameter(name, default, unit, low, high, read_only=True, **options)
 
