@@ -468,7 +468,7 @@ def test_the_extended_model_is_the_arm_with_these_parameters(loaded):
     observer = design_observer("extended_kalman", loaded, values)
     for scale, viscous, coulomb in ((1.0, 0.1, 0.05), (2.0, 0.4, 0.2), (3.7, 0.0, 0.3)):
         arm = changed(loaded, scale, viscous, coulomb)
-        found = observer.slope(np.append(STATE, [scale, viscous, coulomb]), np.array([0.7]))
+        found = observer.derivative(np.append(STATE, [scale, viscous, coulomb]), np.array([0.7]))
         assert_allclose(found[:6], arm.derivative(STATE, [0.7]), rtol=1e-8)
         assert_array_equal(found[6:], 0.0)
 

@@ -181,13 +181,13 @@ def test_joints_follow_the_reference_on_the_manifold():
     reference = Sine(1)
     surface = manifold(model, "corrected", order=4)
 
-    def slope(t, s):
+    def derivative(t, s):
         return model.derivative(s, surface.along(reference.at(t))[2])
 
     r = reference.at(0.0)
     delta, rate, _ = surface.along(r)
     start = np.concatenate([r.position, delta, r.velocity, rate])
-    end = solve_ivp(slope, (0.0, 1.0), start, rtol=1e-9, atol=1e-12).y[:, -1]
+    end = solve_ivp(derivative, (0.0, 1.0), start, rtol=1e-9, atol=1e-12).y[:, -1]
     r = reference.at(1.0)
     delta, rate, _ = surface.along(r)
     assert abs(end[0] - r.position[0]) < 2e-5

@@ -159,13 +159,13 @@ def test_computed_torque_makes_the_error_linear_on_a_rigid_arm(rigid):
     profile = profiles.quintic([0.2, -0.4], [1.0, 1.1], 1.0)
     e0 = np.array([0.3, -0.2])
 
-    def slope(t, x):
+    def derivative(t, x):
         u = torque_at(law, x[:2], x[2:], motion(profile, t))
         return np.concatenate([x[2:], acceleration_of(rigid, u, x[:2], x[2:])])
 
     times = np.linspace(0.0, 1.0, 5)
     start = np.concatenate([profile.position(0.0) - e0, np.zeros(2)])
-    x = solve_ivp(slope, (0, 1), start, "DOP853", times, rtol=1e-9, atol=1e-10).y.T
+    x = solve_ivp(derivative, (0, 1), start, "DOP853", times, rtol=1e-9, atol=1e-10).y.T
     rate = np.array([3.0, 4.0])  # double poles
     t = times[:, None]
     wanted = e0 * (1.0 + rate * t) * np.exp(-rate * t)
@@ -315,12 +315,12 @@ def test_the_tips_error_decays_by_its_gains_on_a_rigid_arm(rigid):
     profile = profiles.quintic([0.3, 0.8], [1.2, 1.5], 1.0)
     tip = Tip(rigid.arm)
 
-    def slope(t, x):
+    def derivative(t, x):
         u = torque_at(law, x[:2], x[2:], motion(profile, t))
         return np.concatenate([x[2:], acceleration_of(rigid, u, x[:2], x[2:])])
 
     times = np.linspace(0.0, 1.0, 5)
-    x = solve_ivp(slope, (0, 1), [0.25, 0.9, 0, 0], "DOP853", times, rtol=1e-9, atol=1e-10).y.T
+    x = solve_ivp(derivative, (0, 1), [0.25, 0.9, 0, 0], "DOP853", times, rtol=1e-9, atol=1e-10).y.T
     rest = np.zeros(2)
     reached = np.array([tip.at(row[:2], rest)[0] for row in x])
     error = np.array([tip.at(profile.position(t), rest)[0] for t in times]) - reached
@@ -396,12 +396,12 @@ def test_the_layer_is_reached_in_time_and_kept_with_the_wrong_payload(rigid):
         ref = motion(profile, t)
         return ref.velocity - x[2:] + 4.0 * (ref.position - x[:2])
 
-    def slope(t, x):
+    def derivative(t, x):
         u = torque_at(law, x[:2], x[2:], motion(profile, t))
         return np.concatenate([x[2:], acceleration_of(plant, u, x[:2], x[2:])])
 
     times = np.linspace(0.0, 3.0, 61)
-    x = solve_ivp(slope, (0, 3), [*q, 0, 0], "LSODA", times, rtol=1e-7, atol=1e-8).y.T
+    x = solve_ivp(derivative, (0, 3), [*q, 0, 0], "LSODA", times, rtol=1e-7, atol=1e-8).y.T
     s = np.abs([s_of(t, row) for t, row in zip(times, x, strict=True)])
     assert s[0].min() > 1.0
     assert (s[times >= (s[0].max() - phi) / eta] <= phi).all()
@@ -481,13 +481,13 @@ def adapted(arm, true_scale, profile, law, times):
     """State (q, qd, estimate) of a rigid arm with another payload under the law in continuous time."""
     plant, n = arm.with_payload(true_scale), arm.n_joints
 
-    def slope(t, x):
+    def derivative(t, x):
         law.model.scale = x[-1]
         u = torque_at(law, x[:n], x[n:-1], motion(profile, t))
         return np.concatenate([x[n:-1], acceleration_of(plant, u, x[:n], x[n:-1]), [law.learning]])
 
     start = np.concatenate([profile.position(0.0), np.zeros(n), [law.payload_scale]])
-    return solve_ivp(slope, (0, times[-1]), start, "RK45", times, rtol=1e-7, atol=1e-8).y.T
+    return solve_ivp(derivative, (0, times[-1]), start, "RK45", times, rtol=1e-7, atol=1e-8).y.T
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,13 @@ def vibration_left(motion, omega, zeta, extra=0.0):
     x'' + 2 zeta omega x' + omega^2 x = -q'', and the amplitude is that of the free vibration after.
     """
 
-    def slope(t, x):
+    def derivative(t, x):
         return [x[1], -2 * zeta * omega * x[1] - omega**2 * x[0] - motion.acceleration(t)[0]]
 
     end = motion.duration + extra
-    x, v = solve_ivp(slope, (0.0, end), [0.0, 0.0], rtol=1e-10, atol=1e-13, max_step=0.02).y[:, -1]
+    x, v = solve_ivp(derivative, (0.0, end), [0.0, 0.0], rtol=1e-10, atol=1e-13, max_step=0.02).y[
+        :, -1
+    ]
     damped = omega * np.sqrt(1.0 - zeta**2)
     return np.hypot(x, (v + zeta * omega * x) / damped)
 

@@ -905,7 +905,7 @@ def test_straight_line_code_of_any_structure(seed, layout, plain):
     state = np.concatenate(random_state(seed, arm))
     torque = np.random.default_rng(seed).standard_normal(chain.n_joints)
     out, expected = np.zeros(state.size), chain.derivative(state, torque)
-    names["slope"](state, torque, constants, out)
+    names["derivative"](state, torque, constants, out)
     # A joint about a light link's own axis makes the equations ill-conditioned.
     M = chain.mass_matrix(*np.split(state, [chain.n_joints, state.size // 2])[:2])
     scale = np.sqrt(np.diag(M))

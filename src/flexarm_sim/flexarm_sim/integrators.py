@@ -35,7 +35,7 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
         When the integration fails.
     """
 
-    def slope(t, s):
+    def derivative(t, s):
         out = model.derivative(s, torque(t, s))
         if not np.isfinite(out).all():  # solve_ivp would shorten its step for ever
             raise ModelError(f"{model.arm.name}: integration stopped at {t} s: not finite any more")
@@ -44,7 +44,7 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     if times[0] == times[-1]:
         return np.tile(state, (len(times), 1))
     result = solve_ivp(
-        slope,
+        derivative,
         (times[0], times[-1]),
         state,
         method="DOP853",

@@ -47,11 +47,11 @@ def test_the_compiled_integrator_converges_with_order_eight(arm_r):
 @pytest.mark.parametrize("name", ["arm_r", "heavy_arm"])
 def test_one_compiled_step_is_the_runge_kutta_step_of_the_models_equations(request, name):
     arm, h = request.getfixturevalue(name), 1e-3
-    slopes = []
+    stages = []
     for row in TABLEAU:
-        stage = START + h * sum((a * k for a, k in zip(row, slopes, strict=False)), np.zeros(6))
-        slopes.append(arm.derivative(stage, TORQUE))
-    assert_allclose(stepped(arm, h, 1), START + h * WEIGHTS @ np.array(slopes), rtol=1e-12)
+        stage = START + h * sum((a * k for a, k in zip(row, stages, strict=False)), np.zeros(6))
+        stages.append(arm.derivative(stage, TORQUE))
+    assert_allclose(stepped(arm, h, 1), START + h * WEIGHTS @ np.array(stages), rtol=1e-12)
 
 
 def test_a_substep_stays_below_half_a_radian_of_the_highest_mode(arm_r):

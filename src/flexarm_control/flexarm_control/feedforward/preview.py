@@ -197,22 +197,22 @@ class _Planner:
         out, torque = np.zeros((self.steps + 1, 3, m)), np.zeros((self.steps + 1, n))
         out[0, 0] = self.model.static_deflection(self.start[0])
 
-        def slope(k, x, v):
-            return self._slope(*self.motion[k], x, v)
+        def acceleration(k, x, v):
+            return self._bending(*self.motion[k], x, v)
 
         for i in range(self.steps):
             x, v, k = out[i, 0], out[i, 1], 2 * i
-            a1, torque[i] = slope(k, x, v)
+            a1, torque[i] = acceleration(k, x, v)
             out[i, 2] = a1
             v2 = v + 0.5 * h * a1
-            a2, _ = slope(k + 1, x + 0.5 * h * v, v2)
+            a2, _ = acceleration(k + 1, x + 0.5 * h * v, v2)
             v3 = v + 0.5 * h * a2
-            a3, _ = slope(k + 1, x + 0.5 * h * v2, v3)
+            a3, _ = acceleration(k + 1, x + 0.5 * h * v2, v3)
             v4 = v + h * a3
-            a4, _ = slope(k + 2, x + h * v3, v4)
+            a4, _ = acceleration(k + 2, x + h * v3, v4)
             out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        out[-1, 2], torque[-1] = slope(-1, out[-1, 0], out[-1, 1])
+        out[-1, 2], torque[-1] = acceleration(-1, out[-1, 0], out[-1, 1])
         return out, torque
 
     def _along(self, c):
@@ -249,21 +249,21 @@ class _Planner:
         out[m:, -m:] = M12
         out[:m, 2 * n : 3 * n] = -np.linalg.solve(t.M[n:, n:], t.M[n:, :n])
         out[m:, 2 * n : 3 * n] = t.M[:n, :n]
-        here, u = self._slope(q, qd, qdd, x, v)
+        here, u = self._bending(q, qd, qdd, x, v)
         for part, values in enumerate((q, qd, None, x, v)):
             if values is None:
                 continue
             first = (0, n, 0, 3 * n, 3 * n + m)[part]
             for j in range(values.size):
                 kept, values[j] = values[j], values[j] + SMALL
-                there, u2 = self._slope(q, qd, qdd, x, v)
+                there, u2 = self._bending(q, qd, qdd, x, v)
                 values[j] = kept
                 out[:m, first + j] = (there - here) / SMALL
                 # At fixed acceleration of the bending: that part comes through M12.
                 out[m:, first + j] = (u2 - u - M12 @ (there - here)) / SMALL
         return out
 
-    def _slope(self, q, qd, qdd, x, v):
+    def _bending(self, q, qd, qdd, x, v):
         """Acceleration of the bending, and joint torque, with the joints moved as given: (2), in full."""
         n = self.model.n_joints
         t = self.model.terms(q, qd, x, v)
@@ -287,21 +287,21 @@ class _Planner:
         out = np.zeros((self.steps + 1, 3, m, columns))
         K, D, h = self.spring, self.damper, self.h
 
-        def slope(k, x, v):
+        def acceleration(k, x, v):
             return K[k] @ x + D[k] @ v + force[k]
 
         for i in range(self.steps):
             x, v, k = out[i, 0], out[i, 1], 2 * i
-            a1 = out[i, 2] = slope(k, x, v)
+            a1 = out[i, 2] = acceleration(k, x, v)
             v2 = v + 0.5 * h * a1
-            a2 = slope(k + 1, x + 0.5 * h * v, v2)
+            a2 = acceleration(k + 1, x + 0.5 * h * v, v2)
             v3 = v + 0.5 * h * a2
-            a3 = slope(k + 1, x + 0.5 * h * v2, v3)
+            a3 = acceleration(k + 1, x + 0.5 * h * v2, v3)
             v4 = v + h * a3
-            a4 = slope(k + 2, x + h * v3, v4)
+            a4 = acceleration(k + 2, x + h * v3, v4)
             out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        out[-1, 2] = slope(-1, out[-1, 0], out[-1, 1])
+        out[-1, 2] = acceleration(-1, out[-1, 0], out[-1, 1])
         return out
 
     def _torque(self, bending):

@@ -306,8 +306,8 @@ class ArmObserver:
         """Filtered derivative of the joint positions, shape (n,) [rad/s]; zero at a start."""
         if dt == 0.0:
             return np.zeros_like(self._derivative)
-        slope = (sample.position - self._measured) / dt
-        return slope + (self._derivative - slope) * np.exp(-self.bandwidth * dt)
+        difference = (sample.position - self._measured) / dt
+        return difference + (self._derivative - difference) * np.exp(-self.bandwidth * dt)
 
 
 #: After a longer silence an observer starts afresh [ns].

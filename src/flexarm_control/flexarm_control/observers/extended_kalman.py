@@ -136,7 +136,7 @@ class ExtendedKalman(Kalman):
             self.parameters_estimated[name] = float(value)
             self.parameters_estimated[f"{name}, deviation"] = float(sigma)
 
-    def slope(self, x, torque):
+    def derivative(self, x, torque):
         """Time derivative of the augmented state, shape (N + k,)."""
         model, n, p = self.model, self._n, self._p
         N, speed = 2 * p, x[p : p + n]
@@ -162,7 +162,7 @@ class ExtendedKalman(Kalman):
         if design is None or self._age > relinearise - 0.5 * dt or dt != design.length:
             design = self._linearised(torque, dt)
             self._design, self._age = design, 0.0
-        return self.state + design.Gamma @ self.slope(self.state, torque), design
+        return self.state + design.Gamma @ self.derivative(self.state, torque), design
 
     def _linearised(self, torque, dt):
         """The step at the estimate under this torque."""
@@ -170,7 +170,7 @@ class ExtendedKalman(Kalman):
         density = np.zeros((x.size, x.size))
         density[:N, :N] = force_density(self.model, x[:N], self.density)
         np.fill_diagonal(density[N:, N:], self._drift**2)
-        A = jacobian(lambda at: self.slope(at, torque), x, DIFFERENCE)
+        A = jacobian(lambda at: self.derivative(at, torque), x, DIFFERENCE)
         return discretise(A, dt, density)
 
 

@@ -42,10 +42,10 @@ class FilteredDerivative(Observer):
             self.rate[:] = 0.0
             self._elapsed = 0.0
             return
-        slope = (sample.amplitude - self.amplitude) / dt
-        self.rate -= slope
+        difference = (sample.amplitude - self.amplitude) / dt
+        self.rate -= difference
         self.rate *= np.exp(-self.bandwidth * dt)
-        self.rate += slope
+        self.rate += difference
         self.amplitude[:] = sample.amplitude
         if not self.converged:
             self._elapsed += dt

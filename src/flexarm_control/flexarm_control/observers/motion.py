@@ -115,10 +115,10 @@ class Motion:
 
     def advance(self, x, torque, dt, step):
         """The state after dt under constant torque (n,), shape (N,); `step` from `step_for`."""
-        slope = self.model.derivative(x, torque)
-        out = x + step.Gamma @ slope
+        rate = self.model.derivative(x, torque)
+        out = x + step.Gamma @ rate
         rest = dt - step.length
         if abs(rest) > 1e-12:
-            slope = step.Phi @ slope  # after the step
-            out += rest * (slope + (0.5 * rest) * (step.A @ slope))
+            rate = step.Phi @ rate  # after the step
+            out += rest * (rate + (0.5 * rest) * (step.A @ rate))
         return out

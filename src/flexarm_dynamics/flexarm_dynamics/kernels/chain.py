@@ -949,7 +949,7 @@ def accelerations(d, w, q, delta, qd, delta_d, torque, force, none, driven, qdd,
     forward_dynamics(d, w, qd, torque, force, none[0], none[1], driven, qdd, delta_dd)
 
 
-def slope(state, torque, data, out):
+def derivative(state, torque, data, out):
     """Time derivative of the state (q, delta, qd, delta_d) under net joint torque; `data` as `Chain` packs it."""
     constants, work, joint_extra, modal_extra, driven, force = data
     d, w = constants[0], work[0]
@@ -1144,7 +1144,7 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
     extra : tuple of ndarray, shapes (N,) and (N, K, K)
         Work space: what is added to the mass matrix.
     data : tuple
-        As for `slope`.
+        As for `derivative`.
     """
     constants, work, _, _, driven, force = data
     d, w = constants[0], work[0]

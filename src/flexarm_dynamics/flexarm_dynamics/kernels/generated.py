@@ -6,14 +6,14 @@ import numpy as np
 from . import chain, integrators, load, symbols
 
 #: Longer code than this compiles too long; the recursion in loops serves as well then.
-MOST_OPERATIONS = 6000
+MAX_OPERATIONS = 6000
 
-SLOPE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
+DERIVATIVE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
 
 import numpy as np
 
 
-def slope(x, u, c, out):
+def derivative(x, u, c, out):
 {body}
 '''
 
@@ -38,7 +38,7 @@ def low_storage(
 
 
 def right_hand_side(data, work):
-    """Sources of ``slope(state, net torque, constants, out)`` and its integrators for arms of this structure.
+    """Sources of ``derivative(state, net torque, constants, out)`` and its integrators for arms of this structure.
 
     Parameters
     ----------
@@ -67,17 +67,17 @@ def right_hand_side(data, work):
     )
     zeros = np.zeros((n, K, K), dtype=object)
     packed = ((exact,), (work,), zeros[:, 0, 0], zeros, np.zeros(n, int), np.zeros(m, dtype=object))
-    chain.slope(state, torque, packed, out)
+    chain.derivative(state, torque, packed, out)
     lines, words, constants, operations = symbols.emit(graph, out)
     lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]
-    source = SLOPE.format(body=_indented(lines, 1))
+    source = DERIVATIVE.format(body=_indented(lines, 1))
     parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m))
     return parts, np.array(constants or [0.0]), operations
 
 
 def _low_storage(graph, out, n, half):
     lines, words, _, _ = symbols.emit(graph, out, scalars=True)
-    # Of each pair of states (z, rate): rate is the slope of z, a the slope of the rate.
+    # Of each pair of states (z, rate): rate is the derivative of z, and a that of the rate.
     pairs = [(i, half + i) for i in range(half)]
     move = [f"a{i} = {words[r]}" for i, r in pairs]
     move += [f"w{i} += gain * x{r}" for i, r in pairs] + [f"w{r} += gain * a{i}" for i, r in pairs]

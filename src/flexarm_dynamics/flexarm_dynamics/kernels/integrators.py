@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed-step integrators of ``state' = slope(state, net torque)``; joined to a right-hand side by `kernels.load`.
+"""Fixed-step integrators of ``state' = derivative(state, net torque)``; joined to a right-hand side by `kernels.load`.
 
 The state is (q, delta, qd, delta_d). Torque goes from `torque` to `torque + change` over the whole interval;
 joint friction is taken off it at each stage.
@@ -57,7 +57,7 @@ def runge_kutta(
                     for v in range(size):
                         point[v] += gain * stages[j, v]
             net_torque(torque, change, (k + nodes[i]) * share, friction, point, net)
-            slope(point, net, data, stages[i])  # noqa: F821 - of the file that this one is joined to
+            derivative(point, net, data, stages[i])  # noqa: F821 - of the file that this one is joined to
         for j in range(p):
             gain = step * weights[j]
             if gain != 0.0:
@@ -128,7 +128,7 @@ def low_storage(
             total[v] = state[v]
         for i in range(p):
             net_torque(torque, change, (k + nodes[i]) * share, friction, point, net)
-            slope(point, net, data, rate)  # noqa: F821
+            derivative(point, net, data, rate)  # noqa: F821
             gain = step * weights[i]
             if i + 1 < p:
                 ahead = step * below[i + 1]

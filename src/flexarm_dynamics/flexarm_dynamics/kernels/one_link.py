@@ -16,7 +16,7 @@ The equations of motion (2) of one link with m modes, every term of which is in 
 import numpy as np
 
 
-def slope(state, torque, data, out):
+def derivative(state, torque, data, out):
     """Fill `out` with the time derivative of `state`.
 
     Parameters

@@ -40,7 +40,7 @@ from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotat
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
 
 #: Short enough to be written out in the integrators' loops.
-INLINE = ("slope", "net_torque", "low_storage")
+INLINE = ("derivative", "net_torque", "low_storage")
 
 #: Imaginary step of the complex-step derivatives: no difference is taken, so that it costs no digits.
 STEP = 1e-30
@@ -245,7 +245,7 @@ class Chain(ArmModel):
             raise ShapeError(f"state has shape {state.shape}, wanted {(2 * (n + m),)}")
         out = np.empty_like(state)
         net = np.asarray(torque, float) - self.friction(state[n + m : 2 * n + m])
-        self.kernel.slope(state, net, (self._data, self._work, *self._none), out)
+        self.kernel.derivative(state, net, (self._data, self._work, *self._none), out)
         return out
 
     @cached_property
@@ -437,7 +437,7 @@ class Chain(ArmModel):
         sources, constants, operations = generated.right_hand_side(
             self.data, work_space(self.data, object)
         )
-        if operations > generated.MOST_OPERATIONS:
+        if operations > generated.MAX_OPERATIONS:
             return None
         return load.joined("generated", sources, inline=INLINE), constants
 

@@ -365,7 +365,7 @@ class Stepper:
 
 
 def explicit_stepper(module, method, data, model, lock=None):
-    """`ArmModel.stepper` of a compiled module that has ``slope`` and the integrators."""
+    """`ArmModel.stepper` of a compiled module that has ``derivative`` and the integrators."""
     n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
     net, coefficients = np.zeros(n), (method.weights, method.nodes)
     if not np.tril(method.A, -2).any():

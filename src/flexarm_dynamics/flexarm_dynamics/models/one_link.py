@@ -216,7 +216,9 @@ class OneLinkEquations(ArmModel):
                 f"model {self.arm.model} has no implicit integrator: take an explicit one, or model chain"
             )
         sources = (load.source(kernel), load.source(integrators))
-        module = load.joined("one_link", sources, inline=("slope", "net_torque", "low_storage"))
+        module = load.joined(
+            "one_link", sources, inline=("derivative", "net_torque", "low_storage")
+        )
         return explicit_stepper(module, method, data, self, lock)
 
 
