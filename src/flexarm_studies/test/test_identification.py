@@ -2,6 +2,7 @@
 """Parameters from recorded motions: intervals cover the truth, what is not determined is named, files are read back."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -177,8 +178,8 @@ def test_every_quantity_is_where_it_says(given):
     np.testing.assert_allclose([q.get(arm) for q in found], values, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["one_link", "R", "two_link", "long_reach"])
-def test_the_written_file_reads_as_the_arm_found(name):
+@pytest.mark.parametrize("name", ["one_link", "R", "R_lab", "two_link", "long_reach"])
+def test_the_written_file_reads_as_the_arm_found_and_keeps_every_comment(name):
     """In either system of units, with a section or stiffnesses, with and without friction in the file."""
     arm = arm_file.load(name)
     found = quantities(arm, coverage._still(arm))
@@ -190,9 +191,25 @@ def test_the_written_file_reads_as_the_arm_found(name):
         half_widths=0.01 * values,
     )
     text = arm_file.find(name).read_text()
-    again = arm_file.parse(rewritten(text, made, ["Identified."]))
+    new = rewritten(text, made, ["Identified."])
+    assert new.startswith("# Identified.\n")
+    assert re.findall("#.*", new)[1:] == re.findall("#.*", text)
+    again = arm_file.parse(new)
     np.testing.assert_allclose([q.get(again) for q in found], values, rtol=1e-6, atol=1e-12)
     assert again.observed_modes == arm.observed_modes
+
+
+def test_a_written_file_keeps_its_layout_and_refuses_what_it_can_not_hold():
+    arm = arm_file.load("one_link")
+    (mass,) = (q for q in quantities(arm, coverage._still(arm)) if q.name == "payload.mass")
+    one = {"quantities": [mass], "values": np.array([0.05]), "half_widths": np.array([0.01])}
+    text = arm_file.find("one_link").read_text()
+    made = rewritten(text, SimpleNamespace(arm=mass.put(arm, 0.05), **one))
+    pairs = zip(text.splitlines(), made.splitlines(), strict=True)
+    assert [new for old, new in pairs if new != old] == ["  mass: 0.05                     # [kg]"]
+    with pytest.raises(FlexarmError) as refused:
+        rewritten(text, SimpleNamespace(arm=mass.put(arm, 0.06), **one))
+    assert (refused.value.field, refused.value.value) == ("payload.mass", 0.05)
 
 
 def test_csv_and_commands(tmp_path, capsys):

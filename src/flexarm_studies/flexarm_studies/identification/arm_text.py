@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes an arm file with other values: the text of the given file, its comments kept where that is possible."""
+"""Writes an arm file with identified values: the text of the given file with its comments, numbers replaced."""
 
-from itertools import pairwise
+import io
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML, YAMLError
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.util import load_yaml_guess_indent
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.units import to_si
@@ -12,12 +14,14 @@ from flexarm_dynamics.errors import FlexarmError
 
 from .quantities import KEY, damping_of
 
-#: Values are written with so many digits, and must be read back as well as that.
-DIGITS, AS_GOOD = 8, 1e-6
+#: Significant digits of the written values, and the relative error allowed when they are read back [-].
+DIGITS, TOLERANCE = 8, 1e-6
+#: A gauge or a section stays on one line, however long.
+WIDTH = 4096
 
 
-class _Impossible(Exception):
-    """The text can't be edited in place."""
+class _Number(str):
+    """A number as it stands in the file."""
 
 
 def rewritten(text, identified, heading=()):
@@ -38,70 +42,78 @@ def rewritten(text, identified, heading=()):
     Raises
     ------
     FlexarmError
-        When what would be written does not read as the identified arm.
+        When the new text does not read as the identified arm.
     """
-    system = (yaml.safe_load(text) or {}).get("units", "si")
-    values = _changes(identified, system)
-    top = "".join(f"# {line}".rstrip() + "\n" for line in heading)
-    for make in (_edited, _dumped):
-        try:
-            made = top + make(text, values, identified.arm, system)
-            if _reads_as(made, identified):
-                return made
-        except (_Impossible, yaml.YAMLError):
-            continue
-    raise FlexarmError("the arm file can't be written with these values: write it by hand")
-
-
-def _reads_as(text, identified):
     try:
-        arm = arm_file.parse(text)
-    except FlexarmError:
-        return False
-    return all(
-        np.isclose(q.get(arm), v, rtol=AS_GOOD, atol=AS_GOOD * q.scale)
-        for q, v in zip(identified.quantities, identified.values, strict=True)
+        made = _edited(text, identified)
+    except (YAMLError, LookupError, TypeError, AttributeError) as error:
+        raise FlexarmError(
+            f"can't be edited: {error}", field="arm file", hint="write the values by hand"
+        ) from error
+    made = "".join(f"# {line}".rstrip() + "\n" for line in heading) + made
+    arm = arm_file.parse(made)
+    for quantity, value in zip(identified.quantities, identified.values, strict=True):
+        if not np.isclose(
+            quantity.get(arm), value, rtol=TOLERANCE, atol=TOLERANCE * quantity.scale
+        ):
+            raise FlexarmError(
+                "is not what the written arm file reads as", field=quantity.name, value=value, limit=quantity.get(arm),
+                hint="write the values by hand",
+            )  # fmt: skip
+    return made
+
+
+def _edited(text, identified):
+    yaml = YAML()
+    yaml.preserve_quotes, yaml.width = True, WIDTH
+    yaml.representer.add_representer(
+        _Number, lambda r, number: r.represent_scalar("tag:yaml.org,2002:float", number)
     )
+    data, indent, offset = load_yaml_guess_indent(text, yaml=yaml)
+    if indent is not None:
+        yaml.indent(mapping=2, sequence=indent, offset=offset or 0)
+    system = data.get("units", "si")
+    changes = list(_changes(identified))
+    for i in {path[1] for _, _, path in changes if path[0] == "links" and path[2] in KEY.values()}:
+        if "section" in data["links"][i]:
+            _without_section(data["links"][i], identified.arm.links[i], system)
+    for value, dimension, path in changes:
+        _put(data, path, _number(value, system, dimension))
+    out = io.StringIO()
+    yaml.dump(data, out)
+    return out.getvalue()
 
 
-def _changes(identified, system):
-    """What is to be changed, nested as the file: keys and indices to text or to what is below."""
-    arm, out = identified.arm, {}
-
-    def put(value, dimension, *path):
-        at = out
-        for key in path[:-1]:
-            at = at.setdefault(key, {})
-        at[path[-1]] = _number(value, system, dimension)
-
+def _changes(identified):
+    """Yield value (SI), dimension and path in the file of everything that the fit determined."""
+    arm = identified.arm
     for q, width in zip(identified.quantities, identified.half_widths, strict=True):
         if np.isnan(width):
             continue
         value, where = q.get(arm), q.where
         if q.kind == "hub_inertia":
-            put(value, q.dimension, "joints", where[0], "hub_inertia")
+            yield value, q.dimension, ("joints", where[0], "hub_inertia")
         elif q.kind in ("viscous", "coulomb"):
-            put(value, q.dimension, "joints", where[0], "friction", q.kind)
+            yield value, q.dimension, ("joints", where[0], "friction", q.kind)
         elif q.kind == "EI":
-            put(value, q.dimension, "links", where[0], KEY[where[1]])
+            yield value, q.dimension, ("links", where[0], KEY[where[1]])
             flexibility = arm.links[where[0]].flexible[where[1]]
             if flexibility.frequencies:
-                at = ("links", where[0], "flexible", where[1], "frequencies")
-                put(flexibility.frequencies, "frequency", *at)
+                path = ("links", where[0], "flexible", where[1], "frequencies")
+                yield flexibility.frequencies, "frequency", path
         elif q.kind == "damping":
             values = damping_of(arm.links[where[0]].flexible[where[1]])
-            put(values, q.dimension, "links", where[0], "flexible", where[1], "damping")
+            yield values, q.dimension, ("links", where[0], "flexible", where[1], "damping")
         elif q.kind == "payload_mass":
-            put(value, q.dimension, "payload", "mass")
+            yield value, q.dimension, ("payload", "mass")
         elif q.kind == "payload_inertia":
-            put(_inertia(arm), q.dimension, "payload", "inertia")
+            yield _inertia(arm), q.dimension, ("payload", "inertia")
         else:
-            put(value, q.dimension, "gauges", where[0], q.kind)
-    return out
+            yield value, q.dimension, ("gauges", where[0], q.kind)
 
 
 def _inertia(arm):
-    """One number where that says it all, else xx, yy, zz, xy, xz, yz."""
+    """The payload's inertia: one number if it is the same about all axes, else xx, yy, zz, xy, xz, yz."""
     i = np.array(arm.payload.inertia)
     if np.allclose(i, i[0, 0] * np.eye(3)):
         return i[0, 0]
@@ -110,88 +122,50 @@ def _inertia(arm):
 
 def _number(value, system, dimension):
     if np.ndim(value):
-        return "[" + ", ".join(_number(v, system, dimension) for v in value) + "]"
-    word = f"{value / to_si(system, dimension):.{DIGITS}g}"
-    if "e" in word and "." not in word:  # YAML 1.1 takes 1e-05 for text
-        word = word.replace("e", ".0e")
-    return word
+        row = CommentedSeq(_number(v, system, dimension) for v in value)
+        row.fa.set_flow_style()
+        return row
+    text = f"{value / to_si(system, dimension):.{DIGITS}g}"
+    if "." not in text:  # YAML 1.1 takes 1e-05 for text
+        head, e, exponent = text.partition("e")
+        text = f"{head}.0{e}{exponent}"
+    return _Number(text)
 
 
-# In place --------------------------------------------------------------------------------------
-
-
-def _edited(text, changes, arm, system):
-    edits = []
-    _collect(yaml.compose(text), changes, edits)
-    spans = sorted(edits)
-    if any(a[1] > b[0] for a, b in pairwise(spans)):
-        raise _Impossible
-    for start, end, new in reversed(spans):
-        text = text[:start] + new + text[end:]
-    return text
-
-
-def _collect(node, changes, edits):
-    """Edits (start, end, new text) of a mapping or list node."""
-    if isinstance(node, yaml.SequenceNode):
-        for index, below in changes.items():
-            _collect(node.value[index], below, edits)
-        return
-    if not isinstance(node, yaml.MappingNode) or not node.value:
-        raise _Impossible
-    below = {key.value: value for key, value in node.value}
-    if "section" in below and any(k in changes for k in KEY.values()):
-        raise _Impossible
-    for key, change in changes.items():
-        if key not in below:
-            _insert(node, key, change, edits)
-        elif isinstance(change, dict):
-            _collect(below[key], change, edits)
-        else:
-            start, end = below[key].start_mark.index, below[key].end_mark.index
-            if isinstance(below[key], yaml.SequenceNode) and not below[key].flow_style:
-                raise _Impossible
-            edits.append((start, end, change))
-
-
-def _insert(node, key, change, edits):
-    first = node.value[0][0].start_mark
-    word = f"{key}: {_flow(change)}"
-    if node.flow_style:
-        edits.append((first.index, first.index, f"{word}, "))
+def _put(data, path, value):
+    """Set an entry and keep the comments around it; what is missing on its path is added after the first key."""
+    for key in path[:-1]:
+        if isinstance(data, CommentedMap) and data.get(key) is None:
+            _add(data, key, CommentedMap())
+            data[key].fa.set_flow_style()
+        data = data[key]
+    key = path[-1]
+    if isinstance(value, list) and isinstance(data.get(key), list) and len(data[key]) == len(value):
+        data[key][:] = value
+    elif key in data:
+        data[key] = value
     else:
-        edits.append((first.index, first.index, f"{word}\n{' ' * first.column}"))
+        _add(data, key, value)
 
 
-def _flow(change):
-    if isinstance(change, dict):
-        return "{" + ", ".join(f"{k}: {_flow(v)}" for k, v in change.items()) + "}"
-    return change
+def _add(data, key, value):
+    # Not at the end: the comment before the file's next part hangs there.
+    data.pop(key, None)
+    data.insert(min(1, len(data)), key, value)
 
 
-# As a whole ------------------------------------------------------------------------------------
-
-
-def _dumped(text, changes, arm, system):
-    """The file's data written anew, its comments lost; a section becomes the stiffnesses it stood for."""
-    data = yaml.safe_load(text)
-    _apply(data, changes)
-    for link, own in zip(data["links"], arm.links, strict=True):
-        if "section" not in link or not any(k in link for k in KEY.values()):
-            continue
-        del link["section"]
-        link["mass_per_length"] = own.mass_per_length / to_si(system, "mass_per_length")
-        link["polar_inertia_per_length"] = own.polar_inertia_per_length / to_si(system, "mass")
-        for direction, stiffness in own.stiffness.items():
-            link[KEY[direction]] = stiffness / to_si(system, "stiffness")
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-
-
-def _apply(data, changes):
-    for key, change in changes.items():
-        if isinstance(change, dict):
-            if isinstance(data, dict) and data.get(key) is None:
-                data[key] = {}
-            _apply(data[key], change)
+def _without_section(link, own, system):
+    """Replace a link's section by the mass, the inertia and the stiffnesses that follow from it."""
+    at, comment = list(link).index("section"), link.ca.items.get("section")
+    del link["section"]
+    values = {"mass_per_length": (own.mass_per_length, "mass_per_length")}
+    values["polar_inertia_per_length"] = (own.polar_inertia_per_length, "mass")
+    values |= {KEY[d]: (stiffness, "stiffness") for d, stiffness in own.stiffness.items()}
+    for i, (key, (value, dimension)) in enumerate(values.items()):
+        number = _number(value, system, dimension)
+        if key in link:
+            link[key] = number
         else:
-            data[key] = yaml.safe_load(change)
+            link.insert(at + i, key, number)
+    if comment is not None:
+        link.ca.items["mass_per_length"] = comment
