@@ -276,7 +276,7 @@ def _offer(rng, core):
     plan = None
     if core.plans:
         try:
-            plan = core.prepare(made, core.law)
+            plan = core.prepare(made)
         except FlexarmError:
             plan = None
     core.offer(made, plan)

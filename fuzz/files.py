@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import yaml
 
+from flexarm_control.composite import assembly
 from flexarm_control.nodes import controller, observer
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, FlexarmError, ParameterError
@@ -226,7 +227,7 @@ class ParameterFiles(_Text):
         self.path.write_bytes(given)
         nodes = parameter_files.load(self.path)
         for prefix, group in self.declared:
-            found = parameter_files.under(nodes["controller"], prefix)
+            found = assembly.under(nodes["controller"], prefix)
             names = {p.name for p in group}
             check_all(group, {k: v for k, v in found.items() if k in names}, None, f"{prefix}.")
         return nodes

@@ -6,12 +6,12 @@ import pytest
 from harness import Bench
 
 from flexarm_control import trajectory
+from flexarm_control.composite.assembly import under
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState
 from flexarm_studies.loop import closed_loop, parameter_files
-from flexarm_studies.loop.parameter_files import under
 from flexarm_tools.recording import recorder
 from flexarm_tools.recording.recorder import keep_for_recording
 from flexarm_tools.running import lockstep

@@ -760,7 +760,7 @@ def test_a_rehearsal_leaves_nothing_behind(arm_r, slow):
         return controller(arm_r, design(arm_r, {"type": slow}, FAST))
 
     core, clean = made(), made()
-    core.rehearse()
+    core.warm_up()
     assert answer(core) == answer(clean)
     for c in (core, clean):
         c.step(sample(0))

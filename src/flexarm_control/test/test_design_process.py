@@ -9,9 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flexarm_control.composite import design_process, priority
+from flexarm_control.composite import design_process
 from flexarm_control.composite.design import design
 from flexarm_control.composite.design_process import AwayError, DesignProcess
+from flexarm_dynamics import processes
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models.model import build
@@ -75,13 +76,13 @@ def test_it_leaves_the_cpus_of_the_control_path(monkeypatch):
                 raise refused
 
         monkeypatch.setattr(os, name, record)
-    priority.step_back(5)
+    processes.step_back(5)
     assert [name for name, _ in asked] == ["sched_setscheduler", "nice"]
-    priority.step_back(5, {3})  # what the system refuses is left at that
+    processes.step_back(5, {3})  # what the system refuses is left at that
     assert ("sched_setaffinity", {3}) in asked and asked[-1] == ("nice", 5)
 
 
-def test_a_model_of_another_arm_stays_at_home(arm_r, arm_p3):
+def test_a_model_of_another_arm_is_not_sent(arm_r, arm_p3):
     with pytest.raises(pickle.PicklingError, match="another arm, P3"):
         design_process.dumps([arm_p3], arm_r.arm)
 
@@ -90,17 +91,17 @@ def test_the_process_designs_refuses_and_comes_again_when_it_has_died(arm_r):
     worker = DesignProcess(arm_r, niceness=0)
     try:
         slow, settings = {"type": "linear_model_following"}, {"feedforward": "model"}
-        made = worker.design(slow, FAST, CORRECTED, settings)
+        made = worker.call(design, slow, FAST, CORRECTED, settings)
         here = design(arm_r, slow, FAST, CORRECTED, settings)
         m = arm_r.n_modes
         np.testing.assert_allclose(torques(made, 1, m), torques(here, 1, m), rtol=1e-12)
         with pytest.raises(ParameterError, match=r"slow\.kp"):
-            worker.design(slow | {"kp": [-1.0]}, FAST, CORRECTED, settings)
+            worker.call(design, slow | {"kp": [-1.0]}, FAST, CORRECTED, settings)
         (pid,) = worker._pool._processes
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(AwayError, match="has died"):
-            worker.design(slow, FAST, CORRECTED, settings)
-        assert worker.design(slow, FAST).feedforward is None
+            worker.call(design, slow, FAST, CORRECTED, settings)
+        assert worker.call(design, slow, FAST).feedforward is None
     finally:
         worker.close()
 

@@ -243,3 +243,30 @@ def check_all(declared, values, sizes=None, prefix=""):
             hint = f"there are {', '.join(sorted(known)) or 'none'}"
             raise ParameterError("no such parameter", field=field, hint=hint)
     return {name: p.check(values.get(name, p.default), sizes, prefix) for name, p in known.items()}
+
+
+def merge(*groups):
+    """Declarations of several components under one prefix; a name means one thing.
+
+    `groups` are sequences of `Parameter`.
+
+    Raises
+    ------
+    ParameterError
+        When two components declare a name differently.
+    """
+    merged: dict[str, Parameter] = {}
+    for group in groups:
+        for parameter in group:
+            other = merged.setdefault(parameter.name, parameter)
+            if (other.kind, other.length, other.unit) != (
+                parameter.kind,
+                parameter.length,
+                parameter.unit,
+            ):
+                raise ParameterError(
+                    f"is declared twice, as {other.kind} [{other.unit}] and as {parameter.kind} [{parameter.unit}]",
+                    field=parameter.name,
+                    hint="rename it in one of the components",
+                )
+    return tuple(merged.values())

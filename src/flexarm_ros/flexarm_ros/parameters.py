@@ -12,7 +12,6 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterValueException
 
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter
 
 
 def descriptor(parameter):
@@ -114,6 +113,10 @@ class NodeParameters:
     def __getitem__(self, name):
         return self._values[name]
 
+    def values(self):
+        """All values by their full names."""
+        return dict(self._values)
+
     def group(self, prefix, names=None):
         """Values under a prefix, without it; only `names` where given."""
         return {
@@ -146,29 +149,3 @@ class NodeParameters:
         self._values = self._checked({p.name: p.value for p in parameters if p.name in changed})
         if self._listener is not None:
             self._listener(changed)
-
-
-def merge(*groups):
-    """Declarations of several components under one prefix; a name means one thing.
-
-    `groups` are sequences of `Parameter`.
-
-    Raises
-    ------
-    ParameterError
-        When two components declare a name differently.
-    """
-    merged: dict[str, Parameter] = {}
-    for group in groups:
-        for parameter in group:
-            other = merged.setdefault(parameter.name, parameter)
-            if (other.kind, other.length, other.unit) != (
-                parameter.kind,
-                parameter.length,
-                parameter.unit,
-            ):
-                raise ParameterError(
-                    f"{parameter.name} is declared twice, as {other.kind} [{other.unit}] and as"
-                    f" {parameter.kind} [{parameter.unit}]: rename it in one of the laws"
-                )
-    return tuple(merged.values())

@@ -11,8 +11,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.parameters import Parameter
-from flexarm_ros.parameters import NodeParameters, descriptor, merge
+from flexarm_dynamics.parameters import Parameter, merge
+from flexarm_ros.parameters import NodeParameters, descriptor
 
 KP = Parameter(
     "kp", "float_array", [6.25], "Position gain.", unit="1/s^2", low=0.0, high=1e6, length="joints"
@@ -266,5 +266,5 @@ def test_the_warning_goes_to_the_log_of_the_node(make, capfd):
 def test_a_name_that_two_laws_share_is_one_parameter_and_must_mean_one_thing():
     assert merge((KP, GAIN), (KP, ALPHA)) == (KP, GAIN, ALPHA)
     other = Parameter("kp", "float_array", [1.0], "Something else.", unit="N m", length="joints")
-    with pytest.raises(ParameterError, match=r"kp is declared twice.*\[1/s\^2\].*\[N m\]"):
+    with pytest.raises(ParameterError, match=r"kp: is declared twice.*\[1/s\^2\].*\[N m\]"):
         merge((KP,), (other,))

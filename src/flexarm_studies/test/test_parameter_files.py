@@ -3,7 +3,7 @@
 
 import pytest
 
-from flexarm_control.composite.design import design
+from flexarm_control.composite import assembly
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models import model
@@ -58,7 +58,7 @@ def test_an_empty_file_sets_nothing(load):
 
 def test_under_takes_a_prefix_and_no_namesake():
     values = {"slow.kp": [1.0], "slow.a.b": 2, "slower.kp": 3, "slow": 4, "fast.r": 5}
-    assert parameter_files.under(values, "slow") == {"kp": [1.0], "a.b": 2}
+    assert assembly.under(values, "slow") == {"kp": [1.0], "a.b": 2}
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,7 @@ def test_a_name_that_is_neither_file_nor_shipped_lists_the_shipped_ones(name):
 @pytest.mark.parametrize("name", ["paper_composite", "paper_slow"])
 def test_a_shipped_file_designs_a_controller_for_every_shipped_arm(name):
     values = parameter_files.load(name)["controller"]
-    groups = [parameter_files.under(values, p) for p in ("slow", "fast")]
     for arm in ("R", "P3", "one_link"):
-        law = design(model.build(arm_file.load(arm)), *groups)
+        law = assembly.control(model.build(arm_file.load(arm)), values)
         assert type(law.fast).__name__ == ("Lqr" if name == "paper_composite" else "NoFastLaw")
     assert parameter_files.load(parameter_files.find(name)) == parameter_files.load(name)

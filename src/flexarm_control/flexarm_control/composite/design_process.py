@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs in a process of their own, so that none holds the interpreter's lock while a sample waits for its torque.
+"""A second process that designs, so that no design holds the interpreter's lock while a sample waits for its torque.
 
-A thread of the controller's process shares its lock: on a design's every other bytecode the control path may have to
-wait for it, which was measured to double or treble the time of a step. Here the design is made by a second
-interpreter, of lower priority, which knows the arm; what comes back is the finished law. Models hold compiled code and
-do not travel: in either process "the arm's model" stands for its own.
+A design in a thread shares the lock of the controller's process: a step of the control path was measured to take two to
+three times as long meanwhile. The second process has a lower priority and a model of the same arm; it sends back the
+finished law. Models hold compiled code and are not sent: each process puts its own model in their place.
 """
 
-import ctypes
 import io
 import multiprocessing
 import os
 import pickle
 import signal
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from threading import Lock
@@ -21,20 +18,17 @@ from threading import Lock
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models import model as models
 from flexarm_dynamics.models.model import ArmModel
+from flexarm_dynamics.processes import end_with, step_back
 
-from .design import design
-from .priority import step_back
-
-_PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 _MODEL = "model"
 
 
 class AwayError(DesignError):
-    """The other process did not make it: it died, or what was to be made can't travel. It can be made here."""
+    """The other process can't do this: it has died, or an argument or result can't be sent. It can be done here."""
 
 
 class _Pickler(pickle.Pickler):
-    """Writes the arm's model, and every other of the same arm, as a name."""
+    """Writes every model of the arm as a name."""
 
     def __init__(self, file, arm):
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
@@ -45,7 +39,7 @@ class _Pickler(pickle.Pickler):
 
     def reducer_override(self, obj):
         if isinstance(obj, ArmModel):
-            raise pickle.PicklingError(f"a model of another arm, {obj.arm.name}, stays at home")
+            raise pickle.PicklingError(f"a model of another arm, {obj.arm.name}, can't be sent")
         return NotImplemented
 
 
@@ -59,14 +53,12 @@ class _Unpickler(pickle.Unpickler):
 
 
 def dumps(thing, arm):
-    """A law, plan or the like as bytes; models of `arm` are left out.
-
-    The `thing` may hold the model many times over.
+    """A law, plan or the like as bytes, without the models of `arm` in it.
 
     Raises
     ------
     pickle.PicklingError, TypeError, AttributeError
-        For what can't travel: a law with a model of another arm, say.
+        For what can't be sent, such as a law with a model of another arm.
     """
     file = io.BytesIO()
     _Pickler(file, arm).dump(thing)
@@ -74,7 +66,7 @@ def dumps(thing, arm):
 
 
 def loads(data, model):
-    """What `dumps` wrote, with `model` in the place of the models left out."""
+    """What `dumps` wrote, with `model` in the place of the models that it left out."""
     return _Unpickler(io.BytesIO(data), model).load()
 
 
@@ -85,10 +77,7 @@ _own = {}
 
 def _begin(arm, parent, niceness, cpus):
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    if sys.platform.startswith("linux"):
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:
-            os._exit(0)
+    end_with(parent)
     step_back(niceness, cpus)
     _own["model"] = models.build(arm)
 
@@ -98,30 +87,20 @@ def _work(function, data):
     return dumps(function(model, *loads(data, model)), model.arm)
 
 
-def _nothing(model):
-    return None
-
-
-def _design(model, slow, fast, manifold, settings):
-    return design(model, slow, fast, manifold, settings)
-
-
-def _prepare(model, feedforward, trajectory, start):
-    return feedforward.prepare(trajectory, start)
-
-
 class DesignProcess:
-    """Designs for one arm, one after the other; called from a thread that may wait.
+    """Calls functions in a second process that has a model of the same arm, one after the other.
 
-    The process is started by the first call, and again if it has died. It ends with this object, with the thread
+    Called from threads that may wait.
+
+    The process is started by the first call, and again after it has died. It ends with `close`, with the thread
     that made the first call, and with this process.
 
     Parameters
     ----------
     model : ArmModel
-        Of the control path: the laws that come back hold it.
+        The control path's: laws that come back hold it.
     niceness : int
-        Of the process, beside this one's.
+        Of the process, relative to this one.
     cpus : collection of int
         That it runs on; empty: as this one.
     """
@@ -130,33 +109,26 @@ class DesignProcess:
         self.model, self.niceness, self.cpus, self._pool = model, niceness, cpus, None
         self._starting = Lock()
 
-    def begin(self):
-        """Start the process, and let it import what it will need: the first design comes sooner."""
-        self.call(_nothing)
-
-    def design(self, slow, fast, manifold=None, settings=None):
-        """As `composite.design`, of this arm; warnings of the laws are still theirs to ask for.
-
-        `slow`, `fast`, `manifold` and `settings` as there.
-
-        Raises
-        ------
-        FlexarmError
-            What the design raises.
-        """
-        return self.call(_design, slow, fast, manifold, settings)
-
-    def prepare(self, feedforward, trajectory, start):
-        """As `Feedforward.prepare`: what is to be known of a trajectory before it is offered."""
-        return self.call(_prepare, feedforward, trajectory, start)
-
     def call(self, function, *arguments):
-        """``function(model, *arguments)`` over there; a function of a module, whose result can travel.
+        """``function(model, *arguments)`` in the process.
+
+        Parameters
+        ----------
+        function : callable
+            A function of a module.
+        *arguments
+            They can be pickled, models of this arm aside; so can the result.
+
+        Returns
+        -------
+        object
 
         Raises
         ------
         AwayError
-            When the process died, or what it made can't travel: design here instead.
+            When the process has died, or an argument or the result can't be sent.
+        Exception
+            What the function raises.
         """
         try:
             data = dumps(arguments, self.model.arm)
@@ -165,10 +137,10 @@ class DesignProcess:
         except BrokenProcessPool:
             self.close()
             raise AwayError(
-                "the process that designs has died (killed, or out of memory); it is started anew for the next one"
+                "the process that designs has died (killed, or out of memory); a new one is started for the next design"
             ) from None
         except (pickle.PicklingError, TypeError, AttributeError) as error:
-            raise AwayError(f"this design can't be made in another process: {error}") from error
+            raise AwayError(f"this design can't be sent to another process: {error}") from error
 
     def _running(self):
         with self._starting:
@@ -182,7 +154,7 @@ class DesignProcess:
             return self._pool
 
     def close(self):
-        """End the process, whatever it is at."""
+        """End the process, even in the middle of a call."""
         pool, self._pool = self._pool, None
         if pool is None:
             return

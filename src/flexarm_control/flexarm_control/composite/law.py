@@ -60,6 +60,14 @@ class CompositeControl:
         if self.feedforward is not None:
             self.feedforward.limit = value
 
+    def warnings(self):
+        """What a user should know about these laws on this arm; each a sentence."""
+        return [text for part in self._parts() for text in part.warnings()]
+
+    def _parts(self):
+        parts = self.slow, self.fast, self.feedforward
+        return [part for part in parts if part is not None]
+
     def resume(self, other):
         """Go on from another control's states: a redesign does not begin anew."""
         for mine, its in (

@@ -81,6 +81,11 @@ class ArmController:
         self.supervisor = Supervisor(model, settings, limit)
         self._take_limits(settings, limit)
 
+    def replace_law(self, law):
+        """Go on with another control, from the states of the present one; call between two samples."""
+        law.resume(self.law)
+        self.law = law
+
     def configure(self, settings):
         """Take new limits whole; call between two samples.
 
@@ -136,36 +141,27 @@ class ArmController:
         """Whether a trajectory is worth a `prepare` before it is offered."""
         return self.law.feedforward is not None and self.law.feedforward.plans
 
-    def prepare(self, trajectory, law, prepare=None):
-        """Design work for a trajectory that is about to be offered; off the control path, in any thread.
+    def prepare(self, trajectory):
+        """Design work for a trajectory that is about to be offered; off the control path.
 
         Parameters
         ----------
         trajectory : JointTrajectoryData
-        law : CompositeControl
-            The one in force.
-        prepare : callable, optional
-            Does that work, called with the feed-forward, the trajectory and the state (3, n) that it starts from:
-            in another process, say. Not given: here.
 
         Returns
         -------
         object or None
-            For `offer`; None where there is none to do.
+            For `offer`; None where there is nothing to prepare.
 
         Raises
         ------
         DesignError
             When it can't be done: the trajectory may be offered without.
         """
-        if law.feedforward is None:
-            return None
         start = self.reference.resting
-        if start is None:
+        if start is None or not self.plans:
             return None
-        if prepare is not None:
-            return prepare(law.feedforward, trajectory, start)
-        return law.feedforward.prepare(trajectory, start)
+        return self.law.feedforward.prepare(trajectory, start)
 
     def offer(self, trajectory, plan=None):
         """Offer a trajectory.
@@ -279,8 +275,8 @@ class ArmController:
         step = dt / FAST_RAMP
         return min(goal, share + step) if goal > share else max(goal, share - step)
 
-    def rehearse(self):
-        """Go through three samples and a trajectory on the side, so that compiled code is loaded before it counts."""
+    def warm_up(self):
+        """Run three samples and a trajectory on a second controller, so that compiled code is loaded."""
         model = self.model
         other = ArmController(model, self.law, self._settings)
         sample = ArmSample(model.n_joints, model.n_modes)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
-from dataclasses import replace
 from math import isnan
 from time import perf_counter
 
@@ -12,32 +11,25 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import parameter, sizes
+from flexarm_dynamics.parameters import sizes
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
 from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
-from flexarm_ros.parameters import merge
 from flexarm_ros.start import leave
 from flexarm_ros.statistics import Gaps, Latency, Percentiles
 
+from ..composite import assembly
 from ..loop.samples import ArmSample
 from ..observers import arm_observer, gauge_health
 
 #: So large a part of the samples may get lost in a second before it is worth a warning.
 MANY_LOST = 0.01
 
-TYPE = parameter("type", "filtered_derivative", read_only=True).described(
-    "Observer, by its name in the entry-point group flexarm.observers."
-)
-
 
 def parameter_groups():
     """Declared parameters of this node, by prefix."""
-    group = arm_observer.OBSERVERS
-    laws = [law.PARAMETERS for law in registry.importable(group).values()]
-    kind = replace(TYPE, choices=registry.names(group))
-    return {"": (ARM,), "observer.": (kind, *arm_observer.PARAMETERS, *merge(*laws))}
+    return {"": (ARM,), "observer.": assembly.declarations("observer")}
 
 
 class ObserverNode(ArmNode):

@@ -142,7 +142,7 @@ def slower_bending(scenario, factor):
     arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
     kind = scenarios.type_of("fast", scenario.controller)
     values = dict(scenario.controller)
-    declared = {p.name: p for p in scenarios._declared("fast", scenario.controller)}
+    declared = {p.name: p for p in scenarios.declared("fast", scenario.controller)}
     modes = len(arm.mode_names)
     if {"q", "alpha"} <= set(declared):
         q = np.asarray(values.get("fast.q", declared["q"].default), float)

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexarm_control import trajectory
-from flexarm_control.composite.design import design
+from flexarm_control.composite import assembly
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
 
-from ..loop import closed_loop, metrics, parameter_files
+from ..loop import closed_loop, metrics, scenario
+from ..loop.scenario import Scenario
 
 DURATION = 8.0  # [s] from the start of the trajectory
 FINAL = np.array([math.pi / 2])
@@ -81,10 +82,7 @@ RUNS = (
 
 def law_of(run, arm_model):
     """The run's composite control, from its controller file."""
-    values = parameter_files.load(run.file)["controller"] | run.controller
-    return design(
-        arm_model, parameter_files.under(values, "slow"), parameter_files.under(values, "fast")
-    )
+    return assembly.control(arm_model, scenario.parameters(run.file) | {"slow.gain": run.gain})
 
 
 def run_without_ros(run):
@@ -94,19 +92,10 @@ def run_without_ros(run):
     -------
     Record
     """
-    values = parameter_files.load(run.file)
-    control = values["controller"] | run.controller
-    observer = values["observer"] | run.observer
-    observer = parameter_files.under(observer, "observer")
+    values = scenario.parameters(run.file) | {"slow.gain": run.gain}
     if run.rates == "true":
-        observer.pop("bandwidth", None)
-    loop = closed_loop.ClosedLoop(
-        run.arm,
-        parameter_files.under(control, "slow"),
-        parameter_files.under(control, "fast"),
-        observer,
-        {k: v for k, v in run.simulator.items() if k != "arm"},
-    )
+        values["observer.type"] = "true_rates"
+    loop = scenario.loop_of(Scenario(run.arm, values))
     return loop.run(paper_trajectory(loop.model.joint_names), DURATION)
 
 

@@ -143,9 +143,7 @@ def run_controller(options, recorder=None):
 def warnings(scenario, loop):
     """What a person should know of a run that was carried out all the same."""
     law, gauges = loop.controller.law, loop.simulator.plant_model.arm.gauges
-    for part in (law.slow, law.fast, law.feedforward):
-        if part is not None:
-            yield from part.warnings()
+    yield from law.warnings()
     if loop.unprepared:
         yield f"no preview of the trajectory: {loop.unprepared}"
     if scenario.noise and not any(g.noise or g.drift for g in gauges):

@@ -5,13 +5,13 @@ from collections import deque
 
 import numpy as np
 
+from flexarm_control.composite import assembly
 from flexarm_control.composite.design import PARAMETERS as DESIGN_PARAMETERS
-from flexarm_control.composite.design import design, typed
+from flexarm_control.composite.design import design
 from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.loop.arm_controller import START_TOLERANCE, ArmController
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State
-from flexarm_control.observers.arm_observer import observe
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.errors import FlexarmError, MessageError, ModelError
@@ -75,7 +75,7 @@ class ClosedLoop:
             settings["plant_arm"] = plant_arm
         self.simulator = Simulator(settings)
         model = self.model = self.simulator.nominal
-        self.observer = observe(model, *typed(observer, "observer"))
+        self.observer = assembly.observer(model, observer)
         given, whole = dict(controller or {}), {p.name for p in DESIGN_PARAMETERS}
         chosen = {name: given.pop(name) for name in whole & set(given)}
         if chosen:
@@ -234,7 +234,7 @@ class ClosedLoop:
         self.unprepared = ""
         if controller.plans:
             try:
-                return controller.prepare(trajectory, controller.law)
+                return controller.prepare(trajectory)
             except FlexarmError as error:
                 self.unprepared = str(error)
         return None

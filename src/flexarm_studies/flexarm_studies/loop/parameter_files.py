@@ -5,9 +5,11 @@ from pathlib import Path
 
 import yaml
 
+from flexarm_control.composite import assembly
 from flexarm_dynamics.errors import ParameterError
 
-PREFIXES = {"controller": ("slow", "fast", "manifold"), "observer": ("observer",), "simulator": ()}
+#: Components whose parameters each node has.
+PREFIXES = {"controller": assembly.CONTROL, "observer": ("observer",), "simulator": ()}
 
 
 def directory():
@@ -52,7 +54,7 @@ def load(name):
     path = find(name)
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        sections = {key: _flat(section["ros__parameters"]) for key, section in data.items()}
+        sections = {key: assembly.flat(section["ros__parameters"]) for key, section in data.items()}
     except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         # ValueError: text that is no UTF-8, or a scalar that is not what it looks like, as a 13th month.
         raise ParameterError(f"{path}: can't be read: {error}") from None
@@ -69,18 +71,3 @@ def load(name):
         }
         for node in PREFIXES
     }
-
-
-def _flat(tree, prefix=""):
-    flat = {}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            flat.update(_flat(value, f"{prefix}{key}."))
-        else:
-            flat[prefix + key] = value
-    return flat
-
-
-def under(parameters, prefix):
-    """Parameters below ``prefix.``, without it."""
-    return {k[len(prefix) + 1 :]: v for k, v in parameters.items() if k.startswith(prefix + ".")}

@@ -13,15 +13,12 @@ import numpy as np
 import yaml
 
 from flexarm_control import trajectory
-from flexarm_control.composite.design import FAST, MANIFOLD, SLOW
+from flexarm_control.composite.assembly import COMPONENTS, chosen, declared, type_of
 from flexarm_control.composite.design import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.loop.arm_controller import START_TOLERANCE
 from flexarm_control.loop.supervisor import State
-from flexarm_control.observers.arm_observer import OBSERVERS
-from flexarm_control.observers.arm_observer import PARAMETERS as OBSERVER_PARAMETERS
 from flexarm_control.trajectory import specs
-from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm, scaled
 from flexarm_dynamics.errors import ParameterError, TrajectoryError
@@ -32,13 +29,6 @@ from .closed_loop import ClosedLoop
 from .metrics import tracking_metrics
 from .network import Network, NetworkedLoop
 
-#: Groups of components by the prefix of their parameters, and the type where none is given, as in the nodes.
-COMPONENTS = {
-    "slow": (SLOW, "linear_model_following"),
-    "fast": (FAST, "lqr"),
-    "manifold": (MANIFOLD, "corrected"),
-    "observer": (OBSERVERS, "filtered_derivative"),
-}
 #: Parameters of the nodes themselves: they say nothing of the loop.
 OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
 CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS)
@@ -145,9 +135,9 @@ def parameters(file, settings=()):
         own = parameter_files.PREFIXES[node]
         found |= {k: v for k, v in nodes[node].items() if k.split(".")[0] in own}
     found = {k: v for k, v in found.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
-    chosen = dict(map(_setting, settings))
-    found |= chosen
-    for name in chosen:
+    set_here = dict(map(_setting, settings))
+    found |= set_here
+    for name in set_here:
         _check_name(name, found)
     return found
 
@@ -166,7 +156,7 @@ def _check_name(name, values):
     """Refuse a name that none of the chosen components has."""
     prefix = name.split(".")[0]
     if prefix in COMPONENTS:
-        known = ("type", *(p.name for p in _declared(prefix, values)))
+        known = ("type", *(p.name for p in declared(prefix, values)))
         known = [f"{prefix}.{k}" for k in known]
     else:
         known = [p.name for p in (*CONTROLLER, *SIMULATOR_PARAMETERS)]
@@ -180,31 +170,6 @@ def _check_name(name, values):
     close = difflib.get_close_matches(name, known, 1)
     hint = f"; did you mean {close[0]}?" if close else ""
     raise ParameterError(f"{name}: no such parameter{what}; there are {', '.join(there)}{hint}")
-
-
-def type_of(prefix, values):
-    """Name of the component of a group: slow, fast, manifold or observer."""
-    return values.get(f"{prefix}.type", COMPONENTS[prefix][1])
-
-
-def _declared(prefix, values):
-    """Parameters of the chosen component of a group."""
-    common = OBSERVER_PARAMETERS if prefix == "observer" else ()
-    kind = type_of(prefix, values)
-    if not isinstance(kind, str):
-        raise ParameterError(f"{prefix}.type: {kind!r} is not a name")
-    return (*common, *registry.find(COMPONENTS[prefix][0], kind).PARAMETERS)
-
-
-def _component(prefix, values):
-    """Mapping with `type` for one component; what belongs to others of its group is left out, as by the node."""
-    given = parameter_files.under(values, prefix) | {"type": type_of(prefix, values)}
-    own = {p.name for p in _declared(prefix, values)} | {"type"}
-    if not set(given) <= own:
-        everyone = registry.importable(COMPONENTS[prefix][0]).values()
-        others = {p.name for law in everyone for p in law.PARAMETERS} - own
-        given = {k: v for k, v in given.items() if k not in others}
-    return given
 
 
 def loop_of(scenario):
@@ -232,7 +197,7 @@ def loop_of(scenario):
     controller.setdefault("feedforward", "model")
     if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
-    groups = {prefix: _component(prefix, values) for prefix in COMPONENTS}
+    groups = {prefix: chosen(prefix, values) for prefix in COMPONENTS}
     arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
     plant = scaled(
         arm_file.load(scenario.plant_arm) if scenario.plant_arm else arm,

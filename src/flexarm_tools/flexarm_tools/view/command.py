@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 
-from flexarm_control.composite.priority import step_back
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError, ParameterError
 from flexarm_dynamics.models import model
+from flexarm_dynamics.processes import step_back
 from flexarm_studies.loop import parameter_files
 
 #: Pictures per second, and the most of them.

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Design work for one arm, off the control path: in a process of its own, or in the thread that asks for it."""
+
+from concurrent.futures import CancelledError
+
+from flexarm_dynamics.models.model import build
+
+from .assembly import control
+from .design_process import AwayError, DesignProcess
+
+
+def ready(model):
+    """Nothing: to import this module, and to build the model, is what the first design would wait for."""
+
+
+def prepare(model, feedforward, trajectory, start):
+    """``feedforward.prepare(trajectory, start)``, callable in the design process; its `model` is not needed."""
+    return feedforward.prepare(trajectory, start)
+
+
+class Designer:
+    """Designs controls and prepares trajectories; called from threads that may wait.
+
+    Where the process does not answer, or what it is to make can't be sent, the work is done in the calling thread.
+
+    Parameters
+    ----------
+    model : ArmModel
+        The control path's: controls that the process designs hold it.
+    warn : callable
+        Called with a sentence when the process can't be used.
+    process : bool
+        Whether to design in a process of its own. A thread holds up the control path now and then, since both need
+        the interpreter's lock.
+    cpus : collection of int
+        That the process runs on; empty: as this one.
+    """
+
+    def __init__(self, model, warn, process=True, cpus=()):
+        self.model, self._warn, self.closed = model, warn, False
+        self._process = DesignProcess(model, cpus=cpus) if process else None
+
+    def warm_up(self):
+        """Start the process, so that the first design need not wait for its imports."""
+        if self._process is not None:
+            try:
+                self._process.call(ready)
+            except AwayError as error:
+                if not self.closed:
+                    self._warn(str(error))
+
+    def design(self, values):
+        """The control that flat parameters describe, as `assembly.control`.
+
+        Parameters
+        ----------
+        values : mapping
+
+        Returns
+        -------
+        CompositeControl
+
+        Raises
+        ------
+        FlexarmError
+            What the design raises.
+        CancelledError
+            After `close`.
+        """
+        try:
+            return self._in_process(control, values)
+        except AwayError:
+            # With a model of its own: meanwhile the control path uses the other one.
+            return control(build(self.model.arm), values)
+
+    def prepare(self, feedforward, trajectory, start):
+        """As `Feedforward.prepare`; errors as for `design`.
+
+        Parameters
+        ----------
+        feedforward : Feedforward
+        trajectory : JointTrajectoryData
+        start : ndarray, shape (3, n)
+            Position, velocity and acceleration of the reference where the trajectory begins.
+
+        Returns
+        -------
+        object or None
+        """
+        try:
+            return self._in_process(prepare, feedforward, trajectory, start)
+        except AwayError:
+            return feedforward.prepare(trajectory, start)
+
+    def _in_process(self, function, *arguments):
+        """``function(model, *arguments)`` in the process; an `AwayError`, with a warning, where that can't be."""
+        if self._process is None:
+            raise AwayError("there is no design process")
+        try:
+            return self._process.call(function, *arguments)
+        except AwayError as error:
+            if self.closed:
+                raise CancelledError from error
+            self._warn(f"{error}; it is made in a thread of the controller")
+            raise
+
+    def close(self):
+        """End the process, even in the middle of a design."""
+        self.closed = True
+        if self._process is not None:
+            self._process.close()

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories on their way from a raw message to the controller: read, prepared, and offered or refused."""
+
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+
+from rclpy.serialization import deserialize_message
+from trajectory_msgs.msg import JointTrajectory
+
+from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_ros.messages import stamp_ns, trajectory_points
+
+from .. import trajectory
+
+#: Longer trajectories are refused: their points are read in one go.
+MAX_POINTS = 10_000
+
+
+def read(raw, arm):
+    """A serialised message as data that the arm can follow.
+
+    Parameters
+    ----------
+    raw : bytes
+        A serialised `JointTrajectory`.
+    arm : Arm
+        Its joints and their limits.
+
+    Returns
+    -------
+    JointTrajectoryData
+
+    Raises
+    ------
+    TrajectoryError
+        For anything that is no trajectory of this arm.
+    """
+    try:
+        count = trajectory_points(raw)
+        if count > MAX_POINTS:
+            raise TrajectoryError(
+                f"{count} points, at most {MAX_POINTS} are taken: send fewer, a quintic polynomial joins them, or"
+                " one trajectory after another"
+            )
+        msg = deserialize_message(raw, JointTrajectory)
+        points = [
+            (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
+            for p in msg.points
+        ]
+        low, high = zip(*(j.limits.position for j in arm.joints), strict=True)
+        return trajectory.validate(
+            msg.joint_names,
+            arm.joint_names,
+            stamp_ns(msg.header.stamp),
+            points,
+            position_low=list(low),
+            position_high=list(high),
+            velocity_max=[j.limits.velocity for j in arm.joints],
+        )
+    except TrajectoryError:
+        raise
+    except Exception as error:  # untrusted bytes
+        raise TrajectoryError(f"no JointTrajectory: {type(error).__name__}: {error}") from error
+
+
+class TrajectoryInbox:
+    """Takes raw messages off the control path: a thread reads and prepares them, the node's own thread offers them.
+
+    Parameters
+    ----------
+    node : ArmNode
+    core : ArmController
+    designer : Designer
+    """
+
+    def __init__(self, node, core, designer):
+        self._node, self._core, self._designer = node, core, designer
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="trajectory")
+
+    def warm_up(self):
+        """Have the designer ready before the first motion comes."""
+        if self._core.plans:
+            self._thread.submit(self._designer.warm_up)
+
+    def receive(self, raw):
+        """Take a serialised message: turning thousands of points into objects would hold up the control path."""
+        if self._node.active:
+            self._thread.submit(self._read_and_prepare, raw, self._core.law.feedforward)
+
+    def _read_and_prepare(self, raw, feedforward):
+        """In a thread: make a message ready to be offered."""
+        try:
+            data = read(raw, self._core.model.arm)
+        except TrajectoryError as error:
+            self._node.hand_over(self._refuse, str(error))
+            return
+        plan, start = None, self._core.reference.resting
+        try:
+            if feedforward is not None and feedforward.plans and start is not None:
+                plan = self._designer.prepare(feedforward, data, start)
+        except CancelledError:
+            return
+        except Exception as error:
+            if self._designer.closed:
+                return
+            kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+            self._node.get_logger().warning(f"trajectory without preview: {kind}{error}")
+        self._node.hand_over(self._offer, data, plan)
+
+    def _refuse(self, reason):
+        self._core.refuse(reason)
+        self._node.get_logger().warning(f"trajectory refused: {reason}")
+
+    def _offer(self, data, plan):
+        verdict = self._core.offer(data, plan)
+        if verdict.accepted:
+            text = f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}"
+            self._node.get_logger().info(text)
+        elif not verdict.repeat:
+            self._node.get_logger().warning(f"trajectory refused: {verdict.reason}")
+
+    def close(self):
+        """Take no more messages; what is under way is not waited for."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
