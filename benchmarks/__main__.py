@@ -58,7 +58,7 @@ def measure(quick, note):
     quick : bool
         Few turns and few arm sizes.
     note : callable
-        Is told what is being measured.
+        Called with the name of what is being measured.
 
     Returns
     -------

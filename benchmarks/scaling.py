@@ -21,7 +21,7 @@ STAGES = METHODS["rk4"].weights.size
 #: Turns of one attempt, and the shortest turn [s]: both kinds of threads meet the same other load.
 TURNS, TURN = 5, 0.25
 
-#: Other programs are waited for: so many attempts, until that share of all cores was to be had.
+#: Attempts to find the machine idle, and the fraction of all cores that must be free.
 ATTEMPTS, ALL_THERE = 6, 0.9
 
 #: What the threads that share nothing work on.

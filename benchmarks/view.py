@@ -54,8 +54,8 @@ def main(case, rounds=ROUNDS):
             for key in list(loops)[:: 1 - 2 * (i % 2)]:
                 windows[key].append(loops[key].window(case.window))
         viewed.processes.stop()
-        said = viewed.processes.log("client").strip()
-    print(f"{case.name}; the client: {said}")
+        client = viewed.processes.log("client").strip()
+    print(f"{case.name}; the client: {client}")
     found = {
         key: [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in each]
         for key, each in windows.items()

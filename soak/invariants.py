@@ -73,7 +73,7 @@ class Invariants:
         self._demand(np.isfinite(u).all(), "torque finite", where)
         self._demand(enabled or not u.any(), "disabled is zero", where)
         self._demand((np.abs(u) <= self.limit).all(), "torque within its limit", where)
-        # An estimate that this process has not got yet, or has lost, judges nobody.
+        # Without the estimate, because it is late or lost, there is nothing to check.
         valid = self._valid.get(key, True)
         self._demand(valid or not enabled, "enabled with a valid state alone", where)
         last, self._last = (

@@ -6,7 +6,7 @@ processes, or observer and controller in one. The relay is three plain nodes tha
 ready-made one of the same type, size and quality of service (`relay`); the same simulator, with the same plant, is at
 its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's publish
 to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that what
-slows the machine slows all of them, and the ratio of each round's medians is told.
+slows the machine slows all of them, and the result is the ratio of each round's medians.
 """
 
 import json
@@ -176,14 +176,14 @@ class Chain:
         self.pause(False)
         time.sleep(seconds)
         self.pause(True)
-        said = self.wait_for("the simulator's figures", lambda: self.figures()[before:])
-        return said[-1]
+        found = self.wait_for("the simulator's figures", lambda: self.figures()[before:])
+        return found[-1]
 
     def figures(self):
         """What the simulator found, one for each window so far."""
-        return self._said("simulator")
+        return self._figures_of("simulator")
 
-    def _said(self, name):
+    def _figures_of(self, name):
         lines = self.processes.log(name).splitlines()
         return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
 
@@ -193,8 +193,8 @@ class Chain:
         self.processes.stop()
         found = {}
         for name in logs:
-            for said in self._said(name):
-                for part, times in said.items():
+            for times_of in self._figures_of(name):
+                for part, times in times_of.items():
                     # The first ones wait for code to be loaded.
                     found[part] = statistics.median(times[20:] or times or [float("nan")])
         return found
@@ -221,7 +221,7 @@ def measure(
     moving : bool
         Whether the arm moves.
     fraction : callable
-        Is told how much is done, 0 to 1.
+        Called with the fraction that is done, 0 to 1.
 
     Returns
     -------

@@ -2,7 +2,7 @@
 """``flexarm latency --redesign``: the same loop's latency while its fast law is designed anew, beside without.
 
 Three processes, the moving arm; windows without and windows in which parameters of the controller are set once in
-`EVERY` seconds take turns, and the ratio of each round's percentiles is told. Each set is a whole design: gains,
+`EVERY` seconds take turns, and the result is the ratio of each round's percentiles. Each set is a whole design: gains,
 full-order check, feed-forward; or the Riccati gains over the workspace.
 """
 
@@ -117,7 +117,7 @@ def measure(case, rounds, fraction=lambda done: None):
         Of an arm of `REDESIGNS`.
     rounds : int
     fraction : callable
-        Is told how much is done, 0 to 1.
+        Called with the fraction that is done, 0 to 1.
 
     Returns
     -------

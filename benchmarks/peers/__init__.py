@@ -28,7 +28,7 @@ class Peer:
     parameters : dict
         That case's entry of ``parameters.json``.
     **settings
-        What the code can be told: step, segments, tolerance.
+        The settings of the code: step, segments, tolerance.
     """
 
     name = ""
