@@ -14,12 +14,17 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control.composite.design import FAST, SLOW, design_law
+from flexarm_control.nodes.controller import ControllerNode
+from flexarm_control.nodes.observer import ObserverNode
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_ros import node
 from flexarm_ros.messages import stamp_ns
+from flexarm_sim.nodes.simulator import SimulatorNode
 from flexarm_studies.loop import parameter_files
+from flexarm_tools.running.processes import arguments, own_domain
 
 NODES = ("simulator", "observer", "controller")
 LOCKSTEP = {"lockstep": True, "resend_period": 0.02}
@@ -110,7 +115,7 @@ REFUSALS = {
     "negative field": (
         "observer",
         {"arm": arm_file_with("mass_per_length: 0.2453384470152408", "mass_per_length: -0.2")},
-        r"links\[0\]\.mass_per_length: -0.2 must be greater than 0",
+        r"links\[0\]\.mass_per_length: -0.2.* must be greater than 0",
     ),
     "misspelt field": (
         "controller",
@@ -118,8 +123,8 @@ REFUSALS = {
         r"joints\[0\]\.hub_inertai: .*hub_inertia",
     ),
     "integers for floats": ("controller", {"slow.kp": [6]}, r"slow\.kp: .*write \[6\.0\]"),
-    "below range": ("controller", {"fast.alpha": -1.0}, r"fast\.alpha: -1\.0 is below"),
-    "above range": ("simulator", {"rate": 1e9}, r"rate: 1000000000\.0 is above"),
+    "below range": ("controller", {"fast.alpha": -1.0}, r"fast\.alpha: -1\.0 .*is below"),
+    "above range": ("simulator", {"rate": 1e9}, r"rate: 1000000000\.0 .*is above"),
     "unknown law": (
         "controller",
         {"slow.type": "nonsense"},
@@ -137,30 +142,45 @@ REFUSALS = {
 }
 
 
-@pytest.fixture(scope="module")
-def refusals(tmp_path_factory):
-    """Exit codes and logs of nodes that are to refuse, all started together."""
-    folder = tmp_path_factory.mktemp("refusals")
-    with Bench(folder / "log") as bench:
-        for case, (node, parameters, _) in REFUSALS.items():
-            given = {} if case.startswith("no arm") else {"arm": "R", **parameters}
-            if "\n" in str(given.get("arm", "")):
-                path = folder / f"{case}.yaml"
-                path.write_text(given["arm"])
-                given["arm"] = str(path)
-            bench.start(node, given, key=case)
-        for case in REFUSALS:
-            bench.processes.expect_end(case)
-        codes = {case: bench.end_of(case) for case in REFUSALS}
-        return codes, {case: bench.log(case) for case in REFUSALS}
+#: One of each kind as a process of its own; all of them in this process.
+AS_PROCESS = ("no arm", "missing field", "below range", "no design")
+CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
+
+
+def refused(case, folder):
+    """Node and parameters of a refusal, the text of an arm written to a file."""
+    name, parameters, _ = REFUSALS[case]
+    given = {} if case.startswith("no arm") else {"arm": "R", **parameters}
+    if "\n" in str(given.get("arm", "")):
+        path = folder / "arm.yaml"
+        path.write_text(given["arm"])
+        given["arm"] = str(path)
+    return name, given
+
+
+def names_its_error_once(case, log):
+    assert len(printed(log)) == 1, log
+    assert re.search(REFUSALS[case][2], log), log
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_what_a_node_cannot_start_with_ends_it_with_one_error_that_names_it(refusals, case):
-    codes, logs = refusals
-    assert codes[case] == 1, logs[case]
-    assert len(printed(logs[case])) == 1, logs[case]
-    assert re.search(REFUSALS[case][2], logs[case]), logs[case]
+def test_what_a_node_cannot_start_with_ends_it_with_one_error_that_names_it(
+    case, tmp_path, monkeypatch, capfd
+):
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    name, given = refused(case, tmp_path)
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        assert node.run(CLASSES[name], arguments(given)) == 1
+    names_its_error_once(case, "".join(capfd.readouterr()))
+
+
+@pytest.mark.parametrize("case", AS_PROCESS)
+def test_a_process_that_cannot_start_ends_with_code_1(bench, case, tmp_path):
+    name, given = refused(case, tmp_path)
+    process = bench.start(name, given)
+    assert process.wait(bench.PATIENCE) == 1
+    names_its_error_once(case, bench.log(name))
 
 
 @pytest.mark.real_time
@@ -317,7 +337,7 @@ REFUSED_SETS = {
     "integers": ({"slow__kp": [6]}, r"write \[6\.0\]"),
     "text": ({"slow__kp": "six"}, "'six' is not a list of numbers"),
     "scalar": ({"slow__kp": 6.25}, "not a list of numbers"),
-    "below": ({"slow__kp": [-1.0]}, "below its lower limit (0.0)"),
+    "below": ({"slow__kp": [-1.0]}, "below its lower limit"),
     "above": ({"fast__alpha": 1e4}, "fast.alpha out of range"),
     "length": ({"slow__kp": [1.0, 2.0]}, r"2 values where 1 \(joints\)"),
     "length of z": ({"fast__q": [1.0, 2.0, 3.0]}, r"3 values where 4 \(z\)"),
