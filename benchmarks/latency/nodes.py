@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of the control path with a stopwatch, as `latency` starts them. ``python -m benchmarks.latency.nodes ROLE …``.
+"""The control path's nodes with a stopwatch, as `latency` starts them: ``python -m benchmarks.latency.nodes ROLE …``.
 
 The nodes are the shipped ones. The simulator stamps each state as it publishes it and each torque as it comes in,
 on one steady clock of one process; observer and controller time their one call of mathematics. What they found they
