@@ -67,8 +67,8 @@ BAD_STATES = {
         {"mode_names": ["link1_y_mode1", "link1_z_mode1"]},
         "missing link1_y_mode2; unknown link1_z_mode1",
     ),
-    "NaN strain alone": ({"strain": [0.0, NAN], "modal_amplitude": []}, "strain of middle is nan"),
-    "huge strain alone": ({"strain": [1e7, 0.0], "modal_amplitude": []}, "strain of root is 1"),
+    "NaN strain alone": ({"strain": [0.0, NAN], "modal_amplitude": []}, "strain of middle: nan"),
+    "huge strain alone": ({"strain": [1e7, 0.0], "modal_amplitude": []}, "strain of root: 1"),
     "one strain": ({"strain": [0.0], "modal_amplitude": []}, "strain has 1 values for 2 names"),
     "wrong gauge": ({"gauge_names": ["root", "tip"]}, "missing middle; unknown tip"),
     "neither strain nor amplitude": (

@@ -63,7 +63,7 @@ def calibrate(source):
 def test_calibration_waits_for_samples_is_refused_in_motion_and_accepted_at_rest(source):
     answer = calibrate(source)
     assert not answer.success
-    assert re.match(rf"not enough samples yet \(\d+ of {SAMPLES}\): call again", answer.message)
+    assert re.match(rf"calibration_samples: \d+ are not enough samples yet \({SAMPLES}\)", answer.message)
     # In motion.
     source.restart()
     for k in range(SAMPLES + 1):
@@ -71,7 +71,7 @@ def test_calibration_waits_for_samples_is_refused_in_motion_and_accepted_at_rest
         source.exchange(source.state(**{k: f(source) for k, f in READ.items()}))
     answer = calibrate(source)
     assert not answer.success
-    assert re.match(r"joint1 moves at 0\.\d+ rad/s, at most 0\.01 is rest", answer.message)
+    assert re.match(r"velocity of joint1: 0\.\d+ rad/s is not rest \(0\.01\)", answer.message)
     # At rest.
     source.restart()
     for _ in range(SAMPLES):
@@ -127,8 +127,8 @@ def test_the_loop_goes_on_without_one_gauge_or_two_and_stops_without_three(sourc
     assert torque.mode == JointTorque.DISABLED
     assert state.supervisor_state == CompositeState.FAULT
     assert re.search(
-        r"strain of root is nan \(missing\), strain of quarter is inf \(missing\), strain of middle is 1\.0"
-        r" \(saturated\): without, the gauges \(three_quarter\) can't give link1_y_mode1, link1_y_mode2",
+        r"strain of root: nan .* without root \(missing\), quarter \(missing\), middle \(saturated\) the gauges"
+        r" \(three_quarter\) can't give link1_y_mode1, link1_y_mode2",
         source.bench.log("observer"),
     )
     source.recover()

@@ -197,7 +197,7 @@ def test_a_sample_that_the_observer_refuses_leaves_nothing_behind(arm_r):
         args = {"velocity_known": False, "position": [0.01 * k**2]}
         if k == 12:
             for _ in range(2):  # sent again, it is refused again
-                with pytest.raises(MessageError, match="joint_torque is unknown"):
+                with pytest.raises(MessageError, match="joint_torque: is unknown"):
                     core.step(sample(k, torque=[np.nan], **args))
                 assert_array_equal(state(core), state(clean))
             continue
@@ -207,7 +207,7 @@ def test_a_sample_that_the_observer_refuses_leaves_nothing_behind(arm_r):
 
 def test_a_start_that_the_observer_refuses_is_no_start(arm_r):
     core = observed(arm_r, "true_rates")
-    with pytest.raises(MessageError, match="modal_rate is empty"):
+    with pytest.raises(MessageError, match="modal_rate: is empty"):
         core.step(sample(0))
     assert core.step(sample(0, rate=[1.0, 2.0])) is True
 
@@ -220,7 +220,7 @@ def test_whatever_an_observer_raises_becomes_a_refusal_that_names_it(arm_r):
 
     core.observer.update = update
     with pytest.raises(
-        MessageError, match="FilteredDerivative failed: ZeroDivisionError: no such thing"
+        MessageError, match="observer FilteredDerivative: failed: ZeroDivisionError: no such thing"
     ):
         core.step(sample(0))
 

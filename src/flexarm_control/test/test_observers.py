@@ -208,7 +208,7 @@ def test_luenberger_innovation_is_the_amplitude_that_was_not_predicted(arm_r):
 def test_luenberger_refuses_an_unknown_torque_but_for_the_first_sample(arm_r):
     observer = luenberger(arm_r)
     observer.update(sample([0.0, 0.0], torque=np.nan), 0.0)
-    with pytest.raises(MessageError, match=r"joint_torque is unknown.*filtered_derivative"):
+    with pytest.raises(MessageError, match=r"joint_torque: is unknown.*filtered_derivative"):
         observer.update(sample([0.0, 0.0], torque=np.nan), 1e-3)
 
 
@@ -224,7 +224,7 @@ def test_true_rates_passes_on_what_the_source_says(arm_r):
 
 
 def test_true_rates_without_rates_says_what_to_do(arm_r):
-    with pytest.raises(MessageError, match=r"modal_rate is empty.*publish_rates"):
+    with pytest.raises(MessageError, match=r"modal_rate: is empty.*publish_rates"):
         design_observer("true_rates", arm_r, {}).update(sample([0.1, 0.2]), 0.0)
 
 

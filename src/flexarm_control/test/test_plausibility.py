@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slips of units and of choice that a person is told of before the arm moves."""
+"""Wrong units and unsuitable choices are reported before the arm moves."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def test_strain_in_microstrain_is_refused_by_name(arm_r):
     observer = ArmObserver(arm_r, design_observer("filtered_derivative", arm_r, {}))
     sample = ArmSample(1, 2, 2)
     sample.amplitude, sample.strain = None, np.array([0.0, 250.0])
-    with pytest.raises(MessageError, match="strain of middle is 250"):
+    with pytest.raises(MessageError, match="strain of middle: 250"):
         observer.step(sample)
     sample.strain = np.array([0.0, 250e-6])
     observer.step(sample)
@@ -43,7 +43,7 @@ def test_only_a_law_without_compensation_warns_of_gravity(arm_r):
     assert not design_law(FAST, "none", arm_r, {}).warnings()
 
 
-def test_a_broken_package_is_an_error_only_for_who_asks_for_it(monkeypatch):
+def test_a_broken_package_is_an_error_only_for_those_who_ask_for_it(monkeypatch):
     good = registry.find(SLOW, "none")
 
     def find(group, name):

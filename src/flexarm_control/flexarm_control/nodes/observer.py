@@ -43,7 +43,7 @@ class ObserverNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(sizes(self.model))
-        arm_observer.ArmObserver(self.model, self._design(), **self._common()).rehearse()
+        arm_observer.ArmObserver(self.model, self._design(), **self._common()).warm_up()
         self.core = arm_observer.ArmObserver(self.model, self._design(), **self._common())
         parameters.on_change(self._changed)
         arm = self.arm

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observer of an arm: strains to amplitudes, order of samples, and the chosen observer."""
+"""Observer of an arm: maps strains to amplitudes, orders the samples, calls the chosen observer."""
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from flexarm_dynamics.parameters import check_all, parameter
 from ..component import make
 from ..loop.samples import ArmSample, SampleOrder
 from . import gauge_health
+from .base import need_torque
 from .motion import Motion
 
 OBSERVERS = "flexarm.observers"
@@ -40,7 +41,7 @@ def design_observer(name, model, values):
 
 
 def observe(model, name, values):
-    """An `ArmObserver` from an observer's name and its parameters, those of `PARAMETERS` among them.
+    """Make an `ArmObserver` from an observer's name and its parameters, including those of `PARAMETERS`.
 
     Raises
     ------
@@ -53,43 +54,43 @@ def observe(model, name, values):
 
 
 class ArmObserver:
-    r"""Turns a sample of the arm into one with modal amplitudes and rates filled in.
+    r"""Estimates modal amplitudes and rates, sample by sample.
 
-    Where the source gives no joint velocity it is the observer's, if that estimates one, else the filtered
+    A joint velocity that the source does not report is the observer's estimate, if it makes one, else the filtered
     derivative of the positions.
 
-    With a `delay`, what is passed on is the state at the stamp plus the delay: the model's motion (`motion`) under
-    the torque that the sample reports, held. Torques that were sent since are not known here.
+    With a `delay`, the estimate is the state at the stamp plus the delay: the model's motion (`motion`) under the
+    reported torque, held. Torques sent since then are unknown here.
 
     Parameters
     ----------
     model : ArmModel
-        The arm as the arm file has it.
+        Model of the arm file's arm.
     observer : Observer
     joint_velocity_bandwidth : float
         [rad/s]
     delay : float
         [s]
     smooth_position : bool
-        Whether `position` is the observer's where it has one.
+        Whether `position` is the observer's estimate, if it makes one.
     calibration_samples, stuck_samples : int
         See `gauge_health.PARAMETERS`.
 
     Attributes
     ----------
     observer : Observer
-        May be replaced whole between two samples.
+        May be replaced between two samples.
     gauges : GaugeHealth or None
-        What is known of each gauge; None for an arm without.
+        Health of each gauge; None for an arm without gauges.
     calibration : BiasCalibration or None
         The last samples, for `calibrate`.
     calibrated : bool
-        Whether strains are mapped with a bias found here; the source's amplitudes, made with the arm file's bias,
-        are no longer used then.
+        Whether the strains are mapped with a bias from `calibrate`. Amplitudes from the source are then ignored,
+        since they are made with the arm file's bias.
     position, velocity : ndarray, shape (n,)
         Of the joints, measured or estimated, predicted ahead by the delay [rad], [rad/s].
     amplitude, rate : ndarray, shape (m,)
-        The observer's, predicted ahead by the delay.
+        The observer's estimate, predicted ahead by the delay.
     """
 
     def __init__(
@@ -115,8 +116,9 @@ class ArmObserver:
         if tuple(observed) != tuple(model.mode_names):
             missing = [n for n in model.mode_names if n not in observed]
             raise ModelError(
-                f"{model.arm.name}: {', '.join(missing)} in links[].flexible but not in observed_modes: the"
-                " controller's arm has just the modes that it observes; lower `modes`"
+                f"of {model.arm.name} lacks {', '.join(missing)}: a controller's arm has only modes that it observes",
+                field="observed_modes",
+                hint="lower `modes` in links[].flexible",
             )
         self.bandwidth, self.delay = joint_velocity_bandwidth, delay
         self.smooth_position = smooth_position
@@ -131,23 +133,23 @@ class ArmObserver:
         self.reason = ""
 
     def step(self, sample):
-        """Take one sample; the control path.
+        """Take one sample, on the control path.
 
         Parameters
         ----------
         sample : ArmSample
-            Its `amplitude` is filled in from the strains when it is None; for an arm without modes there is none.
+            Its `amplitude` is filled in from the strains if it is None.
 
         Returns
         -------
         bool or None
             Whether `velocity`, `amplitude` and `rate` are a converged estimate. A repeated (session, sequence)
-            leaves everything as it was; so does one that comes after a later one, which is None.
+            changes nothing; nor does a sample that is older than the last one, for which it is None.
 
         Raises
         ------
         MessageError
-            When the sample can't be used; the estimate stays as it was.
+            If the sample can't be used; the estimate is unchanged.
         """
         last_stamp = self._order.stamp_ns
         if sample.amplitude is None and not self.model.n_modes:
@@ -159,26 +161,22 @@ class ArmObserver:
         if verdict == SampleOrder.STALE:
             return None
         if verdict == SampleOrder.FOREIGN:
-            raise MessageError(
-                f"two sources send states (sessions {self._order.session} and {sample.session}): stop one of them"
-            )
-        # After a clock that jumped, or a long silence, there is nothing to go on from.
-        gap = sample.stamp_ns - last_stamp > LONGEST_GAP
+            sessions = f"sessions {self._order.session} and {sample.session}"
+            raise MessageError(f"two sources send states ({sessions})", hint="stop one of them")
+        # After a jump of the clock or a long silence the past is useless.
+        gap = sample.stamp_ns - last_stamp > MAX_GAP_NS
         restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
         self._map_strain(sample, restart)
         if restart:
             self.observer.reset()
         dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
-        if self.delay and not restart and not np.isfinite(sample.torque).all():
-            raise MessageError(
-                "joint_torque is unknown (NaN), and observer.delay predicts with it: have the driver report the"
-                " applied torque, or set observer.delay to 0.0"
-            )
+        if self.delay and not restart:
+            need_torque(sample.torque, "observer.delay", "set observer.delay to 0.0")
         if not sample.velocity_known:
             sample.velocity[:] = self._joint_velocity(sample, dt)
         self._update(sample, dt)
         self._pass_on(sample)
-        # Only now: a sample that the observer refused has left nothing behind, its time step included.
+        # Only now, so that a refused sample leaves nothing behind, not even its time step.
         self._order.take(sample)
         self._derivative[:], self._measured[:] = sample.velocity, sample.position
         self._used[:] = sample.amplitude
@@ -186,8 +184,8 @@ class ArmObserver:
             self.calibration.push(sample)
         return self.observer.converged
 
-    def rehearse(self):
-        """Take three samples of an arm at rest, so that compiled code is loaded before it counts; for a fresh one."""
+    def warm_up(self):
+        """Take three samples of an arm at rest, so that compiled code is loaded; discard the observer afterwards."""
         arm = self.model.arm
         sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
         sample.velocity_known, sample.rate = False, np.zeros(self.model.n_modes)
@@ -197,7 +195,7 @@ class ArmObserver:
             self.step(sample)
 
     def _map_strain(self, sample, restart):
-        """Judge the gauges, and fill in the amplitudes where they are this observer's to make."""
+        """Judge the gauges, and fill in the amplitudes unless the source's are used."""
         if sample.strain is None or self.gauges is None:
             return
         if restart:
@@ -210,9 +208,9 @@ class ArmObserver:
                 self.observer.leave_out(self.gauges.lost)
 
     def calibrate(self):
-        """Take the gauges' bias from the last samples, on an arm at rest; not on the control path.
+        """Set the gauges' bias from the last samples, of an arm at rest; not on the control path.
 
-        The estimate moves with it, so that its rates don't jump.
+        The estimate moves with the bias, so that its rates don't jump.
 
         Returns
         -------
@@ -222,10 +220,10 @@ class ArmObserver:
         Raises
         ------
         MessageError, ModelError
-            When there is nothing to calibrate or the arm is not at rest; nothing has changed then.
+            If there is nothing to calibrate or the arm is not at rest; nothing changes then.
         """
         if self.calibration is None:
-            raise MessageError(f"the arm file of {self.model.arm.name} has no gauges")
+            raise MessageError(f"the arm file of {self.model.arm.name} has none", field="gauges")
         old, new = self.strain_map.bias, self.calibration.bias()
         self.strain_map.bias = new
         self.calibrated = True
@@ -235,7 +233,7 @@ class ArmObserver:
         return old, new
 
     def _pass_on(self, sample):
-        """Fill in what is passed on: the observer's estimate, or the sample's own, ahead by the delay; or refuse."""
+        """Set the output: the observer's estimate or the sample's values, predicted ahead by the delay."""
         observer = self.observer
         smooth = self.smooth_position and observer.joint_position is not None
         estimated = not sample.velocity_known and observer.joint_velocity is not None
@@ -250,10 +248,11 @@ class ArmObserver:
         if self.delay and observer.converged:
             x = self._predicted(x, sample.torque)
         if not np.isfinite(x).all():
-            # From what is no number it would never come back.
+            # It would stay so for ever.
             observer.reset()
+            name = type(observer).__name__
             raise MessageError(
-                f"observer {type(observer).__name__} has lost the arm: its estimate is not finite; it begins anew"
+                "has lost the arm: its estimate is not finite", field=f"observer {name}"
             )
         start = 0
         for group in (self.position, self.amplitude, self.velocity, self.rate):
@@ -261,8 +260,8 @@ class ArmObserver:
             start += group.size
 
     def _predicted(self, x, torque):
-        """A state ahead by the delay."""
-        count = int(np.ceil(self.delay / LONGEST_PREDICTION))
+        """Return the state after the delay."""
+        count = int(np.ceil(self.delay / MAX_PREDICTION))
         part = self.delay / count
         for _ in range(count):
             x = self._motion.advance(x, torque, part, self._motion.step_for(part, x[: torque.size]))
@@ -273,10 +272,10 @@ class ArmObserver:
             self.observer.update(sample, dt)
         except MessageError:
             raise
-        except Exception as error:  # anybody's observer: it costs this sample, not the node
-            name = type(self.observer).__name__
+        except Exception as error:  # of third-party code: it costs this sample, not the node
             raise MessageError(
-                f"observer {name} failed: {type(error).__name__}: {error}"
+                f"failed: {type(error).__name__}: {error}",
+                field=f"observer {type(self.observer).__name__}",
             ) from error
 
     def _check(self, sample):
@@ -287,19 +286,23 @@ class ArmObserver:
         if sample.amplitude is not None:
             check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
         elif sample.strain is None:
-            raise MessageError("neither strain nor modal_amplitude is given: one of them is needed")
-        else:
-            if self.strain_map is None:
-                raise MessageError(
-                    f"strain is given, but the arm file of {arm.name} has no gauges to map it"
-                )
+            raise MessageError(
+                "neither strain nor modal_amplitude is given", hint="give one of them"
+            )
+        elif self.strain_map is None:
+            raise MessageError(
+                f"can't be mapped: the arm file of {arm.name} has no gauges", field="strain"
+            )
         if sample.rate is not None:
             check_finite(sample.rate, self.model.mode_names, "modal_rate")
-        wild = np.abs(sample.torque) >= HUGE_TORQUE  # false for NaN, which means unknown
+        wild = np.abs(sample.torque) >= MAX_TORQUE  # false for NaN, which means unknown
         if wild.any():
             i = int(np.argmax(wild))
             raise MessageError(
-                f"joint_torque of {self.model.joint_names[i]} is {sample.torque[i]}: no torque of an arm"
+                "is beyond any arm's torque",
+                field=f"joint_torque of {self.model.joint_names[i]}",
+                value=float(sample.torque[i]),
+                limit=MAX_TORQUE,
             )
 
     def _joint_velocity(self, sample, dt):
@@ -311,8 +314,8 @@ class ArmObserver:
 
 
 #: After a longer silence an observer starts afresh [ns].
-LONGEST_GAP = 500_000_000
+MAX_GAP_NS = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].
-LONGEST_PREDICTION = 0.01
-#: Torques beyond this are none [N m].
-HUGE_TORQUE = 1e9
+MAX_PREDICTION = 0.01
+#: A larger torque can't be that of an arm [N m].
+MAX_TORQUE = 1e9

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an observer is."""
+"""Base class of observers."""
 
 from abc import ABC, abstractmethod
 
 import numpy as np
+
+from flexarm_dynamics.errors import MessageError
 
 from ..component import Component
 
@@ -17,7 +19,7 @@ class Observer(Component, ABC):
     Parameters
     ----------
     model : ArmModel
-        The arm as the observer believes it to be.
+        The observer's model of the arm.
     parameters : dict
         Checked values of `PARAMETERS`, arrays at full length.
 
@@ -26,22 +28,22 @@ class Observer(Component, ABC):
     amplitude, rate : ndarray, shape (m,)
         The estimate.
     innovation : ndarray, shape (m,) or (0,)
-        Measured minus predicted amplitude, where the observer predicts one.
+        Measured minus predicted amplitude, if the observer predicts one.
     covariance_diagonal : ndarray, shape (2m,) or (0,)
-        Where the observer has one.
+        Variances of amplitudes and rates, if the observer has them.
     converged : bool
         Whether the estimate may be used for control.
     joint_position, joint_velocity : ndarray, shape (n,), or None
-        The estimate of the joints [rad], [rad/s], where the observer makes one.
+        The estimate of the joints [rad], [rad/s], if the observer makes one.
     innovation_squared : float
         Normalised innovation squared of the last sample [-], whose mean is the number of measurements if the
         noise is as assumed; NaN where the observer has none.
     consistent : bool
         False while the innovations are larger than the assumed noise explains.
     gauges_lost : tuple of int
-        Gauges that the amplitudes are made without, as `leave_out` was told; indices, ascending.
+        Gauges that the amplitudes are made without, see `leave_out`; indices, ascending.
     parameters_estimated : dict of str to float
-        What the observer estimates of the arm itself; the name has the unit.
+        Estimated parameters of the arm itself; the name has the unit.
     """
 
     joint_position = joint_velocity = None
@@ -64,16 +66,16 @@ class Observer(Component, ABC):
         self.converged, self._elapsed = False, -1.0
 
     def resume(self, other):
-        """Go on from another observer's estimate: a redesign does not begin anew."""
+        """Continue from another observer's estimate, so that a redesign does not start afresh."""
         self.amplitude[:], self.rate[:] = other.amplitude, other.rate
         self.converged, self._elapsed = other.converged, other._elapsed
 
     def leave_out(self, lost):
-        """From the next sample on the amplitudes are made without these gauges: they are noisier."""
+        """Expect noisier amplitudes from the next sample on: they are made without these gauges."""
         self.gauges_lost = lost
 
     def rest_at(self, amplitude):
-        """The arm is at rest, bent by these amplitudes (m,): the gauges' bias has just been found."""
+        """Continue at rest with these amplitudes (m,): the gauges' bias has just been calibrated."""
         self.amplitude[:] = amplitude
 
     @abstractmethod
@@ -87,3 +89,13 @@ class Observer(Component, ABC):
         dt : float
             True time since the last sample [s]; 0.0 for the first one.
         """
+
+
+def need_torque(torque, what, hint):
+    """Refuse a sample without torque, (n,): `what` predicts with it."""
+    if not np.isfinite(torque).all():
+        raise MessageError(
+            f"is unknown (NaN), and {what} predicts with it",
+            field="joint_torque",
+            hint=f"have the driver report the applied torque, or {hint}",
+        )

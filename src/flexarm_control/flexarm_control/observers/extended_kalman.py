@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Extended Kalman filter of joints, modes, and what is not known of the arm: payload and joint friction.
+r"""Extended Kalman filter of joints, modes, and unknown parameters of the arm: payload and joint friction.
 
-The state of `kalman` is augmented by parameters that walk slowly at random:
+The state of `kalman` is augmented by parameters, each a slow random walk:
 
 .. math::
     \dot x = f(x, u, \theta), \qquad \dot\theta = w, \qquad
     \theta = (s,\ b_1 \ldots b_n,\ c_1 \ldots c_n)
 
-with s the scale of the payload, its mass and inertia alike, and the friction torque
-:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` of each joint in place of the arm file's. Mass matrix and forces
-are affine in s, so that with :math:`M_1, a_1` of the arm as in its file and :math:`M_2, a_2` of the arm with twice
-the payload (mode shapes held) the acceleration is, exactly,
+with s the scale of the payload's mass and inertia, and the friction torque
+:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` of each joint instead of the arm file's. Mass matrix and forces
+are affine in s. Therefore, with :math:`M_1, a_1` of the arm file's arm and :math:`M_2, a_2` of the arm with twice
+the payload (same mode shapes), the acceleration is exactly
 
 .. math:: a = [(2 - s)M_1 + (s - 1)M_2]^{-1}[(2 - s)M_1a_1 + (s - 1)M_2a_2] .
 
 The prediction is the exponential Euler step of `motion` on f, with the Jacobian :math:`\partial(f, w)/\partial(x,
-\theta)` at the estimate itself, by central differences, taken anew every ``relinearise`` seconds.
-Measurement and update are those of `kalman`. Estimates stay inside bounds: no negative mass or friction.
+\theta)` at the estimate itself, by central differences, recomputed every ``relinearise`` seconds.
+Measurement and update are those of `kalman`. Estimates stay within bounds: no negative mass or friction.
 
-A parameter is found only where the motion excites it: friction at rest is not observable, nor is a payload. It
-costs milliseconds per linearisation: for records, and for arms sampled slowly; see docs/observers.md.
+A parameter is found only if the motion excites it: at rest neither friction nor payload is observable. A
+linearisation takes milliseconds, so use it on records, or for arms sampled slowly; see docs/observers.md.
 """
 
 import numpy as np
@@ -41,7 +41,7 @@ def _size(name, default, unit, what):
 
 
 #: Bounds of the estimates: scale of the payload [-], viscous [N m s/rad] and Coulomb friction [N m].
-LARGEST_SCALE, LARGEST_FRICTION = 20.0, 1e6
+MAX_SCALE, MAX_FRICTION = 20.0, 1e6
 
 
 class ExtendedKalman(Kalman):
@@ -88,21 +88,21 @@ class ExtendedKalman(Kalman):
         self._heavier = None
         if values["estimate_payload"]:
             self._heavier = _twice_loaded(model)
-            add(["payload scale [-]"], "payload", [1.0], LARGEST_SCALE)
+            add(["payload scale [-]"], "payload", [1.0], MAX_SCALE)
         self._viscous_at, self._coulomb_at = slice(0, 0), slice(0, 0)
         for column, kind, unit in ((0, "viscous", "N m s/rad"), (1, "coulomb", "N m")):
             if values[f"estimate_{kind}"]:
                 at = slice(len(names), len(names) + n)
                 setattr(self, f"_{kind}_at", at)
                 labels = [f"{kind} friction of {j} [{unit}]" for j in joints]
-                add(labels, kind, self._friction[:, column], LARGEST_FRICTION)
+                add(labels, kind, self._friction[:, column], MAX_FRICTION)
         self.names, self._first = tuple(names), np.array(start)
         self._deviation, self._drift = np.array(deviation), np.array(drift)
         self._high = np.array(high)
         size = 2 * self._p + len(names)
         self.state, self.covariance = np.zeros(size), np.zeros((size, size))
         self._design, self._age = None, 0.0
-        self._tell()
+        self._report()
 
     def reset(self):
         super().reset()
@@ -112,7 +112,7 @@ class ExtendedKalman(Kalman):
         same = isinstance(other, ExtendedKalman) and other.names == self.names
         if same:
             super().resume(other)
-            self._tell()
+            self._report()
         else:
             self.reset()
 
@@ -121,15 +121,15 @@ class ExtendedKalman(Kalman):
         super()._start(sample)
         self.state[N:] = self._first
         np.fill_diagonal(self.covariance[N:, N:], self._deviation**2)
-        self._tell()
+        self._report()
 
     def update(self, sample, dt):
         super().update(sample, dt)
         parameters = self.state[2 * self._p :]
         np.clip(parameters, 0.0, self._high, out=parameters)
-        self._tell()
+        self._report()
 
-    def _tell(self):
+    def _report(self):
         N = 2 * self._p
         deviation = np.sqrt(np.diagonal(self.covariance)[N:])
         for name, value, sigma in zip(self.names, self.state[N:], deviation, strict=True):
@@ -175,11 +175,13 @@ class ExtendedKalman(Kalman):
 
 
 def _twice_loaded(model):
-    """The arm with twice its payload, in the same mode shapes: the equations of motion are affine in it."""
+    """The arm with twice its payload and the same mode shapes: the equations of motion are affine in it."""
     payload = model.arm.payload
     if not payload.mass > 0.0:
         raise DesignError(
-            f"{model.arm.name}: payload.mass is {payload.mass}, and estimate_payload estimates its scale: give the"
-            " arm file the payload that is expected, or set observer.estimate_payload to false"
+            f"of {model.arm.name} has no scale that could be estimated",
+            field="payload.mass",
+            value=payload.mass,
+            hint="give the arm file the expected payload, or set observer.estimate_payload to false",
         )
     return model.with_payload(2.0)

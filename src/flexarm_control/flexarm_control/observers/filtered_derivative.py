@@ -9,7 +9,7 @@ discretised exactly for a deflection that moves linearly between samples, with t
     \hat{\dot\delta}_k = s_k + (\hat{\dot\delta}_{k-1} - s_k)\,e^{-\omega_c h},
     \qquad s_k = (\delta_k - \delta_{k-1})/h .
 
-It needs no model. It delays a slow rate by 1/omega_c + omega_c h^2/12, and amplifies noise by omega_c.
+It needs no model. A slow rate is delayed by 1/omega_c + omega_c h^2/12, and noise is amplified by omega_c.
 (Sangveraphunsiri 1984 after Siciliano & Book 1986.)
 """
 

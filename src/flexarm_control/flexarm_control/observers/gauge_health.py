@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Strain gauges that fail, and their bias at rest.
+r"""Detects failed strain gauges, and calibrates their bias at rest.
 
 A reading :math:`\varepsilon_i` of gauge i is
 
 - missing when it is not finite,
-- saturated when it stands at an end of the bridge's range,
-- stuck when it has been the same to the last bit for `stuck_samples` samples in which the others of its link and
-  direction, two of them where there are two, travelled so far that it must have moved: by more than 8 of its
-  resolutions, for whichever mode strains it least beside them,
+- saturated when it is at an end of the bridge's range,
+- stuck when it has been the same to the last bit for `stuck_samples` samples, in which the others of its link and
+  direction (two of them, if there are two) moved so far that it must have moved too: by more than 8 of its
+  resolutions, even in the mode that strains it least relative to them,
 - suspect when it does not fit the others: with more gauges than modes, the residual
   :math:`r = \varepsilon - b - R\hat\delta` of weighted least squares has the variance
   :math:`\sigma_i^2(1-H_{ii})`, with :math:`H = R(R^TWR)^{-1}R^TW`; the mean square of
-  :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and the one that is wrong has the largest.
+  :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and the wrong gauge has the largest.
 
-The first three are left out of the strain map where the others still give every observed mode; otherwise the
-sample is refused: fewer gauges than modes give no amplitudes. A suspect one is reported and kept: modes that are
-not observed make residuals too.
+Missing, saturated and stuck gauges are left out of the strain map if the others still give every observed mode.
+Otherwise the sample is refused, since fewer gauges than modes give no amplitudes. A suspect gauge is reported but
+still used: unobserved modes cause residuals too.
 
 The bias of a gauge on an arm at rest is what it reads beyond the strain of the arm's own weight,
 
@@ -46,17 +46,17 @@ PARAMETERS = (
 
 
 def resolution(gauges):
-    """Least strain that each reading can be trusted to tell, shape (gauges,) [strain].
+    """Resolution of each gauge, shape (gauges,) [strain].
 
-    Its noise and rounding; a thousandth of full scale where the arm file states neither.
+    Its noise and rounding; a thousandth of full scale if the arm file states neither.
     """
     return np.array([g.uncertainty or 1e-3 * g.full_scale for g in gauges])
 
 
-def least_travel(rows, gauges):
+def min_travel(rows, gauges):
     """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
 
-    Zero for gauges of different links or directions, and for a gauge beside itself.
+    Zero for gauges of different links or directions, and on the diagonal.
 
     `rows` are the gauges' rows of the strain map, (gauges, modes).
     """
@@ -91,7 +91,7 @@ class GaugeHealth:
         Gauges left out of the last amplitudes; indices, ascending.
     """
 
-    #: Resolutions by which a gauge must have moved to be called stuck; noise of n samples spans about as many.
+    #: A gauge is stuck if it should have moved by this many resolutions; noise spans about as many.
     TRAVEL = 8.0
     #: Rms residual, in its own standard deviations, beyond which a gauge is suspect.
     RESIDUAL = 6.0
@@ -102,14 +102,14 @@ class GaugeHealth:
         self.names = model.arm.gauge_names
         self._low, self._high = np.array([g.range for g in gauges]).reshape(-1, 2).T
         self._resolution = resolution(gauges)
-        self._least = least_travel(strain_map.rows, gauges)
+        self._min_travel = min_travel(strain_map.rows, gauges)
         places = [(g.link, g.direction) for g in gauges]
-        # One other gauge that jumps is broken itself; two have seen the arm move.
-        self._witnesses = np.clip((self._least > 0.0).sum(axis=1), 1, min(2, len(gauges)))
+        # A single gauge that jumps may be broken itself; two have seen the arm move.
+        self._witnesses = np.clip((self._min_travel > 0.0).sum(axis=1), 1, min(2, len(gauges)))
         self._mates = np.array([[a == b for b in places] for a in places])
         free = 1.0 - np.einsum("ij,ji->i", strain_map.rows, strain_map.inverse)
         redundant = free > 1e-6
-        # A residual's mean square is one; a gauge that no other one checks has none.
+        # The mean square of a residual is one; a gauge that no other one checks has none.
         self._weight = np.where(
             redundant, 1.0 / (self._resolution**2 * np.maximum(free, 1e-6)), 0.0
         )
@@ -119,22 +119,22 @@ class GaugeHealth:
         self._mapped = np.zeros(len(strain_map.mode_names))
         self._last, self._same = np.zeros(count), np.zeros(count, int)
         self._hold = np.zeros(count, int)
-        self._least_seen, self._most_seen = np.zeros((2, count, count))
+        self._min_seen, self._max_seen = np.zeros((2, count, count))
         self._square = np.zeros(count)
         self.reset()
 
     def reset(self):
-        """Forget the past: a new session of the source."""
+        """Forget the past, for a new session of the source."""
         self.health[:] = GOOD
         self.lost = ()
         self._last[:] = np.nan
         self._same[:] = 0
         self._hold[:], self._holding = 0, False
-        self._least_seen[:], self._most_seen[:] = np.nan, np.nan
+        self._min_seen[:], self._max_seen[:] = np.nan, np.nan
         self._square[:] = 0.0
 
     def update(self, strain):
-        """Judge the readings, shape (gauges,), of a new sample; the control path."""
+        """Judge the readings, shape (gauges,), of a new sample, on the control path."""
         self.health[:] = GOOD
         outside = ~((strain > self._low) & (strain < self._high))  # NaN too
         self.health[self._stuck(strain, outside)] = STUCK
@@ -154,21 +154,21 @@ class GaugeHealth:
         self._last[:] = strain
         if moved.all():
             self._same[:] = 0
-            self._most_seen[:] = self._least_seen[:] = np.where(bad, np.nan, strain)
+            self._max_seen[:] = self._min_seen[:] = np.where(bad, np.nan, strain)
             return []
         self._same += 1
         self._same[moved] = 0
         # How far every gauge has travelled since gauge i last moved.
         seen = np.where(bad, np.nan, strain)
-        self._most_seen[moved] = seen
-        self._least_seen[moved] = seen
-        np.fmax(self._most_seen, seen, out=self._most_seen)
-        np.fmin(self._least_seen, seen, out=self._least_seen)
+        self._max_seen[moved] = seen
+        self._min_seen[moved] = seen
+        np.fmax(self._max_seen, seen, out=self._max_seen)
+        np.fmin(self._min_seen, seen, out=self._min_seen)
         still = self._same >= self.stuck_samples
         if not still.any():
             return []
-        travel = self._most_seen - self._least_seen - self.TRAVEL * self._resolution
-        travel = np.sort(np.nan_to_num(self._least * travel), axis=1)
+        travel = self._max_seen - self._min_seen - self.TRAVEL * self._resolution
+        travel = np.sort(np.nan_to_num(self._min_travel * travel), axis=1)
         travel = travel[np.arange(travel.shape[0]), -self._witnesses]
         return still & (travel > self.TRAVEL * self._resolution)
 
@@ -179,18 +179,18 @@ class GaugeHealth:
         self._square += (residual**2 * self._weight - self._square) / self.stuck_samples
         if not (self._square > self.RESIDUAL**2).any():
             return
-        # A wrong gauge spoils the others' residuals too: the largest of its link and direction is named.
+        # A wrong gauge spoils the others' residuals too, so only the largest of its link and direction is suspect.
         largest = np.where(self._mates, self._square, 0.0).max(axis=1)
         suspect = (self._square > self.RESIDUAL**2) & (self._square > 0.99 * largest)
         self.health[suspect] = SUSPECT
 
     def amplitudes(self, strain, out=None):
-        """Modal amplitudes from the gauges that can be trusted, shape (modes,) [m, rad].
+        """Modal amplitudes from the usable gauges, shape (modes,) [m, rad].
 
         Raises
         ------
         MessageError
-            When these don't give all observed modes; names gauges and modes.
+            If these don't give all observed modes; with gauges and modes.
         """
         self.lost = ()
         if self._holding:
@@ -198,25 +198,27 @@ class GaugeHealth:
         return self.strain_map.amplitudes_without(self.lost, strain, out)
 
     def _left_out(self, strain):
-        # One that was bad comes back after a while, so that a loose wire does not switch maps at each contact.
+        # A bad gauge comes back after a while only, so that a loose wire does not switch maps at each contact.
         held = tuple(np.flatnonzero(self._hold).tolist())
         if self.strain_map.possible_without(held):
             return held
         bad = tuple(np.flatnonzero(self._bad()).tolist())
         if self.strain_map.possible_without(bad):
             return bad
-        what = ", ".join(
-            f"strain of {self.names[i]} is {strain[i]} ({WORDS[self.health[i]]})" for i in bad
-        )
+        lost = ", ".join(f"{self.names[i]} ({WORDS[self.health[i]]})" for i in bad)
         modes = ", ".join(self.strain_map.unobservable_without(bad))
         left = ", ".join(n for i, n in enumerate(self.names) if i not in bad)
-        raise MessageError(f"{what}: without, the gauges ({left or 'none'}) can't give {modes}")
+        raise MessageError(
+            f"can't be used: without {lost} the gauges ({left or 'none'}) can't give {modes}",
+            field=f"strain of {self.names[bad[0]]}",
+            value=float(strain[bad[0]]),
+        )
 
     def _bad(self):
         return (self.health != GOOD) & (self.health != SUSPECT)
 
     def warnings(self):
-        """One sentence on every gauge that is not good; empty when all are."""
+        """One sentence for every gauge that is not good."""
         found = []
         for i, name in enumerate(self.names):
             state = self.health[i]
@@ -234,20 +236,20 @@ class GaugeHealth:
 
 
 class BiasCalibration:
-    """Bias of the gauges from the last samples, on an arm at rest.
+    """Computes the bias of the gauges from the last samples, of an arm at rest.
 
     Parameters
     ----------
     model : ArmModel
     strain_map : StrainMap
-        Whose bias is to be found; `rows` and gauge names are its.
+        With the rows of the gauges.
     samples : int
-        How many the mean is taken of.
+        How many samples are averaged.
     """
 
     #: Mean joint speed [rad/s], and span of the joint angle beyond two encoder counts [rad], of an arm at rest.
     REST_SPEED, REST_ANGLE = 0.01, 2e-3
-    #: Rms strain about the mean, in resolutions, and span of a torque as a part of its limit, at rest.
+    #: Rms strain about the mean, in resolutions, and span of a torque as a fraction of its limit, at rest.
     REST_STRAIN, REST_TORQUE = 4.0, 0.05
 
     def __init__(self, model, strain_map, samples=200):
@@ -267,11 +269,11 @@ class BiasCalibration:
         self.reset()
 
     def reset(self):
-        """Forget the samples: a new session of the source."""
+        """Forget the samples, for a new session of the source."""
         self.count, self._next = 0, 0
 
     def push(self, sample):
-        """Keep a sample that has strains; the control path."""
+        """Keep a sample that has strains, on the control path."""
         k = self._next
         self._position[k], self._velocity[k] = sample.position, sample.velocity
         self._torque[k], self._strain[k] = sample.torque, sample.strain
@@ -289,13 +291,17 @@ class BiasCalibration:
         Raises
         ------
         MessageError
-            When there are too few samples, a gauge is bad, or the arm is not at rest; says which and by how much.
+            If there are too few samples, a gauge is bad, or the arm is not at rest.
         ModelError
-            When the arm has no static deflection here.
+            If the arm has no static deflection here.
         """
         if self.count < self.samples:
             raise MessageError(
-                f"not enough samples yet ({self.count} of {self.samples}): call again"
+                "are not enough samples yet",
+                field="calibration_samples",
+                value=self.count,
+                limit=self.samples,
+                hint="call again",
             )
         self._check_gauges()
         self._check_rest()
@@ -304,8 +310,11 @@ class BiasCalibration:
         for name, b, high in zip(self.model.arm.gauge_names, found, self._ranges[1], strict=True):
             if not abs(b) < high:
                 raise MessageError(
-                    f"gauge {name}: a bias of {1e6 * b:.1f} microstrain is beyond its full scale: check the"
-                    " bridge, and the payload and gravity of the arm file"
+                    "microstrain is beyond full scale",
+                    field=f"bias of {name}",
+                    value=float(1e6 * b),
+                    limit=float(1e6 * high),
+                    hint="check the bridge, and the payload and gravity of the arm file",
                 )
         return found
 
@@ -313,7 +322,9 @@ class BiasCalibration:
         """Amplitudes of the observed modes under the arm's own weight [m, rad]."""
         delta = self.model.static_deflection(q)
         if not np.isfinite(delta).all():
-            raise ModelError(f"{self.model.arm.name} has no static deflection at q = {q.tolist()}")
+            raise ModelError(
+                f"has no static deflection of {self.model.arm.name}", field="q", value=q.tolist()
+            )
         names = self.model.mode_names
         return np.array([delta[names.index(n)] for n in self.strain_map.mode_names])
 
@@ -323,41 +334,38 @@ class BiasCalibration:
             values = self._strain[:, i]
             if not np.isfinite(values).all():
                 raise MessageError(
-                    f"gauge {name} is missing: nothing to calibrate; check its wires"
+                    "is missing", field=f"strain of {name}", hint="check the wires of the gauge"
                 )
             if values.min() <= low[i] or values.max() >= high[i]:
                 raise MessageError(
-                    f"gauge {name} is saturated at {1e6 * values[-1]:.1f} microstrain: balance the bridge first"
+                    "microstrain is at the end of the range",
+                    field=f"strain of {name}",
+                    value=float(1e6 * values[-1]),
+                    hint="balance the bridge first",
                 )
 
     def _check_rest(self):
         arm = self.model.arm
+        max_torque = self.REST_TORQUE * np.array([j.limits.torque for j in arm.joints])
+        max_strain = self.REST_STRAIN * self._resolution
         speed = np.abs(self._velocity.mean(axis=0))
-        span = np.ptp(self._position, axis=0)
-        for joint, v, s, most in zip(arm.joints, speed, span, self._span, strict=True):
-            if not v <= self.REST_SPEED:
-                raise MessageError(
-                    f"{joint.name} moves at {v:.3g} rad/s, at most {self.REST_SPEED:g} is rest: call again at rest"
-                )
-            if not s <= most:
-                raise MessageError(
-                    f"{joint.name} moved by {s:.3g} rad, at most {most:.3g} is rest: call again at rest"
-                )
         torque = np.ptp(self._torque, axis=0)  # NaN where the source does not know it
-        for joint, t in zip(arm.joints, torque, strict=True):
-            most = self.REST_TORQUE * joint.limits.torque
-            if t > most:
+        rest_speed = np.full(speed.size, self.REST_SPEED)
+        for field, names, values, limits, unit in (
+            ("velocity", arm.joint_names, speed, rest_speed, "rad/s"),
+            ("change of position", arm.joint_names, np.ptp(self._position, axis=0), self._span, "rad"),
+            ("change of torque", arm.joint_names, np.where(np.isnan(torque), 0.0, torque), max_torque, "N m"),
+            ("rms strain", arm.gauge_names, 1e6 * self._strain.std(axis=0), 1e6 * max_strain, "microstrain"),
+        ):  # fmt: skip
+            moving = ~(values <= limits)  # NaN too
+            if moving.any():
+                i = int(np.argmax(moving))
                 raise MessageError(
-                    f"the torque of {joint.name} changed by {t:.3g} N m, at most {most:.3g} is rest:"
-                    " call again at rest"
-                )
-        rms = self._strain.std(axis=0)
-        for name, r, one in zip(arm.gauge_names, rms, self._resolution, strict=True):
-            most = self.REST_STRAIN * one
-            if not r <= most:
-                raise MessageError(
-                    f"the strain of {name} varies by {1e6 * r:.3g} microstrain rms, at most {1e6 * most:.3g} is"
-                    " rest: the arm swings; call again at rest"
+                    f"{unit} is not rest",
+                    field=f"{field} of {names[i]}",
+                    value=float(f"{values[i]:.3g}"),
+                    limit=float(f"{limits[i]:.3g}"),
+                    hint="call again at rest",
                 )
 
     def error(self):
@@ -366,7 +374,7 @@ class BiasCalibration:
 
 
 def calibration_text(names, old, new, samples):
-    """What was found, in microstrain."""
+    """Describe a calibration, in microstrain."""
     each = ", ".join(
         f"{n} {1e6 * b:+.2f} (was {1e6 * a:+.2f})" for n, a, b in zip(names, old, new, strict=True)
     )
@@ -374,5 +382,5 @@ def calibration_text(names, old, new, samples):
 
 
 def calibration_yaml(names, bias):
-    """What to put into the arm file's gauges; one line each."""
+    """Lines for the gauges of the arm file."""
     return "\n".join(f"bias: {b:.4e}  # gauge {n}" for n, b in zip(names, bias, strict=True))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Kalman filter of joints and modes, from noise levels in physical units.
 
-The state x = (q, delta, qd, delta_d) moves as `motion` has it, under the torque that was applied and under unknown
-white forces: torque of density ``torque_noise`` at the joints, ``modal_force_noise`` on the modes. Measured are the
-joint positions and the modal amplitudes, y = C x = (q, delta) + v, each sample; joint velocities are not needed.
+The state x = (q, delta, qd, delta_d) moves as in `motion`, under the applied torque and under unknown white forces:
+torque of density ``torque_noise`` at the joints, ``modal_force_noise`` on the modes. Each sample measures the joint
+positions and the modal amplitudes, y = C x = (q, delta) + v. Joint velocities are not needed.
 With P the covariance of the error,
 
 .. math::
@@ -11,17 +11,17 @@ With P the covariance of the error,
     S &= C P^- C^T + R, & K &= P^- C^T S^{-1}, \\
     x &= x^- + K\nu, \quad \nu = y - C x^-, & P &= (I - KC)P^-(I - KC)^T + K R K^T
 
-(Joseph's form: positive whatever the rounding). R has the encoders' variance and, for the amplitudes, the gauges'
-noise through the strain map: :math:`R_\delta = W\,\mathrm{diag}(\sigma_i^2)\,W^T` with W its weighted inverse and
-the strain's gain in it. An encoder of N counts rounds to steps of :math:`2\pi/N`: variance step^2/12, as if white,
-which it is while the joint moves more than a step per sample and is not at rest.
+(Joseph's form, which stays positive despite rounding). R contains the encoders' variance and, for the amplitudes, the
+gauges' noise through the strain map: :math:`R_\delta = W\,\mathrm{diag}(\sigma_i^2)\,W^T` with its weighted inverse W,
+which includes the gain. An encoder of N counts rounds to steps of :math:`2\pi/N`. Its variance step^2/12 is taken as
+white, which is right while the joint moves by more than a step per sample, and wrong at rest.
 
-Lost samples only make the step longer; P grows as it should, the torque is taken as constant over the gap.
-The normalised innovation squared :math:`\nu^T S^{-1}\nu` is chi-squared of n + m degrees of freedom if all is as
-assumed. `consistent` turns False when over a tenth of the last fifty or so exceed the 99.9 % bound: then noise
-levels are set too low, or the model is not this arm's.
+Lost samples make the step longer: P grows accordingly, and the torque is held over the gap.
+The normalised innovation squared :math:`\nu^T S^{-1}\nu` is chi-squared with n + m degrees of freedom if all
+assumptions hold. `consistent` becomes False when more than a tenth of the last fifty or so exceed the 99.9 % bound:
+then the noise levels are too low, or the model is wrong.
 
-The recursion of P does not depend on what is measured: once it has settled, at one time step in one configuration,
+The recursion of P does not depend on the measurements. Once it has settled, for one time step and configuration,
 gain and covariance are kept until either changes.
 """
 
@@ -33,7 +33,7 @@ from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import parameter
 
-from .base import Observer
+from .base import Observer, need_torque
 from .motion import Motion
 
 NOISE = (
@@ -54,7 +54,7 @@ NOISE = (
     ),
 )
 
-#: Where neither arm file nor parameter states a noise: a good bridge's [strain], a fine encoder's [rad].
+#: Noise if neither arm file nor parameter gives one: of a good bridge [strain], of a fine encoder [rad].
 UNSTATED_STRAIN, UNSTATED_POSITION = 1e-6, 1e-5
 
 
@@ -76,11 +76,11 @@ class Kalman(Observer):
 
     #: Deviation of the first sample's rates from zero [rad/s, m/s].
     START = 1.0
-    #: The estimate has converged once no rate's variance falls by more than this share per sample.
+    #: The estimate has converged once no rate's variance falls by more than this fraction per sample.
     SETTLED = 0.1
-    #: P has settled once no variance changes by more than this share per sample.
+    #: P has settled once no variance changes by more than this fraction per sample.
     STEADY = 1e-9
-    #: Innovations beyond this quantile are counted; over `TOO_MANY` of the recent ones (1/RECENT): inconsistent.
+    #: Inconsistent: more than a fraction `TOO_MANY` of the last 1/`RECENT` innovations are beyond this quantile.
     QUANTILE, TOO_MANY, RECENT = 0.999, 0.1, 0.02
 
     def __init__(self, model, parameters):
@@ -90,7 +90,6 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
-        # That of all gauges, and of every set of them that was in use.
         self._strain_map = StrainMap(model) if model.arm.gauges else None
         self.measurement_covariance = measurement_covariance(
             model, self.parameters, self._strain_map
@@ -119,7 +118,7 @@ class Kalman(Observer):
 
     def resume(self, other):
         if not isinstance(other, Kalman) or other.state.size < self.state.size:
-            self.reset()  # nothing known of the joints: the next sample is the first
+            self.reset()  # it has no estimate of the joints: the next sample is the first
             return
         super().resume(other)
         size = self.state.size
@@ -129,7 +128,7 @@ class Kalman(Observer):
         self._publish()
 
     def leave_out(self, lost):
-        """As `Observer.leave_out`: R is that of the gauges that are left."""
+        """As `Observer.leave_out`: R becomes that of the remaining gauges."""
         super().leave_out(lost)
         if lost not in self._covariances:
             self._covariances[lost] = measurement_covariance(
@@ -139,7 +138,7 @@ class Kalman(Observer):
         self._steady = False
 
     def rest_at(self, amplitude):
-        """As `Observer.rest_at`: the next innovation is none of the bias, which the filter had made motion of."""
+        """As `Observer.rest_at`: the old bias, which looked like motion, is in no later innovation."""
         n, p = self._n, self._p
         self.state[n:p], self.state[p : 2 * p] = amplitude, 0.0
         self._publish()
@@ -150,14 +149,10 @@ class Kalman(Observer):
         if self._elapsed < 0.0:
             self._start(sample)
             return
-        if not np.isfinite(sample.torque).all():
-            raise MessageError(
-                f"joint_torque is unknown (NaN), and observer.type {self.NAME} predicts with it:"
-                " have the driver report the applied torque, or use filtered_derivative"
-            )
+        need_torque(sample.torque, f"observer.type {self.NAME}", "use filtered_derivative")
         before = np.diagonal(self.covariance)[self._p : 2 * self._p].copy()
         x, step = self._predict(sample.torque, dt)
-        # Nothing is assigned before all is computed: a failure leaves no trace.
+        # Nothing is assigned before everything is computed: a failure changes nothing.
         innovation = measured - x[: self._p]
         if step is not self._step or not self._steady:
             self._recursion(step)
@@ -197,8 +192,9 @@ class Kalman(Observer):
         root, failed = dpotrf(seen[:, :p] + R, lower=1)
         if failed:
             raise MessageError(
-                "the covariance of the innovation is not positive definite: the time step is too long for this"
-                " arm's model, or a noise level is too small"
+                "is not positive definite",
+                field="covariance of the innovation",
+                hint="the time step is too long for this arm's model, or a noise level is too small",
             )
         gain = dpotrs(root, seen, lower=1)[0]  # K^T
         P = P - gain.T @ seen
@@ -235,9 +231,9 @@ def measurement_covariance(model, parameters, strain_map=None, lost=()):
     parameters : mapping
         ``strain_noise``, ``position_noise`` and ``amplitude_noise``.
     strain_map : StrainMap, optional
-        Of the model, where it has been made.
+        Of the model, if it exists already.
     lost : tuple of int
-        Gauges that the amplitudes are made without; the others suffice.
+        Gauges that the amplitudes are made without; the others must suffice.
     """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))

@@ -16,21 +16,20 @@ The amplitudes are measured, the rates are predicted and corrected by the predic
     + L\,[\delta_k - \Phi_{11}\delta_{k-1} - \Phi_{12}\hat{\dot\delta}_{k-1} - \Gamma_1 u],
 
 with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`, which leaves the error
-:math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes, whatever the time step up to a quarter period of the
-fastest mode. Over a longer gap (lost samples) the rates are predicted and not corrected, L = 0.
+:math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes and for any time step up to a quarter period of the
+fastest mode. Over a longer gap (lost samples) the rates are predicted but not corrected, L = 0.
 
-The joint torque is the one that was applied, from the sample. What (6) has in g2, friction and gravity, goes
-with it: u stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
+The joint torque is the applied one, from the sample. Friction and gravity, which are in g2 of (6), act with it: u
+stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
 """
 
 import numpy as np
 
-from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.linear import sampled
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
-from .base import Observer
+from .base import Observer, need_torque
 
 
 class Luenberger(Observer):
@@ -51,8 +50,8 @@ class Luenberger(Observer):
         self.pole = self.parameters["pole"]
         self._designs = {}
         self.innovation = np.zeros(model.n_modes)
-        # Beyond a quarter period of the fastest mode the amplitudes no longer tell its rate: Phi12 turns singular.
-        self._longest = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
+        # Beyond a quarter period of the fastest mode its rate can't be found from the amplitudes: Phi12 gets singular.
+        self._max_step = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
 
     def design(self, dt, q):
         """Transition of (11) over dt and the gain L; at rest, in configuration q.
@@ -70,13 +69,13 @@ class Luenberger(Observer):
         forces = np.vstack([np.zeros((m, n + m)), np.hstack([H21, -H22])])
         Phi, Gamma = sampled(fast_subsystem(terms)[0], forces, dt)
         decay = np.exp(-self.pole * dt)
-        if dt > self._longest:
+        if dt > self._max_step:
             return Phi, Gamma, np.zeros((m, m))
         L = np.linalg.solve(Phi[:m, m:].T, (Phi[m:, m:] - decay * np.eye(m)).T).T
         return Phi, Gamma, L
 
     def _design_for(self, dt, sample):
-        # One design per time step and configuration to 0.1 rad: which one does not depend on the past.
+        # One design per time step and configuration rounded to 0.1 rad, so that it does not depend on the past.
         q = np.round(sample.position, 1)
         key = (dt, *q.tolist())
         found = self._designs.get(key)
@@ -94,11 +93,7 @@ class Luenberger(Observer):
             self.innovation[:] = 0.0
             self._elapsed = 0.0
             return
-        if not np.all(np.isfinite(sample.torque)):
-            raise MessageError(
-                "joint_torque is unknown (NaN), and observer.type luenberger predicts with it: have the"
-                " driver report the applied torque, or use filtered_derivative"
-            )
+        need_torque(sample.torque, "observer.type luenberger", "use filtered_derivative")
         m = self.amplitude.size
         Phi, Gamma, L = self._design_for(dt, sample)
         terms = self.model.terms(sample.position, sample.velocity)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How an arm moves from sample to sample: what observers predict with.
+r"""Prediction of an arm's motion from sample to sample, for observers.
 
 With the state x = (q, delta, qd, delta_d), the equations of motion :math:`\dot x = f(x, u)` and the linearisation
 A of f at rest in the present configuration, a step of length h under constant torque is the exponential Euler
@@ -7,16 +7,16 @@ A of f at rest in the present configuration, a step of length h under constant t
 
 .. math:: x_{k+1} = x_k + \Gamma f(x_k, u), \qquad \Gamma = \int_0^h e^{As}ds,
 
-exact, whatever h, where f is linear; what f has beyond A (centrifugal and Coriolis forces, Coulomb friction,
-gravity's curvature) is held over the step. Forces of spectral density S on joints and modes (white noise) add
+exact for any h where f is linear. The nonlinear parts of f (centrifugal and Coriolis forces, Coulomb friction,
+gravity's curvature) are held over the step. Forces of spectral density S on joints and modes (white noise) add
 
 .. math:: Q = \int_0^h e^{As}\,B S B^T e^{A^Ts}ds, \qquad B = \begin{bmatrix}0\\ M^{-1}\end{bmatrix}
 
 to the covariance (Van Loan 1978). A and B are taken at the straight arm at rest, with viscous friction only: the
-steepness of Coulomb friction at rest holds for no moving joint.
+gradient of Coulomb friction at rest is wrong for a moving joint.
 
-Designs are kept per time step to 10 us and configuration to 0.1 rad, so that which one is taken does not depend on
-the past. What is left of the time step, at most 5 us, is made up for by the second-order term of the linear motion.
+Designs are kept per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
+the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No reconstruction: passes on the modal rates that the source publishes.
+"""Passes on the modal rates that the source publishes, without reconstruction.
 
-For a simulator with ``publish_rates: true``, in tests and for reproducing the paper, which assumes the full
-state; a real arm has no such thing.
+It is for a simulator with ``publish_rates: true``, in tests and for reproducing the paper, which assumes the full
+state. A real arm does not measure rates.
 """
 
 from flexarm_dynamics.errors import MessageError
@@ -16,8 +16,9 @@ class TrueRates(Observer):
     def update(self, sample, dt):
         if sample.rate is None:
             raise MessageError(
-                "modal_rate is empty, and observer.type true_rates does not reconstruct it: set"
-                " publish_rates on the simulator, or another observer.type"
+                "is empty, and observer.type true_rates does not reconstruct it",
+                field="modal_rate",
+                hint="set publish_rates on the simulator, or another observer.type",
             )
         self.amplitude[:] = sample.amplitude
         self.rate[:] = sample.rate
