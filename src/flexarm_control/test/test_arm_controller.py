@@ -73,7 +73,7 @@ class Scripted:
     def __init__(self, *torques):
         self.torques = list(torques)
         self.needs_rates, self.limit, self.feedforward = True, None, None
-        self.free, self.fast_share = False, 1.0
+        self.free, self.fast_fraction = False, 1.0
 
     def reset(self):
         pass
@@ -727,12 +727,12 @@ def test_the_fast_control_comes_and_goes_in_a_ramp(arm_r):
         if k == 150:
             core.enable_fast(True)
         core.step(sample(k))
-        shares.append(core.law.fast_share)
+        shares.append(core.law.fast_fraction)
     assert_allclose(np.abs(np.diff(shares)).max(), 0.01)
     assert shares[120] == 0.0 and shares[-1] == 1.0
 
 
-def test_the_fast_share_is_a_share_of_the_fast_torque(arm_r):
+def test_the_fast_fraction_is_a_share_of_the_fast_torque(arm_r):
     law = design(arm_r, SLOW, FAST)
     reference = SimpleNamespace(
         position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1)
@@ -740,7 +740,7 @@ def test_the_fast_share_is_a_share_of_the_fast_torque(arm_r):
     state = (np.zeros(1), np.zeros(1), np.array([0.01, 0.0]), np.zeros(2))
     law.step(*state, reference)
     whole, slow = law.fast_torque.copy(), law.slow_torque.copy()
-    law.fast_share = 0.25
+    law.fast_fraction = 0.25
     u = law.step(*state, reference)
     assert_allclose(law.fast_torque, 0.25 * whole, rtol=1e-15)
     assert_allclose(u, slow + 0.25 * whole, rtol=1e-15)

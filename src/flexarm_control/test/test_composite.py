@@ -191,23 +191,23 @@ RUNNING = {
     "manifold": {"type": "corrected", "order": 2},
     "settings": {"feedforward": "model", "rate": 1000.0},
 }
-#: What is set in the running design, and what is said of it.
+#: What is set in the running design; the refusal, and its field or a word of it.
 REFUSED = [
     ("slow", {"type": "slidingmode"}, UnknownComponentError, "did you mean 'sliding_mode'"),
-    ("slow", {"type": "sliding_mode", "lambda": [-1.0]}, ParameterError, r"slow\.lambda\[0\]"),
-    ("slow", {"adaptation_gain": -1.0}, ParameterError, r"slow\.adaptation_gain: -1\.0 .*is below"),
+    ("slow", {"type": "sliding_mode", "lambda": [-1.0]}, ParameterError, "slow.lambda[0]"),
+    ("slow", {"adaptation_gain": -1.0}, ParameterError, "slow.adaptation_gain"),
     ("slow", {"type": "model_following", "kp": [1e4], "kv": [1.0]}, DesignError, "1/s"),
     ("fast", {"type": "scheduledlqr"}, UnknownComponentError, "did you mean 'scheduled_lqr'"),
-    ("fast", {"type": "scheduled_lqr", "grid": 1}, ParameterError, r"fast\.grid: 1 is below"),
-    ("fast", {"type": "scheduled_lqr", "grid": 5.0}, ParameterError, r"fast\.grid: 5\.0 is not an"),
-    ("fast", {"type": "scheduled_lqr", "low": [1.0], "high": [-1.0]}, DesignError, r"fast\.low"),
-    ("fast", {"type": "pole_placement", "damping": [1.0]}, ParameterError, r"fast\.damping\[0\]: 1"),
-    ("fast", {"observer_pole": 0.0}, ParameterError, r"fast\.observer_pole: 0\.0 is below"),
+    ("fast", {"type": "scheduled_lqr", "grid": 1}, ParameterError, "fast.grid"),
+    ("fast", {"type": "scheduled_lqr", "grid": 5.0}, ParameterError, "fast.grid"),
+    ("fast", {"type": "scheduled_lqr", "low": [1.0], "high": [-1.0]}, DesignError, "fast.low"),
+    ("fast", {"type": "pole_placement", "damping": [1.0]}, ParameterError, "fast.damping[0]"),
+    ("fast", {"observer_pole": 0.0}, ParameterError, "fast.observer_pole"),
     ("fast", {"type": "lqr", "alpha": 900.0}, DesignError, "1/s"),
-    ("manifold", {"order": 7}, ParameterError, r"manifold\.order: 7 is above"),
+    ("manifold", {"order": 7}, ParameterError, "manifold.order"),
     ("manifold", {"type": "corected"}, UnknownComponentError, "did you mean 'corrected'"),
     ("settings", {"feedforward": "previw"}, UnknownComponentError, "did you mean 'preview'"),
-    ("settings", {"rate": 0.0}, ParameterError, r"rate: 0\.0 is below"),
+    ("settings", {"rate": 0.0}, ParameterError, "rate"),
     ("settings", {"stability_margin": 50.0}, DesignError, "50"),
 ]  # fmt: skip
 
@@ -226,11 +226,14 @@ def torques(model, between):
 
 def test_what_is_refused_leaves_the_running_loop_as_it_was_to_the_last_bit(arm_r):
     def refuse(k):
-        for part, change, error, message in REFUSED if k == 5 else ():
+        for part, change, error, words in REFUSED if k == 5 else ():
             given = {name: dict(values) for name, values in RUNNING.items()}
             given[part] = change if "type" in change else given[part] | change
-            with pytest.raises(error, match=message):
+            with pytest.raises(error) as caught:
                 design(arm_r, **given)
+            if error is ParameterError:
+                assert caught.value.field == words
+            assert words in str(caught.value)
 
     undisturbed = torques(arm_r, lambda k: None)
     assert_array_equal(torques(arm_r, refuse), undisturbed)

@@ -31,13 +31,13 @@ class CompositeControl:
         delta_bar of the manifold [m, rad].
     deviation : ndarray, shape (2m,)
         z_f = z - z_bar [m, rad, m/s, rad/s].
-    fast_share : float
-        What part of the fast torque takes part, 0 to 1.
+    fast_fraction : float
+        Fraction of the fast torque that is applied, 0 to 1.
     """
 
     def __init__(self, model, slow, fast, manifold=None, feedforward=None):
         self.model, self.slow, self.fast = model, slow, fast
-        self.fast_share = 1.0
+        self.fast_fraction = 1.0
         self._last = None  # reference and interval of the last step
         # Of what motion, and the slow law's torque on it.
         self._nominal = b"", np.zeros(model.n_joints)
@@ -70,14 +70,11 @@ class CompositeControl:
 
     def resume(self, other):
         """Go on from another control's states: a redesign does not begin anew."""
-        for mine, its in (
-            (self.slow, other.slow),
-            (self.fast, other.fast),
-            (self.feedforward, other.feedforward),
-        ):
-            if mine is not None and its is not None:
-                mine.resume(its)
-        self.limit, self.fast_share = other.limit, other.fast_share
+        self.slow.resume(other.slow)
+        self.fast.resume(other.fast)
+        if self.feedforward is not None and other.feedforward is not None:
+            self.feedforward.resume(other.feedforward)
+        self.limit, self.fast_fraction = other.limit, other.fast_fraction
 
     @property
     def needs_rates(self):
@@ -91,10 +88,8 @@ class CompositeControl:
 
     def reset(self):
         """A new session begins: the laws forget their own states."""
-        self.slow.reset()
-        self.fast.reset()
-        if self.feedforward is not None:
-            self.feedforward.reset()
+        for part in self._parts():
+            part.reset()
 
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample; the control path.
@@ -115,24 +110,65 @@ class CompositeControl:
         ndarray, shape (n,)
             u of (12) [N m]; before any limit. Overwritten by the next step.
         """
-        m, self._last = delta.size, (reference, dt)
+        self._advance(reference, dt)
+        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
+        if self.feedforward is None:
+            u_slow, delta_bar, rate_bar = self._slow_on_manifold(q, qd, reference, terms)
+        else:
+            u_slow, delta_bar, rate_bar = self._slow_about_motion(q, qd, terms)
+        z_f = self._deviation(delta, delta_d, delta_bar, rate_bar)  # z - z_bar
+        u_fast = np.multiply(self.fast.torque(z_f, q), self.fast_fraction, out=self.fast_torque)
+        return np.add(u_slow, u_fast, out=self.torque)  # (12)
+
+    def _advance(self, reference, dt):
+        """Advance the states of the laws, and the feed-forward's motion, to this sample."""
+        self._last = reference, dt
         if dt > 0.0:
             self.slow.advance(dt)
             self.fast.advance(dt)
-        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
-        if self.feedforward is None:
-            amplitude, rate = self._on_manifold(q, qd, reference, terms)
-        else:
-            amplitude, rate = self._on_motion(q, qd, reference, terms, dt)
-        self.quasi_steady[:] = amplitude
-        np.subtract(delta, amplitude, out=self.deviation[:m])
+        if self.feedforward is not None:
+            self.feedforward.update(reference, dt)
+
+    def _slow_on_manifold(self, q, qd, reference, terms):
+        """Slow torque towards the reference, and the manifold's z_bar with the torque that belongs to it."""
+        u, manifold = self.slow_torque, self.manifold
+        u[:] = self.slow.torque(q, qd, reference, terms)
+        manifold.update(q, qd, reference, terms, u)
+        u += manifold.feedforward
+        return u, manifold.amplitude, manifold.rate
+
+    def _slow_about_motion(self, q, qd, terms):
+        """Slow torque about the feed-forward's motion, and that motion's deflections moved by the tracking error.
+
+        The motion's torque takes the place of what the slow law gives on the motion; the manifold's response to the
+        tracking error is added to both.
+        """
+        u, motion, m = self.slow_torque, self.feedforward, self.model.n_modes
+        u[:] = self.slow.torque(q, qd, motion, terms)
+        u += motion.torque - self._nominal_torque(
+            motion.position, motion.velocity, motion.acceleration
+        )
+        response = self._response @ self._tracking_error(q, qd, motion)
+        u += response[2 * m :]
+        return u, motion.amplitude + response[:m], motion.rate + response[m : 2 * m]
+
+    def _tracking_error(self, q, qd, motion):
+        """(q - q_motion, qd - qd_motion), shape (2n,)."""
+        error, n = self._error, self.model.n_joints
+        np.subtract(q, motion.position, out=error[:n])
+        np.subtract(qd, motion.velocity, out=error[n:])
+        return error
+
+    def _deviation(self, delta, delta_d, delta_bar, rate_bar):
+        """z_f = z - z_bar, shape (2m,); NaN in the place of rates that are not known."""
+        z_f, m = self.deviation, delta.size
+        self.quasi_steady[:] = delta_bar
+        np.subtract(delta, delta_bar, out=z_f[:m])
         if delta_d is None:
-            self.deviation[m:] = np.nan
+            z_f[m:] = np.nan
         else:
-            np.subtract(delta_d, rate, out=self.deviation[m:])
-        np.multiply(self.fast.torque(self.deviation, q), self.fast_share, out=self.fast_torque)
-        np.add(self.slow_torque, self.fast_torque, out=self.torque)
-        return self.torque
+            np.subtract(delta_d, rate_bar, out=z_f[m:])
+        return z_f
 
     def look_ahead(self):
         """Do beforehand what the next sample will need and what does not depend on it; call once the torque is sent.
@@ -145,28 +181,6 @@ class CompositeControl:
         foreseen = self.feedforward.look_ahead(*self._last)
         if foreseen is not None:
             self._nominal_torque(*foreseen)
-
-    def _on_manifold(self, q, qd, reference, terms):
-        """Slow torque, and z_bar of the manifold."""
-        manifold = self.manifold
-        self.slow_torque[:] = self.slow.torque(q, qd, reference, terms)
-        manifold.update(q, qd, reference, terms, self.slow_torque)
-        self.slow_torque += manifold.feedforward
-        return manifold.amplitude, manifold.rate
-
-    def _on_motion(self, q, qd, reference, terms, dt):
-        """Slow torque about the feed-forward's motion, and z_bar: its deflections, moved by the tracking error."""
-        motion, m = self.feedforward, self.model.n_modes
-        motion.update(reference, dt)
-        self.slow_torque[:] = self.slow.torque(q, qd, motion, terms)
-        nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
-        self.slow_torque += motion.torque - nominal
-        error, n = self._error, self.model.n_joints
-        np.subtract(q, motion.position, out=error[:n])
-        np.subtract(qd, motion.velocity, out=error[n:])
-        moved = self._response @ error
-        self.slow_torque += moved[2 * m :]
-        return motion.amplitude + moved[:m], motion.rate + moved[m : 2 * m]
 
     def _nominal_torque(self, position, velocity, acceleration):
         """The slow law's torque on a motion, (n,); what was asked for last is remembered."""

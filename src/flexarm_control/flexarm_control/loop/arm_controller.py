@@ -244,7 +244,7 @@ class ArmController:
         q, qd = sample.position, sample.velocity
         np.subtract(reference.position, q, out=self.position_error)
         np.subtract(reference.velocity, qd, out=self.velocity_error)
-        law.fast_share = self._fast_share(law.fast_share, dt)
+        law.fast_fraction = self._fast_fraction(law.fast_fraction, dt)
         try:
             u = law.step(q, qd, sample.amplitude, sample.rate, reference, dt)
         except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
@@ -267,13 +267,13 @@ class ArmController:
             self.brake(why)  # from the next sample on
         return self.enabled
 
-    def _fast_share(self, share, dt):
-        """Part of the fast control that takes part: in a ramp, where it was switched."""
+    def _fast_fraction(self, fraction, dt):
+        """Fraction of the fast torque that is applied: it follows `enable_fast` in a ramp."""
         goal = 1.0 if self.fast_enabled else 0.0
-        if share == goal:
+        if fraction == goal:
             return goal
         step = dt / FAST_RAMP
-        return min(goal, share + step) if goal > share else max(goal, share - step)
+        return min(goal, fraction + step) if goal > fraction else max(goal, fraction - step)
 
     def warm_up(self):
         """Run three samples and a trajectory on a second controller, so that compiled code is loaded."""

@@ -45,7 +45,7 @@ class Baseline:
 
     feedforward = None
     needs_rates, free = True, False
-    limit, fast_share = None, 1.0
+    limit, fast_fraction = None, 1.0
     #: Number of points of a reference that `along` stores.
     MAX_STORED = 20000
 
