@@ -8,10 +8,10 @@ import tempfile
 from array import array
 from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import yaml
+from rclpy.serialization import serialize_message
 
 from flexarm_control.composite import assembly
 from flexarm_control.nodes import controller, observer
@@ -19,6 +19,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, FlexarmError, ParameterError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
+from flexarm_msgs.msg import JointTorque
 from flexarm_sim.nodes import simulator
 from flexarm_sim.simulator import PARAMETERS as PLANT
 from flexarm_studies.commands import gauges
@@ -26,6 +27,8 @@ from flexarm_studies.identification import recording
 from flexarm_studies.loop import parameter_files
 from flexarm_tools.check_driver import listening
 from flexarm_tools.check_driver.samples import Heard, Verdict, samples
+from flexarm_tools.identification.recording import of_contents
+from flexarm_tools.recording import bag
 
 from . import odd
 from .messages import good_state, spoil_state
@@ -301,7 +304,7 @@ def spoilt_run(rng, arm, rows):
 
 
 class Messages(Reader):
-    """`recording.from_messages`: a bag, once its messages are there."""
+    """The messages of a bag: decoded, and made a `Recording`."""
 
     name, share, ROWS = "recording messages", 0.5, 24
 
@@ -312,14 +315,19 @@ class Messages(Reader):
         states = spoilt_run(rng, self.arm, self.ROWS)
         mode = rng.choice((1, 1, 0, 7))
         torques = [
-            SimpleNamespace(session=7, sequence=m.sequence, mode=mode)
+            JointTorque(session=7, sequence=m.sequence, mode=mode)
             for m in states
             if rng.random() < 0.98
         ]
         return states, rng.choice((torques, []))
 
     def read(self, given):
-        return recording.from_messages(*given, self.arm)
+        names = ("arm_state", "joint_torque")
+        raw = {
+            name: [serialize_message(m) for m in messages]
+            for name, messages in zip(names, given, strict=True)
+        }
+        return of_contents(bag.from_messages(raw, self.arm), self.arm)
 
     def check(self, given, result):
         check_recording(result, self.arm)

@@ -39,47 +39,91 @@ def read(path, prefix, names):
     TableError
         Naming file, line and column, the value, and what is wanted.
     """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = [(reader.line_num, row) for reader in [csv.reader(file)] for row in reader]
-    except UnicodeDecodeError:
-        raise TableError(f"{path}: not a text file") from None
-    rows = [(line, [word.strip() for word in row]) for line, row in rows if any(row)]
     wanted = ["t"] + [f"{prefix}{i + 1}" for i in range(len(names))]
-    if not rows:
-        raise TableError(f"{path}: empty; its first line must be {','.join(wanted)}")
-    line, header = rows[0]
+    lines, header, rows = _rows(path, wanted)
     if sorted(header) != sorted(wanted):
         raise TableError(
-            f"{path}:{line}: columns are {','.join(header)}, wanted {','.join(wanted)}: one per joint"
-            f" ({', '.join(names)})"
+            f"columns are {','.join(header)}, wanted {','.join(wanted)}: one per joint ({', '.join(names)})",
+            field=f"{path}:{lines[0]}",
         )
-    order = [header.index(name) for name in wanted]
-    table = np.empty((len(rows) - 1, len(wanted)))
-    for k, (line, row) in enumerate(rows[1:]):
+    for line, row in zip(lines[1:], rows, strict=True):
         if len(row) != len(wanted):
-            raise TableError(f"{path}:{line}: {len(row)} values for {len(wanted)} columns")
-        for column, i in enumerate(order):
-            table[k, column] = _number(row[i], f"{path}:{line}: {wanted[column]}")
+            raise TableError(f"{len(row)} values for {len(wanted)} columns", field=f"{path}:{line}")
+    table = _numbers(path, lines, header, rows, wanted, finite=True)
     if not table.size:
-        raise TableError(f"{path}: no rows below the header")
+        raise TableError("no rows below the header", field=str(path))
     back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
     if back.size:
         k = back[0] + 1
         raise TableError(
-            f"{path}:{rows[k + 1][0]}: t = {table[k, 0]:g} comes after {table[k - 1, 0]:g}; times must ascend"
+            f"t = {table[k, 0]:g} comes after {table[k - 1, 0]:g}; times must ascend",
+            field=f"{path}:{lines[k + 1]}",
         )
     return table[:, 0], table[:, 1:]
 
 
-def _number(word, where):
+def read_columns(path, wanted, optional=()):
+    """Columns of a CSV file by their names, in any order; others in the file are ignored.
+
+    Parameters
+    ----------
+    path : str or Path
+    wanted : sequence of str
+    optional : sequence of str
+        Those of `wanted` that may be missing.
+
+    Returns
+    -------
+    ndarray, shape (k, len(wanted))
+        NaN in the columns that are missing.
+
+    Raises
+    ------
+    TableError
+        For a file that is no table, a missing column, and text that is no number, naming line and column.
+    """
+    lines, header, rows = _rows(path, wanted)
+    missing = [n for n in wanted if n not in header and n not in optional]
+    if missing:
+        raise TableError(
+            f"no column {', '.join(missing)} (wanted: {', '.join(wanted)})", field=str(path)
+        )
+    return _numbers(path, lines, header, rows, wanted)
+
+
+def _rows(path, wanted):
+    """Line numbers, header and rows of a CSV file, without empty lines."""
     try:
-        value = float(word)
-    except ValueError:
-        raise TableError(f"{where} is {word!r}, not a number") from None
-    if not math.isfinite(value):
-        raise TableError(f"{where} is {word}, not finite")
-    return value
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = [(reader.line_num, row) for reader in [csv.reader(file)] for row in reader]
+    except UnicodeDecodeError:
+        raise TableError("not a text file", field=str(path)) from None
+    except (OSError, csv.Error) as error:
+        raise TableError(f"can't be read as a table: {error}", field=str(path)) from None
+    rows = [(line, [word.strip() for word in row]) for line, row in rows if any(row)]
+    if not rows:
+        raise TableError(f"empty; its first line must be {','.join(wanted)}", field=str(path))
+    return [line for line, _ in rows], rows[0][1], [row for _, row in rows[1:]]
+
+
+def _numbers(path, lines, header, rows, wanted, finite=False):
+    """The wanted columns, shape (k, len(wanted)); NaN for one that is not there."""
+    table = np.full((len(rows), len(wanted)), np.nan)
+    for j, name in enumerate(wanted):
+        if name not in header:
+            continue
+        at = header.index(name)
+        for i, row in enumerate(rows):
+            where = f"{path}:{lines[i + 1]}: {name}"
+            try:
+                table[i, j] = float(row[at])
+            except IndexError:
+                raise TableError("is missing", field=where) from None
+            except ValueError:
+                raise TableError("is not a number", field=where, value=row[at]) from None
+            if finite and not math.isfinite(table[i, j]):
+                raise TableError("is not finite", field=where, value=float(row[at]))
+    return table
 
 
 class Steps:
@@ -141,11 +185,11 @@ class Motion:
         return [d(t) for d in self._derivatives]
 
 
-def write(columns, rows, path=None):
-    """Write rows as CSV to a file, its directory made, or to standard output."""
+def write(columns, rows, path=None, digits=12):
+    """Write rows as CSV, with so many significant digits, to a file, its directory made, or to standard output."""
     out = io.StringIO()
     out.write(",".join(columns) + "\n")
-    np.savetxt(out, rows, fmt="%.12g", delimiter=",")
+    np.savetxt(out, rows, fmt=f"%.{digits}g", delimiter=",")
     if path is None:
         sys.stdout.write(out.getvalue())
         return

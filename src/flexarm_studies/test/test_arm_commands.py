@@ -237,8 +237,8 @@ def test_show_warns_of_what_matters(capsys):
 
 
 REFUSED = [
-    ("t,tau1,tau2\n0,0,0\n1,x,0\n", r"tau.csv:3: tau1 is 'x', not a number"),
-    ("t,tau1,tau2\n0,0,0\n1,nan,0\n", r"tau.csv:3: tau1 is nan, not finite"),
+    ("t,tau1,tau2\n0,0,0\n1,x,0\n", r"tau.csv:3: tau1: 'x' is not a number"),
+    ("t,tau1,tau2\n0,0,0\n1,nan,0\n", r"tau.csv:3: tau1: nan is not finite"),
     ("t,tau1,tau2\n0,0,0\n2,0,0\n\n1,0,0\n", r"tau.csv:5: t = 1 comes after 2"),
     (
         "t,tau1\n0,0\n",

@@ -277,7 +277,7 @@ def test_excite_asks_before_it_moves_the_arm(tmp_path):
         (["one_link"], "either a bag or CSV file"),
         (["short.csv", "one_link"], "1 samples; at least 20"),
         (["wrong.csv", "one_link"], "no column joint1_position (wanted: t, joint1_position"),
-        (["text.csv", "one_link"], "line 2: joint1_position is no number"),
+        (["text.csv", "one_link"], "text.csv:2: joint1_position: 'x' is not a number"),
         (["nan.csv", "one_link"], "joint_torque is unknown"),
     ],
 )
@@ -298,22 +298,18 @@ def test_what_can_not_be_used_is_said(words, said, tmp_path, monkeypatch, capsys
 def test_only_the_stretch_under_enabled_torque_counts(given):
     """Safe action before and after, a lost sample in the middle, samples sent twice, another session's state."""
 
-    def stamp(k):
-        ns = round(1e7 * k)
-        return SimpleNamespace(stamp=SimpleNamespace(sec=ns // 10**9, nanosec=ns % 10**9))
+    def table(sequence, session=5, **columns):
+        k = np.array(sequence)
+        session = np.broadcast_to(session, k.shape)
+        return SimpleNamespace(stamp=10_000_000 * k, session=session, sequence=k, columns=columns)
 
-    def state(k, session=5):
-        return SimpleNamespace(
-            header=stamp(k), session=session, sequence=k, joint_names=["joint1"], joint_position=[0.001 * k],
-            joint_torque=[float(k)], gauge_names=["middle", "root"], strain=[2e-6 * k, 1e-6 * k],
-        )  # fmt: skip
-
-    def torque(k, mode):
-        return SimpleNamespace(header=stamp(k), session=5, sequence=k, mode=mode)
-
-    states = [state(k) for k in range(100) if k != 40] + [state(50), state(7, session=4)]
-    torques = [torque(k, int(10 <= k < 90)) for k in range(100)]
-    found = recording.from_messages(states, torques, given)
+    k = np.array([*(k for k in range(100) if k != 40), 50, 7])
+    states = table(
+        k, np.where(np.arange(k.size) == k.size - 1, 4, 5), joint_position=1e-3 * k[:, None],
+        joint_torque=1.0 * k[:, None], strain=np.outer(k, [1e-6, 2e-6]),
+    )  # fmt: skip
+    torques = table(range(100), mode=np.array([float(10 <= k < 90) for k in range(100)]))
+    found = recording.from_tables(states, torques, given)
     # From the gap to the last enabled answer, less two samples at that end; row k holds its torque.
     np.testing.assert_allclose(found.position[:, 0], 0.001 * np.arange(41, 89))
     np.testing.assert_allclose(found.torque[1:, 0], np.arange(42, 89))

@@ -20,6 +20,7 @@ from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_studies.commands import arm_figure
 from flexarm_studies.loop import metrics, scenario
+from flexarm_tools.identification import recording as recordings
 from flexarm_tools.recording import mcap
 from flexarm_tools.recording import record as recording
 from flexarm_tools.recording.loop_bag import LoopBag
@@ -56,6 +57,20 @@ def runs(recorded):
 
 
 # Bags of the loop without ROS ------------------------------------------------------------------
+
+
+def test_identify_reads_the_same_bag(recorded):
+    """Also its states without rates, after whose last array the middleware leaves four bytes."""
+    folder, record, loop = recorded["composite"]
+    found = recordings.read(folder, loop.model.arm)
+    assert found.period == pytest.approx(0.002)
+    begin = np.abs(record.position - found.position[0]).sum(axis=1).argmin()
+    np.testing.assert_array_equal(found.position[:200], record.position[begin : begin + 200])
+    other = replace(loop.model.arm.gauges[0], name="another")
+    other = replace(loop.model.arm, gauges=(other, *loop.model.arm.gauges[1:]))
+    with pytest.raises(FlexarmError) as error:
+        recordings.read(folder, other)
+    assert error.value.field == "gauge_names"
 
 
 def test_a_bag_of_the_loop_holds_what_the_loop_did(recorded, runs):

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured while an arm moved: from a CSV file, or from messages that were read from a bag.
+"""A recorded motion for identification: from a CSV file, or from the topics of a bag.
 
 Row k of a recording holds the joint angles and strains at time k, and the torque that acted over the interval
 that ends there, as `ArmState` carries it.
 """
 
-import csv
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.shown import listed, show
 
-#: Stamps may be off their grid by this share of the period [-].
+from .. import tables
+
+#: Stamps may be off their grid by this fraction of the period [-].
 JITTER = 0.2
 #: `JointTorque.ENABLED`.
 ENABLED = 1
@@ -130,39 +129,15 @@ def columns(arm):
 
 
 def read_csv(path, arm):
-    """Read a CSV file with the columns of `columns`, in any order; columns of gauges may be missing.
+    """Read a CSV file with the columns of `columns`, in any order; those of gauges may be missing, others are ignored.
 
     Raises
     ------
     FlexarmError
         For a column that is missing and for text that is no number, naming column and line.
     """
-    path = Path(path)
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FlexarmError(f"{path}: can't be read as a table: {error}") from None
-    if not rows:
-        raise FlexarmError(
-            f"{path}: empty; the first line names the columns: {', '.join(columns(arm))}"
-        )
-    head = [name.strip() for name in rows[0]]
-    needed = columns(arm)
-    optional = {f"{g}_strain" for g in arm.gauge_names}
-    missing = [n for n in needed if n not in head and n not in optional]
-    if missing:
-        raise FlexarmError(f"{path}: no column {', '.join(missing)} (wanted: {', '.join(needed)})")
-    table = np.full((len(rows) - 1, len(needed)), np.nan)
-    for j, name in enumerate(needed):
-        if name not in head:
-            continue
-        at = head.index(name)
-        for i, row in enumerate(rows[1:]):
-            try:
-                table[i, j] = float(row[at])
-            except (ValueError, IndexError):
-                raise FlexarmError(f"{path} line {i + 2}: {name} is no number") from None
+    optional = [f"{g}_strain" for g in arm.gauge_names]
+    table = tables.read_columns(path, columns(arm), optional)
     n = len(arm.joints)
     t, q, u, e = np.split(table, [1, 1 + n, 1 + 2 * n], axis=1)
     return uniform(arm, t[:, 0], q, u, e)
@@ -173,22 +148,23 @@ def write_csv(path, recording, arm):
     table = np.column_stack(
         [recording.time, recording.position, recording.torque, recording.strain]
     )
-    np.savetxt(path, table, delimiter=",", header=",".join(columns(arm)), comments="", fmt="%.17g")
+    tables.write(columns(arm), table, path, digits=17)
 
 
-# Messages --------------------------------------------------------------------------------------
+# Topics ----------------------------------------------------------------------------------------
 
 
-def from_messages(states, torques, arm):
-    """A recording from `ArmState` messages and, where there are some, the `JointTorque` that answered them.
+def from_tables(states, torques, arm):
+    """A recording from the tables of `arm_state` and, where there is one, of the `joint_torque` that answered it.
 
     With torques, only those samples count over which an enabled torque acted: the safe action before and after
     moves the arm in ways that no torque tells of.
 
     Parameters
     ----------
-    states, torques : sequence
-        Messages, or what has their fields; repeats are kept once.
+    states, torques : Table or None
+        Of a bag's `Contents`: arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are
+        kept once.
     arm : Arm
 
     Returns
@@ -199,41 +175,32 @@ def from_messages(states, torques, arm):
     ------
     FlexarmError
     """
-    if not states:
+    if states is None or not states.stamp.size:
         raise FlexarmError("no arm_state in the recording")
-    session = max((m.session for m in states), key=lambda s: sum(m.session == s for m in states))
-    kept = {m.sequence: m for m in states if m.session == session}
-    rows = [kept[k] for k in sorted(kept)]
-    stamp = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in rows])
-    position = _in_order(rows, "joint_names", "joint_position", arm.joint_names, True)
-    torque = _in_order(rows, "joint_names", "joint_torque", arm.joint_names, False)
-    strain = _in_order(rows, "gauge_names", "strain", arm.gauge_names, False)
+    sessions, counts = np.unique(states.session, return_counts=True)
+    session = sessions[counts.argmax()]
+    rows = np.flatnonzero(states.session == session)[::-1]
+    sequence, last = np.unique(states.sequence[rows], return_index=True)
+    rows = rows[last]
+
+    def column(name, width):
+        values = states.columns.get(name)
+        return np.full((rows.size, width), np.nan) if values is None else values[rows]
+
+    position = column("joint_position", len(arm.joints))
+    if not np.isfinite(position).all():
+        raise FlexarmError("is empty or not finite in some sample", field="joint_position")
     usable = None
-    if torques:
-        usable = _enabled(rows, [m for m in torques if m.session == session])
-    return uniform(arm, 1e-9 * (stamp - stamp[0]), position, torque, strain, usable)
+    if torques is not None:
+        answered = (torques.session == session) & (torques.columns["mode"] == ENABLED)
+        usable = _enabled(np.isin(sequence - 1, torques.sequence[answered]))
+    time = 1e-9 * (states.stamp[rows] - states.stamp[rows[0]])
+    torque = column("joint_torque", len(arm.joints))
+    return uniform(arm, time, position, torque, column("strain", len(arm.gauges)), usable)
 
 
-def _in_order(rows, names, field, wanted, required):
-    out = np.full((len(rows), len(wanted)), np.nan)
-    for k, message in enumerate(rows):
-        values, have = getattr(message, field), list(getattr(message, names))
-        if len(values) == 0:
-            continue
-        if sorted(have) != sorted(wanted):
-            raise FlexarmError(f"{names} {show(have)} are not this arm's: {listed(wanted)}")
-        if len(values) != len(wanted):
-            raise FlexarmError(f"{field} has {len(values)} values for {len(wanted)} {names}")
-        out[k] = [values[have.index(name)] for name in wanted]
-    if required and not np.isfinite(out).all():
-        raise FlexarmError(f"{field} is empty or not finite in some sample")
-    return out
-
-
-def _enabled(rows, torques):
-    """Samples whose interval was under enabled torque, but for `MARGIN` at either end."""
-    answered = {m.sequence for m in torques if m.mode == ENABLED}
-    enabled = np.array([m.sequence - 1 in answered for m in rows])
+def _enabled(enabled):
+    """Samples whose interval was under enabled torque, without `MARGIN` at either end, shape (s,) bool."""
     usable = enabled.copy()
     for k in range(1, MARGIN + 1):
         usable[k:] &= enabled[:-k]

@@ -2,7 +2,6 @@
 """Records the states of a running arm, and the torques that answer them."""
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_studies.identification.recording import from_messages
 
 #: Timeout for the first state, and for the torques that answer the last one [s].
 PATIENCE = 10.0
@@ -22,7 +21,9 @@ def record(arm, seconds, namespace=""):
     """
     from flexarm_ros.session import Session
 
+    from ..recording import bag
     from ..recording.recorder import Recorder, raw_stamp_ns
+    from .recording import of_contents
 
     if not 0.0 < seconds < MAX_SECONDS:
         raise FlexarmError(
@@ -38,5 +39,4 @@ def record(arm, seconds, namespace=""):
             lambda: raw_stamp_ns(states[-1]) >= end,
             PATIENCE + 5.0 * seconds,
         )
-        messages = recorder.messages()
-    return from_messages(messages["arm_state"], messages["joint_torque"], arm)
+    return of_contents(bag.from_messages(recorder.raw, arm), arm)

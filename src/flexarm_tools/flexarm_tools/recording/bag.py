@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the line's topics out of a bag of any length, into columns of numbers in files.
+"""Reads an arm's topics from a bag of any length, as columns of numbers.
 
-Memory holds a block of messages at a time. A bag may come from anywhere: topics may be missing or stand in a
-namespace, names in another order, arrays be empty, the file may break off. What can't be used is left out and said.
+The columns are kept in files, so that memory holds only a block of messages at a time. A bag may come from anywhere:
+topics may be missing or in a namespace, names in another order, arrays empty, the file truncated. What can't be used
+is left out, and a note says so.
 """
 
 import tempfile
@@ -56,7 +57,7 @@ KINDS = {
 #: So many messages, or bytes, are read before they are put into columns.
 BLOCK, BLOCK_BYTES = 40_000, 32_000_000
 #: Different reasons of refusal that are kept.
-MOST_REASONS = 500
+MAX_REASONS = 500
 
 
 @dataclass
@@ -100,6 +101,8 @@ class Contents:
     reasons : list of str
     notes : list of str
         What was left out, and why.
+    unknown : dict
+        ``gauge_names`` and the like to a list of those that are not the arm's; their values are left out.
     """
 
     path: Path
@@ -109,6 +112,7 @@ class Contents:
     tables: dict
     reasons: list
     notes: list = field(default_factory=list)
+    unknown: dict = field(default_factory=dict)
     _folder: object = None  # keeps the files while the arrays are used
 
 
@@ -152,12 +156,12 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
     ----------
     path : str or Path
         The bag's folder, a folder with a folder ``bag`` in it, or a file .mcap or .db3.
-    arm : str, optional
-        Arm file; not given: what the bag says.
+    arm : Arm or str, optional
+        Arm or arm file; the bag's own if not given.
     namespace : str, optional
         Of the one arm that is wanted; not given: all that are there.
     progress : callable
-        Called with the share that is read.
+        Called with the fraction that is read.
 
     Returns
     -------
@@ -170,7 +174,9 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
         For what is no bag, has none of the topics, or belongs to another arm.
     """
     path, notes = _bag(Path(path)), []
-    known = arm_file.load(arm) if arm else arm_of(path, notes)
+    if isinstance(arm, str):
+        arm = arm_file.load(arm) if arm else None
+    known = arm_of(path, notes) if arm is None else arm
     source = _Source(path, notes)
     store, readers, block, size = typestore(), {}, {}, 0
     folder = tempfile.TemporaryDirectory(prefix="flexarm-report-")
@@ -188,6 +194,27 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
         raise FlexarmError(_nothing(path, source, namespace))
     found = [r.contents(path, notes) for _, r in sorted(readers.items())]
     return [c for c in found if _enough(c, len(found))]
+
+
+def from_messages(raw, arm):
+    """The same of serialised messages in memory.
+
+    Parameters
+    ----------
+    raw : dict
+        Topic to list of bytes.
+    arm : Arm
+
+    Returns
+    -------
+    Contents
+    """
+    folder = tempfile.TemporaryDirectory(prefix="flexarm-report-")
+    reader = _Reader("", arm, Path(folder.name), folder, typestore(), "the recording")
+    for topic, messages in raw.items():
+        if messages:
+            reader.take(topic, messages)
+    return reader.contents(Path(), [])
 
 
 def _bag(path):
@@ -333,6 +360,7 @@ class _Reader:
         self._store, self._columns, self._decoders = store, _Columns(place), {}
         self._path, self._others = path, ()
         self._known, self._reasons, self._foreign, self._rows = {}, {}, {}, {}
+        self._unknown = {}
         self.names = {}
         if arm is not None:
             from flexarm_dynamics.models import model
@@ -388,7 +416,7 @@ class _Reader:
             head["reason"][rows] = np.array(numbers)[which]
 
     def _number_of(self, text):
-        if text not in self._reasons and len(self._reasons) >= MOST_REASONS:
+        if text not in self._reasons and len(self._reasons) >= MAX_REASONS:
             text = "(more reasons than are kept)"
         return self._reasons.setdefault(text, len(self._reasons))
 
@@ -405,6 +433,8 @@ class _Reader:
             for j, n in enumerate(have):
                 if n in wanted:
                     out[rows, wanted.index(n)] = values[:, j]
+                else:
+                    self._unknown.setdefault(names, set()).add(n)
         self._known.setdefault(topic, set())
         if np.isfinite(values).any():
             self._known[topic].add(name)
@@ -450,7 +480,16 @@ class _Reader:
                 f"{self._path}: joint_names {show(list(self._others))} are not those of arm"
                 f" {self.arm.name}: {listed(self.names['joint_names'])}; give the right one with --arm"
             )
+        unknown = {names: sorted(found) for names, found in self._unknown.items()}
         reasons = list(self._reasons)
         return Contents(
-            path, self.namespace, self.arm, self.names, tables, reasons, notes, self._folder
+            path,
+            self.namespace,
+            self.arm,
+            self.names,
+            tables,
+            reasons,
+            notes,
+            unknown,
+            self._folder,
         )

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of numbers out of serialised messages, many at a time.
+"""Decodes serialised messages into columns of numbers, many at a time.
 
 Messages of one topic have nearly always the same layout: the same names, arrays as long as the last time. The
 first one of a layout is walked field by field (XCDR1, as ROS 2 writes it: a number is aligned to its size,
 counted from the end of the four bytes of encapsulation); of the others it is checked only that every byte which
 is neither a number nor in a text of its own is the same, and the numbers are taken out of all of them at once.
+
+Why not the library: `rosbags` 0.11 decodes one message at a time. For 100 s of an arm's five topics at 1 kHz (502 800
+messages) that takes 6.4 s of processor time, here 0.3 s. It also refuses every `ArmState` whose last array is empty
+(101 100 of them, "CDR message size mismatch"): Fast DDS leaves four bytes after it, and `rosbags` accepts up to three.
 """
 
 import struct
@@ -20,9 +24,9 @@ _CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1",
 _CODES |= {"int16": "i2", "uint32": "u4", "int32": "i4", "float32": "f4", "uint64": "u8"}
 _CODES |= {"int64": "i8", "float64": "f8"}
 #: A message with more numbers in an array than this is broken.
-LONGEST = 100_000
-#: So many layouts of messages of one length are remembered: orders of names.
-MOST_LAYOUTS = 16
+MAX_COUNT = 100_000
+#: Layouts that are remembered for messages of one length: names may be in several orders.
+MAX_LAYOUTS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +106,7 @@ class _Walker:
         else:
             (node, what), size = what
             count = size if kind == "ARRAY" else self.length()
-            if count > LONGEST:
+            if count > MAX_COUNT:
                 raise MessageError(f"{path} has {count} entries")
             if node.name == "BASE" and what[0] != "string":
                 self.number(path, what[0], count)
@@ -230,6 +234,6 @@ class Decoder:
             return None
         known = self._layouts.setdefault(len(raw), [])
         known.append(layout)
-        if len(known) > MOST_LAYOUTS:
+        if len(known) > MAX_LAYOUTS:
             known.pop(0)
         return layout
