@@ -29,6 +29,7 @@ KEYS = {
     "numpy": "python3-numpy",
     "pytest": "python3-pytest",
     "rosbags": "python3-rosbags-pip",
+    "ruamel": "python3-ruamel.yaml",
     "scipy": "python3-scipy",
     "sympy": "python3-sympy",
     "yaml": "python3-yaml",

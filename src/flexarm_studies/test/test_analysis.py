@@ -54,7 +54,7 @@ def test_gain_sweep_holds_the_design_itself_and_a_slow_loop_leaves_the_bending_a
     assert_allclose([complex(*p) for p in rows[1]["poles"]], here, rtol=1e-6)
 
 
-def test_a_slow_law_without_gains_and_one_that_leaves_the_joints_free_are_said_to_be(paper):
+def test_a_slow_law_without_gains_and_one_that_leaves_the_joints_free_have_a_reason(paper):
     free = cases.of(Scenario("R", {"slow.type": "none", "fast.type": "none"}))
     assert "free" in scales.study(free, 2)["reason"]
     assert scales.gain_sweep(free)["reason"]
@@ -168,7 +168,7 @@ def test_first_loss_finds_the_first_edge_and_says_where_there_is_none():
     assert cases.first_loss(lambda v: False, 1.0, 30.0) == 1.0
 
 
-def test_an_unstable_design_is_told_not_refused():
+def test_an_unstable_design_is_reported_not_refused():
     delayed = cases.of(Scenario("R", DEFAULT | {"slow.kp": [62.5], "slow.kv": [15.8]}))
     found = margins.study(delayed, True)
     assert found["stable"] is False
@@ -246,18 +246,18 @@ def test_the_report_reads_an_arm_of_two_links_and_a_free_one(capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
-        (("--configurations", "0"), "--configurations 0"),
-        (("--seed", "-1"), "--seed -1"),
+        (("--configurations", "0"), "--configurations: 0 is too small"),
+        (("--seed", "-1"), "--seed: -1 is too small"),
         (("--workers", "2"), "only with --monte-carlo"),
         (("--trajectory", "nothing"), "nothing"),
     ],
 )
-def test_wrong_options_are_said(capsys, words, said):
+def test_wrong_options_are_refused(capsys, words, message):
     code, _, err = run(capsys, "R", "paper_composite", "--quick", *words)
     assert code == 1
-    assert said in err
+    assert message in err
 
 
 def test_a_fast_law_with_states_has_no_bound_but_margins(paper):
@@ -266,5 +266,5 @@ def test_a_fast_law_with_states_has_no_bound_but_margins(paper):
         case = cases.of(scenario)
     except FlexarmError as error:  # its own refusals are its own tests'
         pytest.fail(str(error))
-    assert "states of its own" in bound.study(case, 1.0, True)["reason"]
+    assert "has states" in bound.study(case, 1.0, True)["reason"]
     assert margins.study(case, False)["decay_per_s"] is not None

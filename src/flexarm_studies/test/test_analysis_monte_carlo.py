@@ -12,6 +12,7 @@ import pytest
 
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.analysis import monte_carlo as mc
+from flexarm_studies.analysis import report
 from flexarm_studies.loop.scenario import Scenario, parameters
 
 SHORT = Scenario(
@@ -82,16 +83,16 @@ def test_results_that_are_there_survive_an_interruption(spec, results, tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("other", "said"),
+    ("other", "problem"),
     [
         (lambda s: replace(s, seed=8), "seed differ"),
         (lambda s: replace(s, ranges=s.ranges | {"delay": [0.0, 0.1]}), "ranges differ"),
         (lambda s: replace(s, files={"R": "0"}), "files differ"),
     ],
 )
-def test_results_of_another_specification_are_not_mixed(spec, tmp_path, other, said):
+def test_results_of_another_specification_are_not_mixed(spec, tmp_path, other, problem):
     mc.Store(tmp_path / mc.FILE, spec).close()
-    with pytest.raises(FlexarmError, match=said):
+    with pytest.raises(FlexarmError, match=problem):
         mc.run(other(spec), 1, tmp_path)
 
 
@@ -123,16 +124,19 @@ def test_summary_counts_and_orders(results):
     values = [r["metrics"]["peak_joint_error_rad"] for r in results]
     assert peak["0.5"] == pytest.approx(np.median(values))
     assert peak["max"] == max(values)
+    text = "\n".join(report._monte_carlo(found | {"residual_window_s": [1.0, 3.0]}))
+    assert "1 of 5 (95 % interval of the fraction 0.0362 to 0.624)" in text
+    assert "residual: 1 to 3 s after the motion" in text
 
 
 def test_numbers_of_samples_and_workers_are_checked(spec):
-    with pytest.raises(FlexarmError, match="--monte-carlo 0"):
-        mc.run(spec, 0)
-    with pytest.raises(FlexarmError, match="--workers 0"):
-        mc.run(spec, 1, workers=0)
+    for count, workers, field in ((0, None, "--monte-carlo"), (1, 0, "--workers")):
+        with pytest.raises(FlexarmError) as refused:
+            mc.run(spec, count, workers=workers)
+        assert (refused.value.field, refused.value.value) == (field, 0)
 
 
-def test_without_dask_it_is_said_what_to_install(spec, monkeypatch):
+def test_without_dask_the_error_tells_what_to_install(spec, monkeypatch):
     real = builtins.__import__
 
     def without(name, *rest):
@@ -141,7 +145,7 @@ def test_without_dask_it_is_said_what_to_install(spec, monkeypatch):
         return real(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(FlexarmError, match="pip install distributed"):
+    with pytest.raises(FlexarmError, match=r"--scheduler.*pip install distributed"):
         mc.run(spec, 1, scheduler="tcp://127.0.0.1:1")
 
 

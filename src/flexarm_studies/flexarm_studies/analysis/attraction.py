@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From how far off the nonlinear loop brings the arm back to rest, with its torque limits, sensors and observer.
 
-The loop starts with a joint beside where it is to be held, or with the arm bent; the offset is scaled up until the
-arm does not come back, by bisection. The result is a few rays into the domain of attraction, not the domain.
+The loop starts with a joint away from where it is to be held, or with the arm bent. Bisection finds the largest offset
+from which the arm comes back. The result is a few rays into the domain of attraction, not the whole domain.
 """
 
 from dataclasses import replace
@@ -14,31 +14,31 @@ from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from ..loop import scenario as scenarios
 
-#: Joint errors are looked at up to this [rad], deflections up to this share of the arm's length.
-LARGEST_TURN, LARGEST_BEND = 3.0, 0.3
-#: What the arm has to come back to: share of the farthest that it went, and no less than this [rad], [m].
+#: Largest joint error [rad], and largest deflection as a fraction of the arm's length [-], that are tried.
+MAX_TURN, MAX_BEND = 3.0, 0.3
+#: An arm has come back within this fraction of its largest excursion [-], or within this of its rest [rad], [m].
 BACK, FLOOR = 0.1, 1e-4
-#: Over how long at the end that is judged [s].
+#: This is judged over the last part of the run [s].
 LATE = 0.25
-#: Time allowed: decay times of the slowest pole, within limits [s].
-DECAYS, SHORTEST, LONGEST = 8.0, 1.0, 8.0
+#: Length of the run, in time constants of the slowest pole [-], and its limits [s].
+DECAYS, MIN_TIME, MAX_TIME = 8.0, 1.0, 8.0
 
 
 def directions(case):
-    """Name, joint offset (n,) [rad] or deflection (m,) [m, rad], the largest scale and its unit, of each ray."""
+    """Yield each ray: name, joint offset (n,) [rad] or deflection (m,) [m, rad], largest scale, and its unit."""
     model, n, m = case.model, case.model.n_joints, case.model.n_modes
     for i, name in enumerate(model.joint_names):
         offset = np.zeros(n)
         offset[i] = 1.0
-        yield name, offset, np.zeros(m), LARGEST_TURN, "rad"
+        yield name, offset, np.zeros(m), MAX_TURN, "rad"
     shape = lowest_shape(case)
     if shape is not None:
         reach = sum(link.length for link in case.arm.links)
-        yield "lowest fast mode", np.zeros(n), shape, LARGEST_BEND * reach, "m"
+        yield "lowest fast mode", np.zeros(n), shape, MAX_BEND * reach, "m"
 
 
 def lowest_shape(case):
-    """Deflections of the lowest mode of the boundary layer, 1 m at the tip; None where the tip does not move."""
+    """Deflections of the boundary layer's lowest mode, 1 m at the tip; None where it does not move the tip."""
     model, q = case.model, case.q
     m = model.n_modes
     if not m:
@@ -53,7 +53,7 @@ def lowest_shape(case):
 
 
 def comes_back(case, joint, bend, watched):
-    """Whether the loop brings the arm back to the motion's end from an offset.
+    """Whether the loop brings the arm back from an offset to the motion's end.
 
     Parameters
     ----------
@@ -86,32 +86,32 @@ def comes_back(case, joint, bend, watched):
     late = record.time > record.time[-1] - LATE
     off = np.abs(record.plant_position - q).max(1)
     bent = np.abs(record.plant_amplitude[:, modes] - rest).max(1, initial=0.0)
-    # Each by its own peak: what bends the arm a little may turn the joint by much on the way.
+    # Each by its own peak: a small bending may turn the joint far on the way back.
     return all(bool(v[late].max() < max(BACK * v.max(), FLOOR)) for v in (off, bent))
 
 
 def study(case, steps=5, progress=None):
-    """Scale along each ray up to which the arm comes back.
+    """Largest scale along each ray from which the arm comes back.
 
     Parameters
     ----------
     case : Case
     steps : int
-        Bisections; the largest offset is tried before.
+        Number of bisections, after the largest offset has failed.
     progress : Progress, optional
 
     Returns
     -------
     dict
         ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
-        ``searched``, with which `scale` is equal where the arm came back even from there.
+        ``searched``, the largest one tried. `scale` is equal to it where the arm came back even from there.
     """
     if case.without_poles:
         return {"reason": case.without_poles, "rays": []}
     decay = case.decay()
     if decay <= 0.0:
         return {"reason": "the linear loop is not stable", "rays": []}
-    watched = float(np.clip(DECAYS / decay, SHORTEST, LONGEST))
+    watched = float(np.clip(DECAYS / decay, MIN_TIME, MAX_TIME))
     rays, every = [], list(directions(case))
     for i, (name, joint, bend, largest, unit) in enumerate(every):
         good, bad = 0.0, largest

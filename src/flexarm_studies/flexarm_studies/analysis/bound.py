@@ -42,9 +42,9 @@ from ..loop import scenario as scenarios
 from . import case as cases
 from . import trial
 
-#: How much slower bending is looked at: factor of mu [-].
-SLOWEST = 30.0
-#: How far beside the limit runs are made.
+#: Largest factor of mu that is tried: bending that is this much slower [-].
+MAX_FACTOR = 30.0
+#: Runs are made this fraction below and above the limit [-].
 BESIDE = 0.15
 
 
@@ -69,7 +69,7 @@ def blocks(case):
     Raises
     ------
     DesignError
-        For a fast law with states of its own, and for an arm without modes.
+        For a fast law with states, and for an arm without modes.
     """
     model, law, q = case.model, case.law, case.q
     n, m = model.n_joints, model.n_modes
@@ -77,9 +77,7 @@ def blocks(case):
     if not m:
         raise DesignError(f"{model.arm.name} has no modes: there is no fast subsystem")
     if K is None:
-        raise DesignError(
-            "the fast law has states of its own: the theorem is applied to K_f z_f only"
-        )
+        raise DesignError("the fast law has states: the theorem is applied to K_f z_f only")
     A, B = linear.linear_plant(model, q)
     U, Z = full_order.linear_law(law, q)
     joints = np.zeros((2 * n, A.shape[0]))
@@ -124,7 +122,7 @@ def optimised(b, evaluations=2500):
     ----------
     b : Blocks
     evaluations : int
-        Roughly how often the bound is computed.
+        About how often the bound is computed.
 
     Returns
     -------
@@ -134,7 +132,7 @@ def optimised(b, evaluations=2500):
     Raises
     ------
     DesignError
-        When the slow or the fast part is not stable on its own: the theorem then says nothing.
+        When the slow or the fast part alone is unstable: the theorem does not apply.
     """
     for name, A in (("slow", b.A11), ("fast", b.A_f)):
         worst = np.linalg.eigvals(A).real.max()
@@ -155,7 +153,7 @@ def optimised(b, evaluations=2500):
     best = None
     for start in _starts(b):
         p = start
-        # Norms have kinks: a search along gradients, begun anew where it stopped.
+        # Norms have kinks, where a search along gradients stops: it is restarted from there.
         left, before = evaluations // 2, math.inf
         while left > 0:
             found = minimize(cost, p, method="L-BFGS-B", options={"maxfun": left, "maxiter": 200})
@@ -169,7 +167,7 @@ def optimised(b, evaluations=2500):
 
 
 def _triangular(p, size):
-    """Upper triangular matrix with a positive diagonal, from the logarithms of that and the rest in its units."""
+    """Upper triangular matrix from the logarithms of its diagonal and the other entries relative to the diagonal."""
     diagonal = np.exp(np.clip(p[:size], -50.0, 50.0))
     S = np.zeros((size, size))
     S[np.triu_indices(size, 1)] = p[size:]
@@ -177,7 +175,7 @@ def _triangular(p, size):
 
 
 def _starts(b):
-    """First weights: balanced units, and those in which the parts are as near to normal as they can be."""
+    """First weights: balanced units, and units in which the parts are as near to normal matrices as possible."""
     for near in (_balanced, _modal):
         yield np.concatenate([_parameters(near(b.A11)), _parameters(near(b.A_f))])
 
@@ -188,7 +186,7 @@ def _balanced(A):
 
 
 def _modal(A):
-    """Square root of the inverse Gramian-like matrix of eigenvectors; a defective A is pushed off a little."""
+    """Square root of the inverse Gramian of the eigenvectors, regularised for a defective A."""
     units = _balanced(A)
     scaled = units @ A @ np.linalg.inv(units)
     _, V = np.linalg.eig(scaled)
@@ -203,8 +201,8 @@ def _parameters(S):
     return np.concatenate([np.log(diagonal), (S / diagonal[:, None])[np.triu_indices(len(S), 1)]])
 
 
-def stable_factor(b, until=SLOWEST):
-    """Factor of mu up to which the linear loop of the theorem is in fact stable; None: all the way to `until`."""
+def stable_factor(b, until=MAX_FACTOR):
+    """Factor of mu up to which the linear loop of the theorem is in fact stable; None if it is up to `until`."""
     return cases.first_loss(
         lambda f: np.linalg.eigvals(b.matrix(f)).real.max() < -full_order.ROUNDING,
         1.0,
@@ -213,13 +211,13 @@ def stable_factor(b, until=SLOWEST):
     )
 
 
-def redesign_factor(case, until=SLOWEST):
-    """Factor of mu up to which arms with slower bending are held by the design made for them; sampled poles.
+def redesign_factor(case, until=MAX_FACTOR):
+    """Factor of mu up to which a design made for the slower bending is stable, by the poles of the sampled loop.
 
     Returns
     -------
     float or None
-        None: all the way to `until`.
+        None if it is stable up to `until`.
     """
 
     def stable(factor):
@@ -235,25 +233,25 @@ def redesign_factor(case, until=SLOWEST):
 
 
 def simulated(case, factor):
-    """Nonlinear runs of redesigned loops on either side of a factor of mu, `redesign_factor`'s."""
+    """Nonlinear runs of redesigned loops, on either side of the factor of mu from `redesign_factor`."""
     found = {}
     for name, beside in (("inside", 1.0 - BESIDE), ("beyond", 1.0 + BESIDE)):
         f = factor * beside
         slower = cases.slower_bending(case.scenario, f)
-        watched = min(trial.WATCHED * max(f, 1.0), trial.LONGEST)
+        watched = min(trial.WATCHED * max(f, 1.0), trial.MAX_WATCHED)
         found[name] = trial.dies_out(slower, case.q, watched=watched)
         found[f"{name}_factor"] = f
     return found
 
 
 def study(case, mu, quick=False):
-    """The bound beside what the loop bears.
+    """The bound, and the mu at which the loop in fact becomes unstable.
 
     Parameters
     ----------
     case : Case
     mu : float
-        At present.
+        Of the design.
     quick : bool
         A shorter search, no runs.
 
@@ -261,11 +259,11 @@ def study(case, mu, quick=False):
     -------
     dict
         ``mu``; ``bound``, a mu, and its constants; ``linear_limit`` and ``redesign_limit``, mu where the linear
-        family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: unstable as it
-        is); ``simulated``, what nonlinear runs on either side of the latter say; or ``reason``, why there is no
-        bound.
+        family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: the design is
+        unstable); ``simulated``, whether nonlinear runs on either side of the latter are stable; or ``reason``, why
+        there is no bound.
     """
-    found = {"mu": mu, "searched": SLOWEST * mu}
+    found = {"mu": mu, "searched": MAX_FACTOR * mu}
     reason = case.without_poles
     if not reason:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is analysed: an arm, its design in one configuration, the motion it is for."""
+"""The case under analysis: an arm, its controller as designed, and the motion that it is for."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,20 +12,20 @@ from flexarm_dynamics.arm.description import Arm, scaled
 
 from ..loop import scenario as scenarios
 
-#: A design is analysed whether it is stable or not: the check of its poles is put as far off as it goes [1/s].
+#: Stability margin that lets every design pass its check: unstable ones are analysed, too [1/s].
 UNCHECKED = -1e3
-#: Configurations along the motion.
+#: Number of configurations along the motion.
 ALONG = 21
 
 
 @dataclass(frozen=True)
 class Case:
-    """A design and what it is for.
+    """A design and the motion that it is for.
 
     Attributes
     ----------
     scenario : Scenario
-        Its design is not refused for its poles.
+        With `UNCHECKED`, so that its design is not refused for its poles.
     model : ArmModel
     law : CompositeControl
     period : float
@@ -46,7 +46,7 @@ class Case:
 
     @property
     def q(self):
-        """The motion's end, where the linear loop is taken, shape (n,) [rad]."""
+        """The motion's end, where the loop is linearised, shape (n,) [rad]."""
         return self.positions[-1]
 
     @property
@@ -56,18 +56,18 @@ class Case:
 
     @property
     def without_poles(self):
-        """Why the linear loop says nothing of the design; empty if it does."""
+        """Why there is no linear loop to analyse; empty if there is one."""
         if self.law.slow.drifts:
             return "the slow law leaves the joints free"
         return ""
 
     def poles(self, plant=None, delay=0.0, period=None, gain=1.0):
-        """Poles of the sampled full-order loop as those of continuous time [1/s], slowest first.
+        """Poles of the sampled full-order loop, mapped to continuous time [1/s], slowest first.
 
         Parameters
         ----------
         plant : Arm, optional
-            The arm that the design meets; its own if not given.
+            The controlled arm; the design's own if not given.
         delay, period : float
             [s]
         gain : float
@@ -79,12 +79,12 @@ class Case:
         return full_order.poles(self.law, self.q, period or self.period, delay, met, gain)
 
     def decay(self, **changed):
-        """How fast the slowest part of the loop dies out [1/s]; negative: it grows."""
+        """Decay rate of the slowest pole [1/s]; negative if it grows."""
         return -float(self.poles(**changed)[0].real)
 
 
 def unchecked(scenario):
-    """The scenario with a design that is not refused for its poles."""
+    """The scenario, with a design that is not refused for its poles."""
     return replace(scenario, controller=scenario.controller | {"stability_margin": UNCHECKED})
 
 
@@ -94,7 +94,7 @@ def of(scenario):
     Raises
     ------
     FlexarmError
-        For an arm, a parameter, a design or a trajectory that is impossible.
+        For an impossible arm, parameter, design or trajectory.
     """
     scenario = unchecked(scenario)
     loop = scenarios.loop_of(scenario)
@@ -122,11 +122,11 @@ def redesigned(case, **parameters):
 
 
 def slower_bending(scenario, factor):
-    r"""The same design for an arm whose bending is slower: mu times `factor`, told to arm and controller alike.
+    r"""The same design for an arm whose bending is slower: mu times `factor`, in the arm and in the control model.
 
-    With EI and GJ by 1/factor^2 the fast time scale is `factor` times as long and everything else as it was. The
-    fast control is redesigned for the same loop in its own time: in (18) :math:`\delta/\mu^2`, :math:`\dot\delta/\mu`
-    and :math:`t/\mu` take the places of delta, its rate and t. Gains of other laws follow from the arm.
+    With EI and GJ times 1/factor^2 the fast time scale is `factor` times as long, and nothing else changes. The fast
+    control is redesigned for the same loop in its own time: in (18) :math:`\delta/\mu^2`, :math:`\dot\delta/\mu` and
+    :math:`t/\mu` replace delta, its rate and t. Gains of other laws follow from the arm.
 
     Parameters
     ----------
@@ -159,21 +159,21 @@ def slower_bending(scenario, factor):
 
 
 def first_loss(stable, start, end, scan=12, steps=20):
-    """Where a loop that is stable at `start` first is not, on the way to `end`; bisection after a scan.
+    """Where a loop that is stable at `start` becomes unstable first, on the way to `end`; bisection after a scan.
 
     Parameters
     ----------
     stable : callable
-        Of the value; a bool.
+        From a value: whether the loop is stable.
     start, end : float
-        Both above 0: the scan is geometric; otherwise even.
+        The scan's steps are geometric if both are above 0, otherwise even.
     scan, steps : int
-        Intervals of the scan, and halvings of the one that holds the loss.
+        Intervals of the scan, and bisections of the one in which stability is lost.
 
     Returns
     -------
     float or None
-        The last value known as stable, None: stable all the way. `start` itself where it is not stable there.
+        The last value known as stable; None if all are. `start` if the loop is unstable there.
     """
     grid = np.geomspace if min(start, end) > 0.0 else np.linspace
     values = grid(start, end, scan + 1)

@@ -7,6 +7,7 @@ import sys
 from flexarm_dynamics.errors import FlexarmError
 
 from ..loop import scenario as scenarios
+from ..loop.metrics import residual_window
 from ..progress import Progress
 from . import attraction, bound, margins, monte_carlo, report, scales
 from . import case as cases
@@ -15,8 +16,8 @@ from . import case as cases
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
-        "What can be said of an arm and a controller before the arm moves; some of it by "
-        "short runs."
+        "Analyses an arm and a controller before the arm moves; in part by short runs of the "
+        "nonlinear loop."
     )
     parser.epilog = (
         "example: flexarm analyze R paper_composite --out results/analysis --monte-carlo 100"
@@ -38,10 +39,12 @@ def add_arguments(parser):
         help="parameters beyond the file's: slow.kp=[4.0] fast.alpha=4.0",
     )
     add("--rate", type=float, help="samples per second [Hz] (as in the file, or 1000)")
-    add("--configurations", type=int, default=200, metavar="N", help="of the workspace (200)")
+    add(
+        "--configurations", type=int, default=200, metavar="N", help="number in the workspace (200)"
+    )
     add("--quick", action="store_true", help="no nonlinear runs, a shorter search for the bound")
-    add("--monte-carlo", type=int, metavar="N", help="N runs of arms that are not quite as told")
-    add("--seed", type=int, default=0, help="of configurations and samples (0)")
+    add("--monte-carlo", type=int, metavar="N", help="N runs of arms that differ from the model")
+    add("--seed", type=int, default=0, help="seed of configurations and samples (0)")
     add("--workers", type=int, metavar="N", help="processes of the Monte Carlo (one per core)")
     add(
         "--scheduler", metavar="ADDRESS", help="a Dask cluster for the Monte Carlo: tcp://host:8786"
@@ -56,12 +59,13 @@ def add_arguments(parser):
 
 def analyze(options):
     """Run the sub-command."""
-    if options.configurations < 1:
-        raise FlexarmError(f"--configurations {options.configurations}: 1 or more is wanted")
-    if options.seed < 0:
-        raise FlexarmError(f"--seed {options.seed}: 0 or more is wanted")
+    for name, least in (("configurations", 1), ("seed", 0)):
+        if (value := getattr(options, name)) < least:
+            raise FlexarmError(
+                "is too small", field=f"--{name}", value=value, limit=f"{least} or more"
+            )
     if options.monte_carlo is None and (options.workers or options.scheduler):
-        raise FlexarmError("--workers, --scheduler: only with --monte-carlo")
+        raise FlexarmError("only with --monte-carlo", field="--workers, --scheduler")
     values = scenarios.parameters(options.controller, options.set or ())
     scenario = scenarios.Scenario(
         options.arm, values, trajectory=options.trajectory, rate=options.rate
@@ -81,7 +85,7 @@ def analyze(options):
 
 
 def study(scenario, options, progress):
-    """Everything that was asked for.
+    """Run the requested analyses.
 
     Parameters
     ----------
@@ -94,7 +98,7 @@ def study(scenario, options, progress):
     -------
     dict
         Ready for JSON: ``scenario``, ``scales``, ``gain_sweep``, ``bound``, ``margins``, ``attraction`` (None if
-        quick), ``monte_carlo`` (None if not asked for).
+        quick), ``monte_carlo`` (None if not requested).
     """
     total = 3 + (not options.quick) + (options.monte_carlo is not None)
     progress.step("time scales and full-order poles", 1, total)
@@ -127,6 +131,7 @@ def study(scenario, options, progress):
             options.scheduler,
             progress,
         )
-        found["monte_carlo"] = monte_carlo.summary(results)
+        window = list(residual_window(scenario.window))
+        found["monte_carlo"] = monte_carlo.summary(results) | {"residual_window_s": window}
     progress.done()
     return found

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the loop withstands of what it was not told: delay, gain of the drives, payload, stiffness, a lower rate; noise.
+"""Margins: the delay, drive gain, payload, stiffness and lower rate that the loop withstands; its noise at rest.
 
-Each margin is where the sampled full-order loop, linear at the motion's end, loses stability: `full_order.closed_loop`
-with the full state, found by bisection. The loop's observer is not part of it. Where runs are wanted, the nonlinear
-loop with its observer is tried at 0.9 and 1.1 times the margin, and where its own is elsewhere, that is found by
-bisection.
+A margin is where the sampled full-order loop with full state, linearised at the motion's end, loses stability:
+`full_order.closed_loop`, by bisection. The observer is not part of it. With runs, the nonlinear loop with its
+observer is tried at 0.9 and 1.1 times the margin; if its own margin is elsewhere, bisection by runs finds it.
 """
 
 from dataclasses import dataclass, replace
@@ -19,10 +18,10 @@ from ..loop import scenario as scenarios
 from . import case as cases
 from . import trial
 
-#: How long the arm is held while noise is judged, the first part left out [s].
+#: How long the arm is held to judge noise, and the first part that is left out [s].
 HELD, SETTLING = 3.0, 1.0
-#: Bisections by runs, and how far beyond the margin they look.
-RUNS, FARTHEST = 4, 1.5
+#: Number of bisections by runs, and the largest multiple of the margin that they try [-].
+RUNS, MAX_MULTIPLE = 4, 1.5
 
 
 @dataclass(frozen=True)
@@ -33,11 +32,11 @@ class Margin:
     ----------
     name, unit, text : str
     start, end : float
-        From the nominal value to the farthest that is looked at.
+        Nominal value, and the farthest value that is tried.
     poles : callable
-        Of the case and the value: keywords of `Case.poles`.
+        From the case and a value: keywords of `Case.poles`.
     run : callable
-        Of the scenario and the value: the scenario, and the gain, of a run.
+        From the scenario and a value: scenario and gain of a run.
     """
 
     name: str
@@ -74,11 +73,11 @@ def kinds(case):
     )
 
 
-#: Plants that are always looked at: name, factor.
+#: Other plants whose decay is always computed: name, factor.
 PLANTS = tuple(
     [("payload", v) for v in (0.0, 0.5, 2.0, 3.0)] + [("stiffness", v) for v in (0.7, 1.0, 1.3)]
 )
-#: Margins that runs look at.
+#: Margins that runs confirm.
 TRIED = ("delay", "gain_high")
 
 
@@ -119,7 +118,7 @@ def study(case, runs=True, tried=TRIED, progress=None):
             every[kind.name] |= by_runs(case, kind, every[kind.name]["value"])
             if progress is not None:
                 progress.fraction((i + 1) / (len(names) + 1))
-    found["noise"] = noise(case) if runs else {"reason": "not asked for: --quick"}
+    found["noise"] = noise(case) if runs else {"reason": "not computed with --quick"}
     return found
 
 
@@ -136,36 +135,36 @@ def of_poles(case, kind):
     return {"value": value, "searched": kind.end, "unit": kind.unit, "text": kind.text}
 
 
-def _beside(kind, value, share):
-    """A value that lies on the safe side of a margin (share < 1), or beyond."""
+def _beside(kind, value, fraction):
+    """A value on the safe side of a margin (fraction < 1), or beyond it."""
     if kind.start == 0.0:
-        return share * value
-    return kind.start * (value / kind.start) ** share if value > 0.0 else value
+        return fraction * value
+    return kind.start * (value / kind.start) ** fraction if value > 0.0 else value
 
 
 def by_runs(case, kind, value):
-    """What nonlinear runs say of a margin.
+    """Check a margin by nonlinear runs.
 
-    `kind` is the margin's name, `value` what the linear loop says.
+    `kind` is the `Margin`, `value` that of the linear loop.
 
     Returns
     -------
     dict
-        ``confirmed``: stable at 0.9, unstable at 1.1 of the way (in the logarithm for factors); ``simulated``:
-        where the loop with its observer loses stability if it is elsewhere, else None; ``at_least``: whether
-        that is only how far was looked.
+        ``confirmed``: stable at 0.9 and unstable at 1.1 of the margin (of its logarithm for factors); ``simulated``:
+        the margin of the loop with its observer where it differs, else None; ``at_least``: whether that is only
+        the largest value tried.
     """
     unstable = kind.poles(case, _beside(kind, value, 1.02))
     watched = trial.long_enough(case.poles(**unstable)[0])
 
-    def stable(share):
-        scenario, gain = kind.run(case.scenario, _beside(kind, value, share))
+    def stable(fraction):
+        scenario, gain = kind.run(case.scenario, _beside(kind, value, fraction))
         return trial.dies_out(scenario, case.q, gain, watched)
 
     inside, beyond = stable(0.9), stable(1.1)
     if inside and not beyond:
         return {"confirmed": True, "simulated": None, "at_least": False}
-    good, bad = (1.1, FARTHEST) if inside else (0.0, 0.9)
+    good, bad = (1.1, MAX_MULTIPLE) if inside else (0.0, 0.9)
     if inside and stable(bad):
         return {"confirmed": False, "simulated": _beside(kind, value, bad), "at_least": True}
     for _ in range(RUNS):
@@ -175,7 +174,7 @@ def by_runs(case, kind, value):
 
 
 def noise(case):
-    """Rms motion of the tip while the arm is held at the motion's end, with the noise that the arm file states."""
+    """Rms motion of the tip while the arm is held at the motion's end, with the noise of the arm file."""
     gauges = case.arm.gauges
     if not any(g.noise or g.drift for g in gauges):
         return {"reason": f"the arm file of {case.arm.name} states none", "tip_rms_mm": None}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many runs of an arm that is not quite what its controller was told: payload, stiffness, damping, delay, noise.
+"""Monte Carlo: many runs of arms that differ from the control model in payload, stiffness, damping, delay and noise.
 
-Sample i is drawn from ``SeedSequence(seed, spawn_key=(i,))`` alone, and its run is the same to the last bit wherever
-it takes place: neither the number of workers nor an interruption changes a result. With a directory, results are
-appended to a JSON-lines file as they come; its first line is the specification.
+Sample i is drawn from ``SeedSequence(seed, spawn_key=(i,))`` alone, and its run is the same to the last bit on any
+worker: neither the number of workers nor an interruption changes a result. With a directory, results are appended to a
+JSON-lines file as they come; its first line is the specification.
 """
 
 import hashlib
@@ -45,12 +45,12 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True)
 class Specification:
-    """What is drawn and run; plain data, all of it in the file's first line.
+    """What is drawn and run: plain data, stored in the file's first line.
 
     Attributes
     ----------
     scenario : dict
-        As `Scenario.as_dict` has it: the nominal run.
+        The nominal run, from `Scenario.as_dict`.
     seed : int
     ranges : dict
         Name to (low, high).
@@ -70,10 +70,10 @@ def specification(scenario, seed=0):
     Raises
     ------
     FlexarmError
-        For a negative seed, an arm file that is not there.
+        For a negative seed, and a missing arm file.
     """
     if seed < 0:
-        raise ParameterError(f"--seed {seed}: 0 or more is wanted")
+        raise ParameterError("is too small", field="--seed", value=seed, limit="0 or more")
     arms = {a for a in (scenario.arm, scenario.plant_arm) if a}
     files = {a: hashlib.sha256(arm_file.find(a).read_bytes()).hexdigest() for a in sorted(arms)}
     return Specification(scenario.as_dict(), seed, files=files)
@@ -87,15 +87,13 @@ def draw(spec, number):
 
 
 def sample(spec, number):
-    """Run a sample; for other processes, too.
-
-    `spec` says what is drawn, `number` which sample it is.
+    """Run sample `number` of a specification; also called in other processes.
 
     Returns
     -------
     dict
-        ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; the greatest of what is per
-        joint. A run that is refused is lost, its error the reason.
+        ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; of metrics per joint the
+        largest. A refused run counts as lost, with its error as the reason.
     """
     drawn = draw(spec, number)
     try:
@@ -113,18 +111,18 @@ def _one(value):
 
 
 def run(spec, count, directory=None, workers=None, scheduler=None, progress=None):
-    """All samples from 0 to count - 1; those that the directory's file has are not run again.
+    """Run the samples from 0 to count - 1; those in the directory's file are not run again.
 
     Parameters
     ----------
     spec : Specification
     count : int
     directory : str or Path, optional
-        Where results are kept.
+        For the file of results.
     workers : int, optional
-        Processes; as many as cores if not given, none beside this one for 1.
+        Number of processes; one per core if not given. 1: everything in this process.
     scheduler : str, optional
-        Address of a Dask scheduler, whose workers have flexarm, to be used instead.
+        Address of a Dask scheduler to use instead; its workers need flexarm.
     progress : Progress, optional
 
     Returns
@@ -135,11 +133,11 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
     Raises
     ------
     FlexarmError
-        For a file of another specification, and where Dask is not installed or its scheduler not reached.
+        For a file of another specification, and where Dask is not installed or its scheduler can't be reached.
     """
     for name, value in (("--monte-carlo", count), ("--workers", workers)):
         if value is not None and value < 1:
-            raise ParameterError(f"{name} {value}: 1 or more is wanted")
+            raise ParameterError("is too small", field=name, value=value, limit="1 or more")
     keep = None if directory is None else Store(Path(directory) / FILE, spec)
     results = {} if keep is None else {n: r for n, r in keep.results.items() if n < count}
     missing = [n for n in range(count) if n not in results]
@@ -157,7 +155,7 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
 
 
 def _results(spec, missing, workers, scheduler):
-    """Results as they come."""
+    """Yield results as they come."""
     if not missing:
         return
     workers = min(workers or os.cpu_count() or 1, len(missing))
@@ -169,7 +167,7 @@ def _results(spec, missing, workers, scheduler):
 
 
 def through(executor, spec, missing):
-    """Results of samples, as they come, from any `concurrent.futures` executor."""
+    """Yield results of samples, as they come, from any `concurrent.futures` executor."""
     waiting = [executor.submit(sample, spec, n) for n in missing]
     try:
         for future in as_completed(waiting):
@@ -185,13 +183,15 @@ def _dask(address):
         from distributed import Client
     except ImportError:
         raise FlexarmError(
-            "--scheduler: Dask is not installed here: pip install distributed (and flexarm on its workers)"
+            "needs Dask, which is not installed",
+            field="--scheduler",
+            hint="pip install distributed (and flexarm on its workers)",
         ) from None
     try:
         client = Client(address, timeout=10)
     except (OSError, ValueError, TimeoutError) as error:
         raise FlexarmError(
-            f"--scheduler {address}: no Dask scheduler is reached: {error}"
+            f"is no Dask scheduler that can be reached: {error}", field="--scheduler", value=address
         ) from None
     with client, client.get_executor(pure=False) as executor:
         yield executor
@@ -203,18 +203,18 @@ class Store:
     Parameters
     ----------
     path : Path
-        Made if it is not there. A last line that an interruption cut off is dropped.
+        Created if missing. A last line that an interruption cut off is dropped.
     spec : Specification
 
     Attributes
     ----------
     results : dict
-        By sample number: what the file had.
+        Those already in the file, by sample number.
 
     Raises
     ------
     FlexarmError
-        For a file of another specification, or one that is none of ours.
+        For a file of another specification, and for any other file.
     """
 
     def __init__(self, path, spec):
@@ -231,7 +231,7 @@ class Store:
             self._write(header)
 
     def _whole(self):
-        """Rows of the lines that are whole; the file is cut after them."""
+        """Rows of the complete lines; the file is cut after them."""
         data = self.path.read_bytes()
         end = data.rfind(b"\n") + 1
         try:
@@ -241,9 +241,11 @@ class Store:
             ):
                 raise ValueError("not rows of samples")
         except ValueError as error:
-            raise FlexarmError(f"{self.path}: not a file of Monte Carlo results: {error}") from None
+            raise FlexarmError(
+                f"not a file of Monte Carlo results: {error}", field=str(self.path)
+            ) from None
         if not rows and data and not data.startswith(b'{"specification"'):
-            raise FlexarmError(f"{self.path}: not a file of Monte Carlo results")
+            raise FlexarmError("not a file of Monte Carlo results", field=str(self.path))
         os.truncate(self.path, end)
         return rows
 
@@ -252,15 +254,16 @@ class Store:
             return
         old, new = there.get("specification"), wanted["specification"]
         if not isinstance(old, dict):
-            raise FlexarmError(f"{self.path}: not a file of Monte Carlo results")
+            raise FlexarmError("not a file of Monte Carlo results", field=str(self.path))
         other = sorted(k for k in {*old, *new} if old.get(k) != new.get(k))
         raise FlexarmError(
-            f"{self.path} has results of another specification ({', '.join(other)} differ): take another --out,"
-            " or remove the file"
+            f"has results of another specification ({', '.join(other)} differ)",
+            field=str(self.path),
+            hint="use another --out, or remove the file",
         )
 
     def append(self, result):
-        """Keep a result; it is on the disk when this returns."""
+        """Write a result to the file at once."""
         self._write(result)
 
     def _write(self, row):
@@ -268,12 +271,12 @@ class Store:
         self._file.flush()
 
     def close(self):
-        """No more results."""
+        """Close the file."""
         self._file.close()
 
 
 def summary(results):
-    """Share of lost runs and quantiles of the others' metrics.
+    """Fraction of lost runs, and quantiles of the other runs' metrics.
 
     Parameters
     ----------
@@ -282,7 +285,7 @@ def summary(results):
     Returns
     -------
     dict
-        ``samples``, ``lost``, ``lost_share``, ``lost_share_95``: its 95 % interval after Wilson;
+        ``samples``, ``lost``, ``lost_share`` (a fraction), ``lost_share_95``: its 95 % interval after Wilson;
         ``not_settled``; ``quantiles``: per metric those of `QUANTILES`, and ``max``; ``lost_samples``: numbers and
         reasons.
     """
@@ -307,7 +310,7 @@ def summary(results):
 
 
 def _wilson(k, n, z=1.959963984540054):
-    share, square = k / n, z * z / n
-    middle = (share + 0.5 * square) / (1.0 + square)
-    half = z * math.sqrt(share * (1.0 - share) / n + 0.25 * square / n) / (1.0 + square)
+    p, square = k / n, z * z / n
+    middle = (p + 0.5 * square) / (1.0 + square)
+    half = z * math.sqrt(p * (1.0 - p) / n + 0.25 * square / n) / (1.0 + square)
     return [max(0.0, middle - half), min(1.0, middle + half)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An analysis in words and columns, for a terminal."""
+"""The text of an analysis, for a terminal."""
 
 from ..loop.scenario import type_of
 
@@ -46,11 +46,11 @@ def lines(found):
 
 
 def _poles(poles):
-    """Conjugates once."""
+    """Poles as text, conjugate pairs once."""
     if poles is None:
         return "-"
     size = max(abs(complex(*p)) for p in poles)
-    # Undamped poles lie at zero but for rounding.
+    # Undamped poles lie at zero, apart from rounding.
     upper = [(0.0 if abs(re) < 1e-10 * size else re, im) for re, im in poles if im >= 0.0]
     return ", ".join(f"{re:.4g}" + (f" +- {im:.4g}j" if im else "") for re, im in upper)
 
@@ -153,10 +153,12 @@ def _attraction(a):
 
 def _monte_carlo(m):
     low, high = m["lost_share_95"]
-    share = f"{m['lost']} of {m['samples']} (95 % interval of the share {low:.3g} to {high:.3g})"
-    yield _row("arm lost", share)
+    lost = f"{m['lost']} of {m['samples']} (95 % interval of the fraction {low:.3g} to {high:.3g})"
+    yield _row("arm lost", lost)
     yield _row("not settled within the tolerance", str(m["not_settled"]))
     names = next(iter(m["quantiles"].values()), {})
     yield "  " + f"{'quantile':28}" + "".join(f"{k:>12}" for k in names)
     for name, values in m["quantiles"].items():
         yield "  " + f"{name:28}" + "".join(f"{v:12.4g}" for v in values.values())
+    start, end = m["residual_window_s"]
+    yield f"  residual: {start:g} to {end:g} s after the motion"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time scales: mu, spectra of the slow and the fast subsystem, what the torques can reach, along the motion and beyond.
+"""Time scales: mu, spectra of the slow and fast subsystems, and reachability by the torques, over the workspace.
 
-mu is the paper's estimate, the slow subsystem's highest frequency under its control over the smallest frequency of
-the boundary layer (11) without control.
+mu is the paper's estimate: the highest frequency of the slow subsystem under its control, divided by the smallest
+frequency of the boundary layer (11) without control.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ from flexarm_dynamics.singular_perturbation import (
 
 from . import case as cases
 
-#: Joints without limits are taken to turn this far either way [rad].
+#: Range of joints without limits, to either side [rad].
 TURN = np.pi
 #: Factors of slow.kp in the sweep.
 GAINS = np.geomspace(0.1, 10.0, 13)
@@ -152,9 +152,9 @@ def spectra(case, slow):
 
 
 def gain_sweep(case, factors=GAINS):
-    """What a faster slow loop does to the bending: full-order poles over slow.kp, kv critically damped.
+    """How a faster slow loop affects the bending: full-order poles over slow.kp, with kv for critical damping.
 
-    `factors` are of slow.kp [-].
+    `factors` multiply slow.kp [-].
 
     Returns
     -------

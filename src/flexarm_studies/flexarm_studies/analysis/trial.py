@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs that tell whether the nonlinear loop, sensors, observer and limits included, is stable."""
+"""Runs that show whether the nonlinear loop is stable, with its sensors, observer and limits."""
 
 from dataclasses import replace
 
@@ -9,20 +9,20 @@ from flexarm_dynamics.errors import FlexarmError, MessageError
 
 from ..loop import scenario as scenarios
 
-#: A small motion that excites all modes, as a step would without a limit: [rad], [s].
+#: Size and duration of a small motion that excites all modes, like a step but within the limits: [rad], [s].
 SIZE, RISE = 0.02, 0.15
-#: How long it is watched, at least and at most [s].
-WATCHED, LONGEST = 3.0, 10.0
-#: What dies out is in the last third of the time no more than this share of what it was in the one before.
-SHARE = 0.95
-#: What has come to rest to this is at rest [rad], [m], [N m].
+#: Shortest and longest time over which it is watched [s].
+WATCHED, MAX_WATCHED = 3.0, 10.0
+#: A motion dies out if it is in the last third of the time at most this fraction of the third before [-].
+DECAYED = 0.95
+#: Anything smaller than this is at rest [rad], [m], [N m].
 REST = 1e-7
 
 
 def long_enough(pole):
-    """How long to watch a loop whose critical pole this is [s]: a whole oscillation in each third of the time."""
+    """How long to watch a loop with this critical pole [s]: each third of the time holds a whole oscillation."""
     period = 2.0 * np.pi / abs(pole.imag) if pole.imag else 0.0
-    return float(min(max(WATCHED, 3.0 * period), LONGEST))
+    return float(min(max(WATCHED, 3.0 * period), MAX_WATCHED))
 
 
 def small_motion(q):
@@ -35,7 +35,7 @@ def small_motion(q):
 
 
 def dies_out(scenario, q, gain=1.0, watched=WATCHED):
-    """Whether what a small motion to q leaves behind dies out.
+    """Whether the vibration that a small motion to q leaves dies out.
 
     Parameters
     ----------
@@ -44,16 +44,15 @@ def dies_out(scenario, q, gain=1.0, watched=WATCHED):
     q : ndarray, shape (n,)
         [rad]
     gain : float
-        Of the torque on its way to the arm [-].
+        Factor on the torque between controller and arm [-].
     watched : float
         [s]
 
     Returns
     -------
     bool
-        False for a loop whose joints and deflections, or whose torque, move no less in the last third of the time
-        than in the one before, that still meets a torque limit in the last third, that loses the arm or is
-        refused.
+        False if joints and deflections, or the torque, move in the last third of the time as much as in the third
+        before; if the torque is at its limit in the last third; if the loop loses the arm or is refused.
     """
     trial = replace(scenario, trajectory=small_motion(q), repeat=1)
     try:
@@ -70,17 +69,17 @@ def dies_out(scenario, q, gain=1.0, watched=WATCHED):
     third = watched / 3.0
     middle = (record.time > RISE + third) & (record.time <= RISE + 2.0 * third)
     last = record.time > RISE + 2.0 * third
-    if record.saturated[last].any():  # a limit cycle: what grows has come to the limit
+    if record.saturated[last].any():  # a limit cycle: it has grown up to the limit
         return False
     state = np.hstack([record.plant_position, record.plant_amplitude])
     moves = lambda values, when: np.linalg.norm(values[when].std(0))  # noqa: E731
     return bool(
-        all(moves(v, last) < max(SHARE * moves(v, middle), REST) for v in (state, record.torque))
+        all(moves(v, last) < max(DECAYED * moves(v, middle), REST) for v in (state, record.torque))
     )
 
 
 def weaken(simulator, gain):
-    """Let the simulated drives give `gain` times the torque that they are told."""
+    """Let the simulated drives apply `gain` times the commanded torque."""
     advance = simulator.advance
 
     def scaled(torque, before=None, share=0.0):
