@@ -106,6 +106,42 @@ def test_the_table_goes_between_the_markers_alone(tmp_path):
         latency.write(file, "new")
 
 
+def row(chain, median, missed):
+    return {"chain": chain, "latency_ms": {"p50": median}, "missed": missed}
+
+
+@pytest.mark.parametrize(
+    ("load", "median", "missed", "said"),
+    [
+        (0.2, 0.7, 0.04, ""),
+        (3.0, 0.7, 0.04, "3.0 processes per CPU"),
+        (0.2, 2.5, 0.04, "relay 2.5 ms"),
+        (0.2, 0.7, 0.45, "45 % of the relay's samples"),
+    ],
+)
+def test_a_busy_machine_is_known_by_its_load_and_by_the_relay(load, median, missed, said):
+    everything = [{"rows": [row("relay", median, missed), row("three processes", 9.0, 0.9)]}]
+    found = latency.too_busy(load, everything)
+    assert said in found and bool(found) == bool(said)
+
+
+def test_a_busy_machine_writes_no_table_unless_forced(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "page.md"
+    page = f"{latency.BEGIN}\nold\n{latency.END}\n"
+    file.write_text(page)
+
+    def measured(everything, cases, options, title, of):
+        everything.append({"rows": [row("relay", 2.5, 0.45)]})
+        return "new"
+
+    monkeypatch.setattr(latency, "_table_of", measured)
+    with pytest.raises(FlexarmError, match="is not written: the machine was too busy"):
+        latency.latency(options("--quick", "--arms", "R", "--write", str(file)))
+    assert file.read_text() == page and "too busy" in capsys.readouterr().out
+    latency.latency(options("--quick", "--arms", "R", "--force", "--write", str(file)))
+    assert "new" in file.read_text()
+
+
 def test_motions_of_the_cases_are_those_of_their_arms():
     from flexarm_dynamics.arm import arm_file
 

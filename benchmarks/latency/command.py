@@ -2,6 +2,7 @@
 """``flexarm latency``: its options, and the tables that it writes; `measure` has what is measured."""
 
 import json
+import os
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
@@ -12,6 +13,9 @@ from . import redesign
 from .measure import CASES, CHAINS, measure, summary, table
 
 BEGIN, END = "<!-- latency: begin -->", "<!-- latency: end -->"
+#: A machine with more is too busy for a table: processes per CPU before the start, median of the bare relay [ms], and
+#: fraction of the relay's samples answered too late. On a quiet machine of two cores the last two are 0.7 ms and 0.04.
+MAX_LOAD, MAX_RELAY_MS, MAX_RELAY_LATE = 0.5, 1.5, 0.1
 
 
 def write(file, text):
@@ -51,7 +55,12 @@ def add_arguments(parser):
         help="then, at 500 Hz, the loop while its fast law is designed anew; five minutes more",
     )
     parser.add_argument("--json", metavar="FILE", help="all figures, window by window")
-    parser.add_argument("--write", metavar="FILE", help="put the table between a file's markers")
+    parser.add_argument(
+        "--write",
+        metavar="FILE",
+        help="put the table between a file's markers, unless the machine was too busy",
+    )
+    parser.add_argument("--force", action="store_true", help="write, however busy the machine was")
 
 
 def chosen(options):
@@ -65,6 +74,33 @@ def chosen(options):
             f" {'; '.join(c.name for c in CASES)}"
         )
     return cases
+
+
+def too_busy(load, everything):
+    """Why the machine was too busy for a table; empty where it was not.
+
+    Parameters
+    ----------
+    load : float
+        Processes per CPU before the start.
+    everything : list of dict
+        What was measured, case by case; the relay's rows show what the machine alone costs.
+
+    Returns
+    -------
+    str
+    """
+    relay = [r for case in everything for r in case["rows"] if r.get("chain") == "relay"]
+    median = max((r["latency_ms"]["p50"] for r in relay), default=0.0)
+    late = max((r["missed"] for r in relay), default=0.0)
+    reasons = {
+        f"{load:.1f} processes per CPU before the start (at most {MAX_LOAD:g})": load > MAX_LOAD,
+        f"median of the bare relay {median:.1f} ms (at most {MAX_RELAY_MS:g})": median
+        > MAX_RELAY_MS,
+        f"{100.0 * late:.0f} % of the relay's samples late (at most {100.0 * MAX_RELAY_LATE:g} %)": late
+        > MAX_RELAY_LATE,
+    }
+    return "; ".join(text for text, holds in reasons.items() if holds)
 
 
 def _table_of(everything, cases, options, title, measured):
@@ -106,7 +142,7 @@ def _while_designing(case, options, progress):
 def latency(options):
     """The sub-command."""
     tables, everything = [], []
-    cases = chosen(options)
+    cases, load = chosen(options), os.getloadavg()[0] / (os.cpu_count() or 1)
     again = [case for case in cases if case.rate == 500.0]
     if options.redesign and not again:
         raise FlexarmError("latency --redesign is measured at 500 Hz: have it among the --rates")
@@ -115,5 +151,10 @@ def latency(options):
         tables.append(_table_of(everything, again, options, "while designing", _while_designing))
     if options.json:
         Path(options.json).write_text(json.dumps(everything, indent=1) + "\n", encoding="utf-8")
+    busy = too_busy(load, everything)
+    if busy:
+        print(f"The machine was too busy for a table that is to be kept: {busy}.")
+    if options.write and busy and not options.force:
+        raise FlexarmError(f"{options.write} is not written: the machine was too busy; see --force")
     if options.write:
         write(options.write, "\n\n".join(tables))

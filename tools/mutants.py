@@ -1,0 +1,559 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Puts one error at a time into a copy of the sources, and runs the tests that must fail: `make mutants`.
+
+Each mutation is one replacement in one file. It is caught when a named test fails; a test run that cannot start, or
+ends otherwise, is an error. ``-k TEXT`` chooses those whose name or file has the text in it.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+#: What a copy needs: sources and what their tests read.
+COPIED = ("src", "tests", "config", "pyproject.toml", "conftest.py")
+LEFT_OUT = shutil.ignore_patterns("__pycache__", "*.egg-info", ".pytest_cache", ".hypothesis")
+#: Of one mutation [s].
+TIMEOUT = 1800.0
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One error.
+
+    Attributes
+    ----------
+    name : str
+        What is wrong then.
+    file : str
+        Below ``src``.
+    old, new : str
+        Text that occurs once in the file, and what takes its place.
+    tests : str
+        Arguments of pytest, relative to ``src``.
+    """
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+def of(package, folder, tests, *rows):
+    """Mutants of modules in one folder: rows of (module, name, old, new), or with tests of their own at the end."""
+    return [
+        Mutant(name, f"{package}/{package}/{folder}/{module}.py", old, new, *(own or [tests]))
+        for module, name, old, new, *own in rows
+    ]
+
+
+CHAIN = "flexarm_dynamics/test/test_chain.py"
+FORCES = f"{CHAIN}::test_forces_are_those_of_a_second_derivation"
+FORWARD = f"{CHAIN}::test_forward_dynamics_solve_what_the_terms_say"
+ENERGY = f"{CHAIN}::test_energies_and_momenta_are_sums_over_all_that_has_mass"
+POINTS = f"{CHAIN}::test_points_turn_and_move_as_in_the_second_derivation"
+IMPLICIT = "flexarm_sim/test/test_chain_simulation.py -k implicit"
+ONE_LINK = "flexarm_dynamics/test/test_one_link.py -k kernel"
+STEPPER = "flexarm_dynamics/test/test_one_link.py -k stepper"
+ORDER = "flexarm_sim/test/test_chain_simulation.py::test_order_of_the_integrators"
+
+KERNELS = of(
+    "flexarm_dynamics",
+    "kernels",
+    FORCES,
+    (
+        "chain",
+        "centripetal force of a link: sign of 2 w x c'",
+        "t[1, 0], t[1, 1], t[1, 2] = 0.0, 2.0 * cyd, 2.0 * czd",
+        "t[1, 0], t[1, 1], t[1, 2] = 0.0, -2.0 * cyd, 2.0 * czd",
+    ),
+    (
+        "chain",
+        "Coriolis force on a mode: factor",
+        "wy * along - w2 * gy - 2.0 * wx * gzd",
+        "wy * along - w2 * gy - wx * gzd",
+    ),
+    (
+        "chain",
+        "centrifugal force on a mode: missing",
+        "wz * along - w2 * gz + 2.0 * wx * gyd",
+        "wz * along + 2.0 * wx * gyd",
+    ),
+    ("chain", "coupling of a mode to the joint: sign", "w.l[i, j, 1] = -e\n", "w.l[i, j, 1] = e\n"),
+    ("chain", "inertia of a bent link: missing", "    J[1, 1] += zz\n", ""),
+    ("chain", "inertia of a bent link: index", "    J[0, 2] -= xz\n", "    J[0, 2] -= xy\n"),
+    (
+        "chain",
+        "moment of r x (w x r'): sign",
+        "N[1] += 2.0 * (wy * rr - (",
+        "N[1] += 2.0 * (wy * rr + (",
+    ),
+    (
+        "chain",
+        "foreshortening: factor",
+        "            w.node[0, g] = 0.5 * u\n",
+        "            w.node[0, g] = u\n",
+    ),
+    (
+        "chain",
+        "foreshortening's acceleration: missing",
+        "bias[0], bias[1], bias[2] = t[5, 0] - w.node[3, g]",
+        "bias[0], bias[1], bias[2] = t[5, 0]",
+    ),
+    (
+        "chain",
+        "foreshortening of the tip: sign",
+        "w.partial[n, j, 0] = -w.node_partial[1, G, j]",
+        "w.partial[n, j, 0] = w.node_partial[1, G, j]",
+    ),
+    (
+        "chain",
+        "elastic force of finite slopes: missing",
+        "kz2 * phi2 + kz2 * kz2 * sz * phi1",
+        "kz2 * phi2",
+    ),
+    (
+        "chain",
+        "tip's Coriolis acceleration: factor",
+        "        t[5, k] += 2.0 * rate[k]\n",
+        "        t[5, k] += rate[k]\n",
+    ),
+    ("chain", "tip's angular acceleration: missing", "    bias_al[0] += ad * bd * ca\n", ""),
+    (
+        "chain",
+        "joint's offset from the tip: missing",
+        "cross(carried, t[8], t[9])",
+        "cross(om, t[8], t[9])",
+    ),
+    (
+        "chain",
+        "twist of a tip's frame: sign",
+        "-ca * st - sa * sb * ct,",
+        "ca * st - sa * sb * ct,",
+    ),
+    (
+        "chain",
+        "payload's centrifugal force: missing",
+        "    cross(om, w.t[0], zf)\n",
+        "    cross(om, s, zf)\n",
+    ),
+    (
+        "chain",
+        "gravity: sign",
+        "        w.a0[0, k] = -w.a0[0, k]\n",
+        "        w.a0[0, k] = w.a0[0, k]\n",
+    ),
+    (
+        "chain",
+        "rotor: its gear",
+        "w.u[n] = d.rotor[n] * (dot(d.axis[n], w.al[n]) + d.gear[n] * qdd[n])",
+        "w.u[n] = d.rotor[n] * (dot(d.axis[n], w.al[n]) + qdd[n])",
+    ),
+    (
+        "chain",
+        "articulated inertia: sign of a coupling",
+        "- Y[a, k] * S[k, b] - tm[5, a, k]",
+        "+ Y[a, k] * S[k, b] - tm[5, a, k]",
+        FORWARD,
+    ),
+    (
+        "chain",
+        "elimination of a mode: sign",
+        "            w.zn[i, a] += ga * r\n",
+        "            w.zn[i, a] -= ga * r\n",
+        FORWARD,
+    ),
+    (
+        "chain",
+        "elimination of a joint: rotor missing",
+        "D = dot(a, Ua) + d.gear[i] * d.gear[i] * d.rotor[i] + extra",
+        "D = dot(a, Ua) + extra",
+        FORWARD,
+    ),
+    (
+        "chain",
+        "momentum: coupling of a mode missing",
+        "                    L[k] += w.l[i, j, k] * delta_d[d.first[i] + j]\n",
+        "",
+        ENERGY,
+    ),
+    ("chain", "implicit method: gamma", "gamma = 1.0 - np.sqrt(0.5)", "gamma = 0.5", IMPLICIT),
+    (
+        "one_link",
+        "centrifugal stiffness: sign",
+        "r2 = ri + qd * qd * gi",
+        "r2 = ri - qd * qd * gi",
+        ONE_LINK,
+    ),
+    ("one_link", "Coriolis torque: factor", "r1 -= 2.0 * qd * gi", "r1 -= qd * gi", ONE_LINK),
+    (
+        "integrators",
+        "viscous friction: sign",
+        "fraction * change[i] - friction[i, 0] * rate",
+        "fraction * change[i] + friction[i, 0] * rate",
+        STEPPER,
+    ),
+    (
+        "integrators",
+        "a stage's step",
+        "point[v] = state[v] + ahead * rate[v]",
+        "point[v] = state[v] + gain * rate[v]",
+        ORDER,
+    ),
+)
+
+TESTS = "flexarm_control/test/"
+LAWS = [
+    *of(
+        "flexarm_control",
+        "slow",
+        TESTS + "test_slow_laws.py",
+        (
+            "linear_model_following",
+            "the inertia: factor",
+            "return self.B_inverse(terms) @ v\n",
+            "return 0.98 * self.B_inverse(terms) @ v\n",
+        ),
+        (
+            "model_following",
+            "(13): a sign",
+            "v = self.Lambda0 * q + self.Lambda1 * qd + u_hat",
+            "v = self.Lambda0 * q - self.Lambda1 * qd + u_hat",
+        ),
+        (
+            "computed_torque",
+            "gravity and velocity torque: missing",
+            "u = np.linalg.solve(B, v - a)",
+            "u = np.linalg.solve(B, v)",
+            TESTS + "test_more_slow_laws.py",
+        ),
+        (
+            "resolved_acceleration",
+            "null space: missing",
+            "return y + self.damped_inverse(J) @ (b - J @ y)",
+            "return self.damped_inverse(J) @ (b - J @ y)",
+            TESTS + "test_more_slow_laws.py",
+        ),
+        (
+            "sliding_mode",
+            "surface: sign",
+            "s = rate + self.slope * error",
+            "s = rate - self.slope * error",
+            TESTS + "test_more_slow_laws.py",
+        ),
+        (
+            "adaptive_model_following",
+            "regressor: velocity torque missing",
+            "Y += self._coriolis(self._difference, q, qd, speed)",
+            "Y += 0.0",
+            TESTS + "test_more_slow_laws.py",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "fast",
+        TESTS + "test_more_fast_laws.py",
+        (
+            "lqr",
+            "(20): alpha missing",
+            "_solve(A2 + alpha * np.eye(A2.shape[0]), B2, q, parameters)",
+            "_solve(A2, B2, q, parameters)",
+            TESTS + "test_fast_laws.py",
+        ),
+        (
+            "pole_placement",
+            "damping's sign",
+            "wanted = np.stack([-damping * omega + imaginary",
+            "wanted = np.stack([damping * omega + imaginary",
+        ),
+        (
+            "output_feedback",
+            "its estimator's gain",
+            "(1.0 - rho) * (Phi[m:, m:] @ inverse",
+            "(1.0 + rho) * (Phi[m:, m:] @ inverse",
+        ),
+        ("scheduled_lqr", "interpolation", "for v in (1.0 - t, t)]", "for v in (t, 1.0 - t)]"),
+    ),
+    *of(
+        "flexarm_control",
+        "manifold",
+        TESTS + "test_manifolds.py",
+        (
+            "expansion",
+            "inertia of the bending: sign",
+            "self.delta - self._solve(self.terms.M[n:, n:] @ second",
+            "self.delta + self._solve(self.terms.M[n:, n:] @ second",
+        ),
+        (
+            "corrected",
+            "the error's own motion: sign",
+            "        motion[1] -= later[n:]\n",
+            "        motion[1] += later[n:]\n",
+        ),
+        (
+            "quasi_steady",
+            "(9): gone",
+            "self.amplitude[:] = quasi_steady_state(terms, slow_torque)",
+            "self.amplitude[:] = 0.0",
+        ),
+        (
+            "reference",
+            "its feed-forward: gone",
+            "self.feedforward[:] = here.feedforward(delta, rate, second)",
+            "self.feedforward[:] = 0.0",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "feedforward",
+        TESTS + "test_look_ahead.py flexarm_studies/test/test_beyond_the_paper.py",
+        ("model", "the regulator's gain: sign", "    return B.T @ P\n", "    return -B.T @ P\n"),
+        (
+            "preview",
+            "torque of the coming period",
+            "plan.torque_at(elapsed + 0.5 * self._period)",
+            "0.9 * plan.torque_at(elapsed)",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "observers",
+        TESTS + "test_observers.py",
+        (
+            "filtered_derivative",
+            "settling",
+            "self.rate *= np.exp(-self.bandwidth * dt)",
+            "self.rate *= np.exp(-2.0 * self.bandwidth * dt)",
+        ),
+        (
+            "luenberger",
+            "its correction: missing",
+            "predicted[m:] + L @ self.innovation",
+            "predicted[m:]",
+        ),
+        ("true_rates", "a rate", "self.rate[:] = sample.rate", "self.rate[:] = 0.0"),
+        (
+            "kalman",
+            "covariance: half of Joseph's form",
+            "        P -= (P[:, :p] - gain.T @ R) @ gain\n",
+            "",
+            TESTS + "test_kalman.py",
+        ),
+        (
+            "motion",
+            "the rest of a step: missing",
+            "            out += rest * (rate + (0.5 * rest) * (step.A @ rate))\n",
+            "            pass\n",
+            TESTS + "test_kalman.py",
+        ),
+        (
+            "extended_kalman",
+            "payload's scale",
+            "one = (2.0 - s) * mass_matrix(model, q, delta)",
+            "one = (1.0 - s) * mass_matrix(model, q, delta)",
+            TESTS + "test_kalman.py",
+        ),
+        (
+            "gauge_health",
+            "a gauge that is silent",
+            "self.health[~np.isfinite(strain)] = MISSING",
+            "self.health[~np.isfinite(strain)] = GOOD",
+            TESTS + "test_gauge_health.py",
+        ),
+    ),
+]
+
+LIMITS = [
+    *of(
+        "flexarm_control",
+        "loop",
+        TESTS + "test_arm_controller.py " + TESTS + "test_plausibility.py",
+        (
+            "supervisor",
+            "velocity limit: never",
+            "np.abs(qd, out=value[speeds])",
+            "value[speeds] = 0.0",
+        ),
+        (
+            "supervisor",
+            "deflection limit: only one sign",
+            "np.abs(amplitude, out=value[bends])",
+            "value[bends] = amplitude",
+        ),
+        (
+            "supervisor",
+            "strain limit: never",
+            "np.abs(self._rows @ amplitude, out=value[strains])",
+            "value[strains] = 0.0",
+        ),
+        (
+            "supervisor",
+            "tracking error: only one sign",
+            "np.abs(error, out=value[errors])",
+            "value[errors] = error",
+        ),
+        (
+            "supervisor",
+            "braking distance: factor",
+            "speed * abs(speed) / (2.0 * able)",
+            "speed * abs(speed) / (20.0 * able)",
+        ),
+        (
+            "supervisor",
+            "time at the torque limit: never",
+            "value[-1] = self._saturated_for",
+            "value[-1] = 0.0",
+        ),
+        (
+            "supervisor",
+            "a limit that stays exceeded: never a fault",
+            'if self._exceeded_for > self.settings["limit_patience"]:',
+            "if False:",
+        ),
+        (
+            "supervisor",
+            "a fault is left by itself",
+            "            self.state, self.reason = State.INACTIVE, reason\n",
+            "            self.state, self.reason = State.READY, reason\n",
+        ),
+        (
+            "arm_controller",
+            "stamps: max_gap",
+            "if sample.stamp_ns - before_ns > self._max_gap and self.enabled:",
+            "if False:",
+        ),
+        (
+            "arm_controller",
+            "stamps: max_age, of the future",
+            "if abs(age) > self._max_age:",
+            "if age > self._max_age:",
+        ),
+        (
+            "samples",
+            "stamps: a clock that goes back",
+            "return self.NEW if sample.stamp_ns > self.stamp_ns else self.JUMP",
+            "return self.NEW",
+        ),
+        (
+            "samples",
+            "sequence: an older state",
+            "        if ahead >= WRAP // 2:\n",
+            "        if False:\n",
+        ),
+    ),
+    *[
+        Mutant(
+            name,
+            "flexarm_ros/flexarm_ros/torque_gate.py",
+            old,
+            new,
+            "flexarm_ros/test/test_torque_gate.py",
+        )
+        for name, old, new in (
+            (
+                "freshness: a torque that is too old",
+                "        if self._until >= now:\n",
+                "        if True:\n",
+            ),
+            (
+                "freshness: a state's age, not the message's",
+                "self._sent[message.sequence] + self.timeout",
+                "now + self.timeout",
+            ),
+            (
+                "freshness: another session",
+                "        if message.session != self.session:\n",
+                "        if False:\n",
+            ),
+            (
+                "freshness: out of order",
+                "(message.sequence - self._answered) % 2**32 >= 2**31",
+                "False",
+            ),
+            (
+                "freshness: DISABLED",
+                "            return self._close(self.DISABLED)\n",
+                "            return self.DISABLED\n",
+            ),
+            (
+                "two controllers in turn",
+                "            if controller in self.ids:\n",
+                "            if False:\n",
+            ),
+        )
+    ],
+]
+
+MUTANTS = KERNELS + LAWS + LIMITS
+
+
+def places(mutant, root=ROOT):
+    """How often the old text occurs."""
+    return (root / "src" / mutant.file).read_text(encoding="utf-8").count(mutant.old)
+
+
+def run(mutant):
+    """Run the tests of one mutant in a copy: ``caught``, ``SURVIVED``, or what went wrong."""
+    if places(mutant) != 1:
+        return f"ERROR: its text occurs {places(mutant)} times"
+    with tempfile.TemporaryDirectory(prefix="flexarm-mutant-") as folder:
+        copy = Path(folder, "copy")
+        for name in COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, copy / name, ignore=LEFT_OUT)
+            else:
+                shutil.copy(source, copy / name)
+        file = copy / "src" / mutant.file
+        text = file.read_text(encoding="utf-8")
+        file.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
+        packages = [str(path.parent) for path in (copy / "src").glob("*/setup.py")]
+        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1")
+        environment["PYTHONPATH"] = os.pathsep.join([*packages, os.environ["PYTHONPATH"]])
+        if "/kernels/" in mutant.file:  # compiled anew, and never run again
+            environment |= {"FLEXARM_CACHE": str(Path(folder, "cache")), "NUMBA_OPT": "1"}
+        words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
+        words += [f"src/{w}" if w.startswith("flexarm_") else w for w in mutant.tests.split()]
+        try:
+            done = subprocess.run(
+                words, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT
+            )
+        except subprocess.TimeoutExpired:
+            return f"ERROR: no end after {TIMEOUT:g} s"
+    if done.returncode in (0, 1):
+        return "caught" if done.returncode else "SURVIVED"
+    tail = "\n".join((done.stdout + done.stderr).splitlines()[-10:])
+    return f"ERROR: pytest ended with {done.returncode}\n{tail}"
+
+
+def main():
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-k", default="", help="only mutants with this text in name or file")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    chosen = [m for m in MUTANTS if options.k in f"{m.file} {m.name}"]
+    with ThreadPoolExecutor(options.processes) as executor:
+        results = list(executor.map(lambda m: (m, report(m, run(m))), chosen))
+    caught = sum(result == "caught" for _, result in results)
+    print(f"{caught} of {len(results)} mutants are caught")
+    return 0 if results and caught == len(results) else 1
+
+
+def report(mutant, result):
+    """Print one result as it comes."""
+    print(f"{result.splitlines()[0]:8}  {mutant.file}: {mutant.name}", flush=True)
+    for line in result.splitlines()[1:]:
+        print(f"          {line}")
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
