@@ -63,7 +63,9 @@ def calibrate(source):
 def test_calibration_waits_for_samples_is_refused_in_motion_and_accepted_at_rest(source):
     answer = calibrate(source)
     assert not answer.success
-    assert re.match(rf"calibration_samples: \d+ are not enough samples yet \({SAMPLES}\)", answer.message)
+    assert re.match(
+        rf"calibration_samples: \d+ are not enough samples yet \({SAMPLES}\)", answer.message
+    )
     # In motion.
     source.restart()
     for k in range(SAMPLES + 1):
