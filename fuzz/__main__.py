@@ -79,44 +79,44 @@ def fuzz(kind, inputs, seed):
     -------
     Tally
     """
-    subject, tally = kind(), Tally(kind.name)
+    reader, tally = kind(), Tally(kind.name)
     started = time.perf_counter()
     for number in range(-(-inputs // kind.batch)):
         tally.inputs += kind.batch
         try:
-            tally.refused += subject.run(frame.generator(seed, kind.name, number))
+            tally.refused += reader.run(frame.generator(seed, kind.name, number))
         except Exception as error:
             tally.failures += 1
-            tally.first.setdefault(_kind(error), _failure(subject, error, seed, number))
+            tally.first.setdefault(_kind(error), _failure(reader, error, seed, number))
             if tally.failures >= ENOUGH:
                 break
-            subject.renew()
+            reader.renew()
     tally.seconds = time.perf_counter() - started
     return tally
 
 
 def _kind(error):
-    """Failures of one kind have one cause, as far as can be told: numbers and names aside."""
+    """The kind of a failure, by which failures of one cause are grouped: numbers and names aside."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     return type(error).__name__, where.filename, where.lineno, NUMBER.sub("#", str(error))[:24]
 
 
-def _failure(subject, error, seed, number):
+def _failure(reader, error, seed, number):
     kind = "" if isinstance(error, Violation) else f"{type(error).__name__}: "
     frames = traceback.extract_tb(error.__traceback__)
     where = " < ".join(f"{f.filename.rsplit('/', 1)[-1]}:{f.lineno}" for f in frames[:-5:-1])
     return (
-        f"{subject.name}, input {number} of seed {seed}: {kind}{str(error)[:400]}\n"
+        f"{reader.name}, input {number} of seed {seed}: {kind}{str(error)[:400]}\n"
         f"  at {where}\n"
-        f"  given: {frame.show(getattr(subject, 'given', None))}\n"
-        f"  again: python -m fuzz --only '{subject.name}' --seed {seed} --at {number}"
+        f"  given: {frame.show(getattr(reader, 'given', None))}\n"
+        f"  again: python -m fuzz --only '{reader.name}' --seed {seed} --at {number}"
     )
 
 
-def shares(kinds, inputs):
+def inputs_of(kinds, inputs):
     """How many inputs each reader gets."""
-    whole = sum(kind.share for kind in kinds)
-    return {kind: max(kind.batch, round(inputs * kind.share / whole)) for kind in kinds}
+    whole = sum(kind.weight for kind in kinds)
+    return {kind: max(kind.batch, round(inputs * kind.weight / whole)) for kind in kinds}
 
 
 def main(arguments=None):
@@ -140,7 +140,7 @@ def main(arguments=None):
         f"{'reader':20}{'inputs':>9}{'refused':>9}{'accepted':>9}{'failures':>9}{'s':>8}",
         flush=True,
     )
-    for kind, count in shares(kinds, options.inputs).items():
+    for kind, count in inputs_of(kinds, options.inputs).items():
         tallies.append(fuzz(kind, count, options.seed))
         print(line(tallies[-1]), flush=True)
     if options.dds:
@@ -162,11 +162,11 @@ def line(tally):
 
 def again(kind, seed, number):
     """Run one input again, and let its error out."""
-    subject = kind()
+    reader = kind()
     try:
-        refused = subject.run(frame.generator(seed, kind.name, number))
+        refused = reader.run(frame.generator(seed, kind.name, number))
     finally:
-        print(f"given: {frame.show(getattr(subject, 'given', None))}")
+        print(f"given: {frame.show(getattr(reader, 'given', None))}")
     print(f"{refused} of {kind.batch} refused")
     return 0
 

@@ -28,7 +28,7 @@ TWO_LINK_LAW = (
     {"type": "lqr", "alpha": 2.0, "q": [0.0] * 4 + [0.001] * 4, "configuration": [0.8, 0.8]},
     {"type": "corrected", "order": 1},
 )
-SUBJECTS = (("R", R_LAW, "model"), ("two_link", TWO_LINK_LAW, "none"), ("R", R_LAW, "preview"))
+LOOPS = (("R", R_LAW, "model"), ("two_link", TWO_LINK_LAW, "none"), ("R", R_LAW, "preview"))
 
 FIELDS = ("position", "velocity", "torque", "strain", "amplitude", "rate")
 #: The latest stamp that a message can have [ns]: its seconds are an int32.
@@ -116,18 +116,18 @@ class _Path(Reader):
     batch, GOOD, HEALING = 20, 4, 12
 
     def __init__(self):
-        self.subjects, self.wanted = {}, {}
+        self.built, self.wanted = {}, {}
         self.session = 1
 
-    def subject(self, key):
+    def ready(self, key):
         """An object, made when first asked for; with what a healthy session gives from it."""
-        if key not in self.subjects:
-            self.subjects[key] = self.build(key)
+        if key not in self.built:
+            self.built[key] = self.build(key)
             self.wanted[key] = self.live(key, range(self.HEALING))
-        return self.subjects[key]
+        return self.built[key]
 
     def renew(self):
-        self.subjects, self.wanted = {}, {}
+        self.built, self.wanted = {}, {}
 
     def live(self, key, steps):
         """A session of good samples; what came out."""
@@ -136,7 +136,7 @@ class _Path(Reader):
 
     def run(self, rng):
         key = rng.choice(self.keys)
-        self.subject(key)
+        self.ready(key)
         self.live(key, range(self.GOOD))
         self.given, refused = [key], 0
         for k in range(self.batch):
@@ -162,13 +162,13 @@ def _plain(value):
 class Observers(_Path):
     """`ArmObserver.step` of every observer: an estimate, or a refusal that leaves it as it was."""
 
-    name, share, error = "observer", 4.0, MessageError
+    name, weight, error = "observer", 4.0, MessageError
     words = ("joint_", "modal_", "strain", "state", "observer", "covariance", "source")
 
     def __init__(self):
         super().__init__()
         names = registry.names(arm_observer.OBSERVERS)
-        self.loops = {arm: healthy(arm, law, 40) for arm, law, _ in SUBJECTS[:2]}
+        self.loops = {arm: healthy(arm, law, 40) for arm, law, _ in LOOPS[:2]}
         self.keys = [
             (arm, name, delay) for arm in self.loops for name in names for delay in (0.0, 0.004)
         ]
@@ -181,15 +181,15 @@ class Observers(_Path):
         return observe(self.loops[arm][0], name, {"delay": delay})
 
     def outputs(self, key):
-        core = self.subjects[key]
+        core = self.built[key]
         return np.concatenate([core.position, core.velocity, core.amplitude, core.rate])
 
     def good(self, key, k):
-        converged = self.subjects[key].step(sample_of(self.data(key)[k], self.session))
+        converged = self.built[key].step(sample_of(self.data(key)[k], self.session))
         return [float(converged), *self.outputs(key)]
 
     def bad(self, rng, key, sample):
-        core, before = self.subjects[key], self.outputs(key)
+        core, before = self.built[key], self.outputs(key)
         try:
             converged = core.step(sample)
         except MessageError as error:
@@ -208,18 +208,18 @@ class Observers(_Path):
 class Controllers(_Path):
     """`ArmController.step`: every sample is answered, and no torque but a finite one within the limits."""
 
-    name, share = "controller", 4.0
+    name, weight = "controller", 4.0
 
     def __init__(self):
         super().__init__()
-        self.loops = [healthy(arm, law, 40) for arm, law, _ in SUBJECTS]
-        self.keys = list(range(len(SUBJECTS)))
+        self.loops = [healthy(arm, law, 40) for arm, law, _ in LOOPS]
+        self.keys = list(range(len(LOOPS)))
 
     def data(self, key):
         return self.loops[key][2]
 
     def build(self, key):
-        _, law, feedforward = SUBJECTS[key]
+        _, law, feedforward = LOOPS[key]
         arm_model = self.loops[key][0]
         slow, fast, manifold = law
         made = design(arm_model, slow, fast, manifold, {"feedforward": feedforward})
@@ -229,14 +229,14 @@ class Controllers(_Path):
         return core, CompositeStateWriter(arm_model)
 
     def good(self, key, k):
-        core, _ = self.subjects[key]
+        core, _ = self.built[key]
         if k == 0:
             core.recover()
         enabled = core.step(sample_of(self.data(key)[k], self.session))
         return [float(enabled), *core.torque]
 
     def bad(self, rng, key, sample):
-        core, writer = self.subjects[key]
+        core, writer = self.built[key]
         if rng.random() < 0.1:
             _offer(rng, core)
         before = core.torque.copy()
@@ -285,7 +285,7 @@ def _offer(rng, core):
 class Designs(Reader):
     """`composite.design`: any law with any parameters in range is made, or refused with a reason."""
 
-    name, share = "design", 0.15
+    name, weight = "design", 0.15
 
     def __init__(self):
         self.models = {arm: model.build(arm_file.load(arm)) for arm in ("R", "two_link", "rigid")}

@@ -41,7 +41,7 @@ ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
 class Arms(Reader):
     """`arm_file.parse`, and the model and gauges of an arm that it takes."""
 
-    name, share, error = "arm file", 0.8, ArmFileError
+    name, weight, error = "arm file", 0.8, ArmFileError
 
     def __init__(self):
         folder = arm_file.arms_directories()[0]
@@ -72,7 +72,7 @@ class Arms(Reader):
 class Models(Arms):
     """`model.build` and `gauges.study` of arms whose numbers are altered."""
 
-    name, share = "arm's model", 0.1
+    name, weight = "arm's model", 0.1
     error = FlexarmError
 
     def make(self, rng):
@@ -119,7 +119,7 @@ SIZES = {"joints": 2, "modes": 4, "z": 8, "gauges": 4}
 class Parameters(Reader):
     """`check_all` of every declared group: the values that files, services and callers give."""
 
-    name, share, error = "parameters", 20.0, ParameterError
+    name, weight, error = "parameters", 20.0, ParameterError
 
     def __init__(self):
         self.groups = {prefix.replace(" ", ""): group for prefix, group in declared().items()}
@@ -208,7 +208,7 @@ class _Text(Reader):
 class ParameterFiles(_Text):
     """`parameter_files.load`, and the check of what it finds."""
 
-    name, share, error, suffix = "parameter file", 0.8, ParameterError, ".yaml"
+    name, weight, error, suffix = "parameter file", 0.8, ParameterError, ".yaml"
 
     def __init__(self):
         super().__init__()
@@ -244,7 +244,7 @@ class ParameterFiles(_Text):
 class Csv(_Text):
     """`recording.read_csv`."""
 
-    name, share, suffix = "recording CSV", 1.0, ".csv"
+    name, weight, suffix = "recording CSV", 1.0, ".csv"
 
     def __init__(self, arm="two_link"):
         super().__init__()
@@ -306,7 +306,7 @@ def spoilt_run(rng, arm, rows):
 class Messages(Reader):
     """The messages of a bag: decoded, and made a `Recording`."""
 
-    name, share, ROWS = "recording messages", 0.5, 24
+    name, weight, ROWS = "recording messages", 0.5, 24
 
     def __init__(self, arm="two_link"):
         self.arm = arm_file.load(arm)
@@ -336,7 +336,7 @@ class Messages(Reader):
 class Driver(Reader):
     """What ``check_driver`` says of a driver's messages: findings, never an error."""
 
-    name, share, error, ROWS = "check_driver", 0.5, (), 12
+    name, weight, error, ROWS = "check_driver", 0.5, (), 12
 
     def __init__(self, arm="two_link"):
         self.arm = arm_file.load(arm)
@@ -347,8 +347,8 @@ class Driver(Reader):
     def read(self, given):
         found = listening.check_layout(self.arm, given)
         if given and not any(f.verdict is Verdict.FAIL for f in found):
-            heard = [Heard(m, 0.001 * k, 10**9 + 10**6 * k) for k, m in enumerate(given)]
-            found.append(listening.check_finite(self.arm, samples(self.arm, heard)))
+            received = [Heard(m, 0.001 * k, 10**9 + 10**6 * k) for k, m in enumerate(given)]
+            found.append(listening.check_finite(self.arm, samples(self.arm, received)))
         return found
 
     def check(self, given, result):

@@ -37,7 +37,7 @@ SHARES = {
 #: A node is asked for an answer after so many messages that have none.
 AT_ONCE = 5
 #: A state that is not answered is sent again so often.
-MOST_TRIES = 20
+MAX_TRIES = 20
 
 
 class Nodes:
@@ -64,7 +64,7 @@ class Nodes:
         self.session = 0
 
     def wait(self, what, condition):
-        """Wait for a condition; messages that nobody will look at are forgotten."""
+        """Wait for a condition; unread messages are dropped."""
 
         def holds():
             for tap in self.bench.taps.values():
@@ -98,7 +98,7 @@ class Nodes:
             key, tries = (msg.session, msg.sequence), [time.monotonic()]
 
             def answered(key=key, tries=tries, msg=msg):
-                if harness.answers(self.arm.torques, *key) or len(tries) > MOST_TRIES:
+                if harness.answers(self.arm.torques, *key) or len(tries) > MAX_TRIES:
                     return True
                 if time.monotonic() > tries[-1] + 0.5:  # overtaken: the line keeps the newest alone
                     tries.append(time.monotonic())
@@ -271,7 +271,7 @@ def fuzz(count, seed, say, patience=180.0):
     count : int
     seed : int
     say : callable
-        Is told each `Tally` when it is complete.
+        Called with each `Tally` when it is complete.
     patience : float
         Longest wait for any one thing [s].
 
@@ -299,7 +299,7 @@ def fuzz(count, seed, say, patience=180.0):
 
         part("trajectories", SHARES["joint_trajectory"], nodes.trajectories)
         part("parameters", 1.0 - sum(SHARES.values()), nodes.parameters)
-        # The nodes that would answer beside this program are told to be still.
+        # Stop the nodes that would answer beside this program.
         bench.change("controller", "deactivate")
         part("torques", SHARES["joint_torque"], nodes.torques)
         bench.change("controller", "activate")

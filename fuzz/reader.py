@@ -23,8 +23,8 @@ class Reader:
     Attributes
     ----------
     name : str
-    share : float
-        Part of all inputs that it gets, before the shares are made to add up to one [-].
+    weight : float
+        Part of all inputs that it gets, before the weights are normalised [-].
     error : type
         What it may raise, and nothing else.
     words : tuple of str
@@ -33,7 +33,7 @@ class Reader:
         Inputs in one run of `run`.
     """
 
-    name, share, batch = "", 1.0, 1
+    name, weight, batch = "", 1.0, 1
     error = FlexarmError
     words = ()
     #: A longer message is not one for a log.

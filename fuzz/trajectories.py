@@ -85,7 +85,7 @@ def check_trajectory(made, joints, low, high, fastest):
 class Points(Reader):
     """`trajectory.validate`, with what a message holds and with what it can't."""
 
-    name, share, error, words = "trajectory message", 16.0, TrajectoryError, WORDS
+    name, weight, error, words = "trajectory message", 16.0, TrajectoryError, WORDS
 
     def make(self, rng):
         points = good_points(rng)
@@ -118,7 +118,7 @@ class Points(Reader):
 class Reference(Reader):
     """`ReferenceGenerator`: any offers, stops and stamps, one after the other."""
 
-    name, share, batch = "reference", 8.0, 10
+    name, weight, batch = "reference", 8.0, 10
 
     def run(self, rng):
         fastest = rng.choice((None, FASTEST))
@@ -198,7 +198,7 @@ class _Files(Reader):
 class YamlFiles(_Files):
     """`trajectory.files`, YAML."""
 
-    name, share, suffix = "trajectory YAML", 1.5, ".yaml"
+    name, weight, suffix = "trajectory YAML", 1.5, ".yaml"
 
     def make(self, rng):
         points = []
@@ -217,7 +217,7 @@ class YamlFiles(_Files):
 class CsvFiles(_Files):
     """`trajectory.files`, CSV."""
 
-    name, share, suffix = "trajectory CSV", 4.0, ".csv"
+    name, weight, suffix = "trajectory CSV", 4.0, ".csv"
 
     def make(self, rng):
         rows = ["t,q1,q2,qd1,qd2"]
@@ -237,7 +237,7 @@ class CsvFiles(_Files):
 class Written(Reader):
     """`specs.from_spec`: motions written in a line."""
 
-    name, share = "written motion", 0.3
+    name, weight = "written motion", 0.3
     words = ("motion", "quintic", "paper", "smooth", "least", "line", "arc", *specs.FAMILIES)
     GOOD = (
         "quintic:to=0.5;0.3,duration=2,points=11",

@@ -365,7 +365,7 @@ class Source:
     def exchange(self, message):
         """Publish a state and wait for the torque that answers it, and its controller/state."""
         key = (message.session, message.sequence)
-        seen, told = len(self.torques.messages), len(self.states.messages)
+        seen, reported = len(self.torques.messages), len(self.states.messages)
 
         def of(messages):
             return [m for m in messages if (m.session, m.sequence) == key]
@@ -374,7 +374,7 @@ class Source:
 
         def answered():
             nonlocal again
-            if of(self.torques.messages[seen:]) and of(self.states.messages[told:]):
+            if of(self.torques.messages[seen:]) and of(self.states.messages[reported:]):
                 return True
             if (
                 time.monotonic() > again
@@ -384,7 +384,7 @@ class Source:
             return False
 
         self.bench.wait_for(f"a torque that answers state {message.sequence}", answered)
-        return of(self.torques.messages[seen:])[-1], of(self.states.messages[told:])[-1]
+        return of(self.torques.messages[seen:])[-1], of(self.states.messages[reported:])[-1]
 
     def step(self, **changes):
         """Exchange the present sample, and advance by the answer; a change may be a function of this."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one host hears of a loop, told on standard output, a JSON line a message; moves and recovers on request.
+"""Writes what one host receives of a loop to standard output, a JSON line per message; moves and recovers on request.
 
-A program and not a fixture: Fast DDS looks up a process's addresses once, so each host needs a process of its own.
+A program and not a fixture, because Fast DDS reads a process's addresses once: each host needs its own process.
 
     [topic, seconds on the steady clock, what is of interest]
 
@@ -37,7 +37,7 @@ def _trajectory(goal, duration):
     return JointTrajectory(joint_names=["joint1"], points=[end])
 
 
-#: Topic to type and to what is of interest in a message; nothing is said of a message without.
+#: Topic to type and to what is of interest in a message; a message without it is not written.
 TOPICS = {
     "arm_state": (ArmState, lambda m: {"sequence": m.sequence, "torque": m.joint_torque[0]}),
     "joint_torque": (JointTorque, lambda m: {"sequence": m.sequence, "mode": m.mode}),

@@ -10,27 +10,29 @@ from flexarm_msgs.msg import JointTorque
 @pytest.mark.real_time
 def test_the_simulator_in_real_time_passes(bench):
     bench.start("simulator", {"arm": "R", "rate": RATE, "torque_timeout": TIMEOUT})
-    code, said = check_driver(bench)
-    assert code == 0, said
-    assert "mode" in said and "on a clock of their own" in said
+    code, output = check_driver(bench)
+    assert code == 0, output
+    assert "mode" in output and "on a clock of their own" in output
     bench.publisher(JointTorque, "joint_torque")
-    code, said = check_driver(bench, "--duration", "0.5")
-    assert code == 1 and "a controller sends joint_torque: stop it" in said
+    code, output = check_driver(bench, "--duration", "0.5")
+    assert code == 1 and "a controller sends joint_torque: stop it" in output
 
 
 @pytest.mark.real_time
-def test_a_drive_that_ignores_torque_fails_and_is_told_so(bench, tmp_path):
+def test_a_drive_that_ignores_torque_fails_with_a_message(bench, tmp_path):
     start_template(bench, tmp_path / "arm", "--ignore-torque")
-    code, said = check_driver(bench)
-    assert code == 1, said
-    failed = [line for line in said.splitlines() if line.startswith("FAIL")]
-    assert [line.split("  ")[2].strip() for line in failed] == ["torque reported", "response"], said
+    code, output = check_driver(bench)
+    assert code == 1, output
+    failed = [line for line in output.splitlines() if line.startswith("FAIL")]
+    assert [line.split("  ")[2].strip() for line in failed] == ["torque reported", "response"], (
+        output
+    )
     assert all("torque is ignored" in line for line in failed)
 
 
 def test_without_a_driver_it_says_so(bench):
-    code, said = check_driver(bench, "--timeout", "0.2")
+    code, output = check_driver(bench, "--timeout", "0.2")
     assert code == 1
-    assert said.startswith(
+    assert output.startswith(
         "flexarm check_driver: waited 0.2 s in vain for arm_state; start the driver"
     )

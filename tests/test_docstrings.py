@@ -42,7 +42,7 @@ EVERYWHERE = {
     "arm": "`Arm`",
     "values": "parameters by name",
     "options": "of the command line, as argparse gives them",
-    "subject": "the analysed or compared loop",
+    "case": "the analysed or compared loop",
     "message": "a ROS message",
     "msg": "a ROS message",
     "path": "of a file",
@@ -51,7 +51,7 @@ EVERYWHERE = {
     "duration": "[s]",
     "seconds": "[s]",
     "namespace": "of the nodes",
-    "progress": "told how far it is",
+    "progress": "called with how far it is",
 }
 
 
@@ -161,8 +161,8 @@ def test_sections_name_the_arguments_and_nothing_else():
         body, given = section(name.doc, "Parameters"), arguments(name.node)
         if body is None or given is None:
             continue
-        said = listed(body)
-        missing, strange = set(given) - set(said), set(said) - set(given)
+        documented = listed(body)
+        missing, strange = set(given) - set(documented), set(documented) - set(given)
         if missing or strange:
             wrong.append(
                 f"{name.where} {name.full}: not named {missing or '-'}, none {strange or '-'}"
@@ -201,8 +201,10 @@ def test_errors_that_are_raised_are_in_the_section():
     for name in NAMES:
         if not isinstance(name.node, ast.FunctionDef) or section(name.doc, "Parameters") is None:
             continue
-        said = section(name.doc, "Raises") or ""
-        missing = [e for e in raised(name.node) if e not in said and "FlexarmError" not in said]
+        documented = section(name.doc, "Raises") or ""
+        missing = [
+            e for e in raised(name.node) if e not in documented and "FlexarmError" not in documented
+        ]
         if missing:
             wrong.append(f"{name.where} {name.full}: {', '.join(missing)}")
     assert not wrong, "raised, and in no section Raises:\n" + "\n".join(wrong)
@@ -214,7 +216,7 @@ def test_there_is_something_to_look_at():
 
 
 @pytest.mark.parametrize(
-    ("doc", "said"),
+    ("doc", "documented"),
     [
         (
             "A.\n\nParameters\n----------\na : int\n    Text: more.\nb, c\n    More.\n",
@@ -223,5 +225,5 @@ def test_there_is_something_to_look_at():
         ("A.\n\nParameters\n----------\n*rest : tuple\n\nReturns\n-------\nint\n", ["rest"]),
     ],
 )
-def test_how_a_section_is_read(doc, said):
-    assert listed(section(doc, "Parameters")) == said
+def test_how_a_section_is_read(doc, documented):
+    assert listed(section(doc, "Parameters")) == documented

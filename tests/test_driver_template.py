@@ -37,7 +37,7 @@ def start_template(bench, port, *options, **parameters):
 
 
 def check_driver(bench, *options):
-    """Run ``flexarm check_driver R --allow-motion``; exit code and what it said."""
+    """Run ``flexarm check_driver R --allow-motion``; exit code and output."""
     words = ["check_driver", "R", "--allow-motion", *EASY, *options]
     bench.processes.start("check", [executable("flexarm_bringup", "flexarm"), *words])
     return bench.end_of("check", 3 * bench.PATIENCE), bench.log("check")
@@ -48,7 +48,7 @@ def test_stamps_are_the_devices_times_however_late_a_frame_comes(monkeypatch):
     from flexarm_driver_template.device import MeasurementTime
 
     random, period, start = np.random.default_rng(1), 5_000_000, 10**18  # [ns]
-    late = 1_000_000 + random.exponential(3e6, 2000).astype(int)  # [ns] on the line
+    late = 1_000_000 + random.exponential(3e6, 2000).astype(int)  # [ns] on the network
     late[0] = 200_000_000  # the first one waited for its reader
     clock, measured = MeasurementTime(), period * np.arange(2000)
     stamps = [clock.stamp(int(t), int(start + t + w)) for t, w in zip(measured, late, strict=True)]
@@ -92,10 +92,10 @@ def line(tmp_path_factory):
 
 @pytest.mark.real_time
 def test_the_template_passes_the_check(line):
-    code, said = check_driver(line, "--rate", str(RATE))
-    assert code == 0, said
+    code, output = check_driver(line, "--rate", str(RATE))
+    assert code == 0, output
     for check in ("torque reported", "response", "strain response", "torque stops"):
-        assert f"PASS     {check}" in said or f"WARN     {check}" in said, said
+        assert f"PASS     {check}" in output or f"WARN     {check}" in output, output
 
 
 def send(publisher, state, torque, controller_id=1):

@@ -135,9 +135,9 @@ def test_a_fault_of_the_senses_ends_in_its_state_with_its_reason_and_recovers(ar
         lambda: arm.measured.newest.session == session and arm.measured.newest.sequence >= 600,
     )
     # Until sample 10 it stood, and was still in the fault of before.
-    told = [m for m in arm.states.messages if m.session == session and m.sequence > 10]
+    reported = [m for m in arm.states.messages if m.session == session and m.sequence > 10]
     torques = [m for m in arm.torques.messages if m.session == session and m.sequence > 10]
-    off = next((m for m in told if m.supervisor_state == FAULT), None)
+    off = next((m for m in reported if m.supervisor_state == FAULT), None)
     since = None
     if row.end == FAULT:
         assert off is not None, STATES[arm.state.supervisor_state]
@@ -178,7 +178,7 @@ def test_the_table_of_the_document_is_what_was_measured(measured):
     if os.environ.get("FLEXARM_WRITE_DOCS"):
         DOCUMENT.write_text(f"{before}{MARKS[0]}\n{table}\n{MARKS[1]}{after}")
         return
-    # Reactions that the arm's motion decides are told, and not compared to the last digit.
+    # Reactions that depend on the arm's motion are listed, but not compared to the last digit.
     inside, table = (re.sub(r"\b\d\d+ ms", "# ms", t.strip()) for t in (inside, table))
     assert inside == table, "run it again with FLEXARM_WRITE_DOCS=1"
 
@@ -203,13 +203,13 @@ def test_stop_brings_the_reference_to_rest_and_the_next_move_goes_on_from_there(
     answer = arm.bench.call(Trigger, "controller/stop")
     assert answer.success and "STOPPING" in answer.message
     arm.run(0.5)
-    told = [m for m in arm.samples(session).values() if m.sequence > 610]
-    states = list(dict.fromkeys(m.supervisor_state for m in told))
+    reported = [m for m in arm.samples(session).values() if m.sequence > 610]
+    states = list(dict.fromkeys(m.supervisor_state for m in reported))
     assert states == [CompositeState.TRACKING, CompositeState.STOPPING, HOLDING] or states == [
         CompositeState.STOPPING,
         HOLDING,
     ]
-    speeds = [m.reference_velocity[0] for m in told]
+    speeds = [m.reference_velocity[0] for m in reported]
     assert speed > 0.2 and speeds[-1] == 0.0
     assert max(abs(b - a) for a, b in pairwise(speeds)) < 0.01  # no jump
     assert {m.mode for m in arm.torques.messages if m.session == session and m.sequence > 10} == {

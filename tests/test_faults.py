@@ -86,14 +86,14 @@ def test_a_bad_state_is_a_fault_with_a_reason_until_recover_is_called(source, ca
     assert torque.mode == JointTorque.DISABLED
     assert list(torque.torque) == [0.0]
     assert state.supervisor_state == CompositeState.FAULT
-    said = state.rejected_reason
-    assert said
+    rejected = state.rejected_reason
+    assert rejected
     # The observer says what it is; the controller does where it concerns the joints.
     assert re.search(reason, source.bench.log("observer")), source.bench.log("observer")
     # Good states alone do not bring the torque back.
     torque, state = source.step()
     assert torque.mode == JointTorque.DISABLED
-    assert (state.supervisor_state, state.rejected_reason) == (CompositeState.FAULT, said)
+    assert (state.supervisor_state, state.rejected_reason) == (CompositeState.FAULT, rejected)
     assert source.recover()
     torque, state = source.until_enabled(most=3)
     assert state.rejected_reason == ""
@@ -184,12 +184,12 @@ def test_an_older_sequence_is_left_out_and_the_loop_goes_on(source):
     old = source.state()
     source.step()
     source.step()
-    told = len(source.torques.messages)
+    known = len(source.torques.messages)
     source.bench.publisher(ArmState, "arm_state").publish(old)
     torque, state = source.step()
     assert torque.mode == JointTorque.ENABLED
     assert state.supervisor_state == CompositeState.READY
-    later = [m.sequence for m in source.torques.messages[told:]]
+    later = [m.sequence for m in source.torques.messages[known:]]
     assert old.sequence not in later, "what was answered is answered again"
 
 
@@ -247,11 +247,11 @@ def estimate(source, **changes):
     for field, value in changes.items():
         setattr(message, field, value)
     key = (message.session, message.sequence)
-    told = len(source.torques.messages)
+    known = len(source.torques.messages)
     source.bench.publisher(ArmState, "arm_state_estimate").publish(message)
     source.bench.wait_for(
         "an answer",
-        lambda: [m for m in source.torques.messages[told:] if (m.session, m.sequence) == key],
+        lambda: [m for m in source.torques.messages[known:] if (m.session, m.sequence) == key],
     )
     source.sim.advance(np.zeros(1))
     return source.torques.newest
@@ -396,12 +396,12 @@ def test_two_controllers_are_an_error_on_diagnostics_that_ends_when_one_of_them_
     def turn(ids, safe=False):
         since = len(bench.diagnostics("simulator"))
 
-        def told():
+        def known():
             for controller_id in ids:
                 step(controller_id, safe)
             return levels(bench, "simulator", since)[1:]  # the first may be of before
 
-        return bench.wait_for("diagnostics", told)
+        return bench.wait_for("diagnostics", known)
 
     step(11)
     assert error not in turn([12])  # the controller was restarted: another id, one controller

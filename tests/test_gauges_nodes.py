@@ -82,8 +82,8 @@ def test_calibration_waits_for_samples_is_refused_in_motion_and_accepted_at_rest
         source.sim.stamp_ns += source.sim.period_ns
     answer = calibrate(source)
     assert answer.success, answer.message
-    told = [float(v) for v in re.findall(r"(\S+) \(was", answer.message)]
-    np.testing.assert_allclose(told, 1e6 * BIAS, atol=0.006)
+    reported = [float(v) for v in re.findall(r"(\S+) \(was", answer.message)]
+    np.testing.assert_allclose(reported, 1e6 * BIAS, atol=0.006)
     assert "bias: 2.0000e-05  # gauge root" in source.bench.log("observer")
     # From now on the straight arm is known to be straight, though its bridge reads a bias.
     source.until_enabled(**READ)

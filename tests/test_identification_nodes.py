@@ -19,7 +19,7 @@ TRUTH, GIVEN = "EI_y: 11.81904468463035", "EI_y: 14.0"
 
 
 def excite(bench, arm, bag, *words):
-    """Run ``flexarm excite``; exit code and what it said."""
+    """Run ``flexarm excite``; exit code and output."""
     command = [
         executable("flexarm_bringup", "flexarm"),
         "excite",
@@ -54,10 +54,10 @@ def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys)
     torques = bench.tap(JointTorque, "joint_torque")
     bag = tmp_path / "bag"
     words = ["--amplitude", "6", "--duration", "3", "--rest", "1", "--kind", "sweep"]
-    code, said = excite(bench, given, bag, *words, "--allow-motion")
-    assert code == 0, said
+    code, output = excite(bench, given, bag, *words, "--allow-motion")
+    assert code == 0, output
     # Three seconds and one, while the torque was on; after that it was off.
-    assert "400 states in" in said
+    assert "400 states in" in output
     assert torques.messages[-1].mode == JointTorque.DISABLED
     options = cli.parser().parse_args(["identify", str(bag), str(given), "--json"])
     options.function(options)
@@ -79,15 +79,15 @@ def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys)
         assert abs(row["value"] - value) < 1.5 * row["half_width"], name
         assert row["half_width"] < 0.1 * value, name
     # The arm still rings: a low strain limit ends it before it has begun.
-    code, said = excite(
+    code, output = excite(
         bench, given, tmp_path / "other", *words, "--allow-motion", "--strain-limit", "1e-5"
     )
-    assert code == 1 and "beyond its limit 1e-05; take a smaller amplitude" in said
+    assert code == 1 and "beyond its limit 1e-05; take a smaller amplitude" in output
     assert not (tmp_path / "other").exists()
     assert torques.messages[-1].mode == JointTorque.DISABLED
 
 
-def test_nothing_moves_before_the_recorder_hears_it(bench):
+def test_nothing_moves_before_the_recorder_is_connected(bench):
     arm = {"arm": "one_link", "rate": RATE}
     bench.start("simulator", {**arm, "lockstep": True, "pause_at": -1.0})
     torques = bench.tap(JointTorque, "joint_torque")

@@ -38,7 +38,7 @@ def test_the_simulator_runs_each_shipped_arm(bench, name):
     assert tuple(state.mode_names) == (arm.observed_modes if arm.gauges else ())
     assert tuple(state.gauge_names) == arm.gauge_names
     assert np.isfinite(state.joint_position).all() and np.isfinite(state.strain).all()
-    # Nobody sends torque: the brakes hold what has them, at rest under its own weight.
+    # There is no controller: the brakes hold what has them, at rest under its own weight.
     if arm.gravity != (0.0, 0.0, 0.0):
         assert np.abs(state.joint_position).max() < 1e-9
     if arm.gauges:

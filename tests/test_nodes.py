@@ -79,7 +79,7 @@ def test_a_signal_ends_every_node_with_code_0_and_leaves_nothing_behind(tmp_path
         assert not abandoned(held[name]) - before, name
 
 
-def test_a_controller_that_is_told_to_end_disables_the_torque(bench):
+def test_a_controller_that_ends_disables_the_torque(bench):
     patient = {"fast.type": "none", "state_timeout": 60.0}
     bench.start_loop({**LOCKSTEP, "pause_at": 0.02}, arm="R", controller=patient)
     arm = Arm(bench, pauses_at=20)
@@ -218,10 +218,10 @@ def test_without_autostart_the_lifecycle_services_start_stop_and_restart_every_n
     assert bench.change("controller", "deactivate")
     bench.wait_for("DISABLED", lambda: arm.torques.newest.mode == JointTorque.DISABLED)
     assert bench.lifecycle("controller") == "inactive"
-    stamp, told = arm.now, len(arm.torques.messages)
+    stamp, answered = arm.now, len(arm.torques.messages)
     seen = len(arm.estimated.messages)
-    bench.wait_for("states that nobody answers", lambda: len(arm.estimated.messages) > seen + 3)
-    assert len(arm.torques.messages) == told
+    bench.wait_for("unanswered states", lambda: len(arm.estimated.messages) > seen + 3)
+    assert len(arm.torques.messages) == answered
     assert bench.change("controller", "activate")
     arm.wait_until(stamp + 50_000_000)
     assert arm.ready() and arm.state.session == session

@@ -74,13 +74,13 @@ with own_domain() as domain, Processes(domain, sys.argv[1]) as processes:
     for key in ("first", "second"):
         print(processes.start_node("observer", {"arm": "R"}).pid, flush=True)
         if key == "first":
-            sys.stdin.readline()  # it is told when the first one runs
+            sys.stdin.readline()  # written when the first one runs
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def alive(pid):
-    """Whether a process runs: not gone, and not a zombie that nobody has buried."""
+    """Whether a process runs: not gone, and not a zombie."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return not re.search(r"\) [ZX]", file.read())
@@ -94,8 +94,8 @@ def test_a_killed_parent_leaves_no_nodes_behind_running_or_just_started(tmp_path
         command = [sys.executable, "-c", PARENT, str(tmp_path)]
         parent = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         first = int(parent.stdout.readline())
-        said = tmp_path / "observer.log"
-        bench.wait_for("the first node to run", lambda: "observer" in said.read_text())
+        log = tmp_path / "observer.log"
+        bench.wait_for("the first node to run", lambda: "observer" in log.read_text())
         assert alive(first)
         second = int(parent.communicate("go\n")[0])
         assert parent.wait() == -signal.SIGKILL

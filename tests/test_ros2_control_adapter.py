@@ -48,7 +48,7 @@ class Arm:
         """Publish samples until one comes back as a state; that state."""
         seen = len(self.states.messages)
 
-        def told():
+        def received():
             self.stamp += TICK
             if strain is not None:
                 self._strain.publish(Float64MultiArray(data=list(strain)))
@@ -60,10 +60,10 @@ class Arm:
             whole = [m for m in new if strain is None or np.isfinite(m.strain).all()]
             return whole and whole[-1]
 
-        return self.bench.wait_for("the state", told)
+        return self.bench.wait_for("the state", received)
 
     def efforts_are(self, *expected, **sample):
-        """Wait until the effort controller is told this."""
+        """Wait until the effort controller receives this."""
 
         def right():
             self.tell(**sample)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ROS users count on: namespaces apart, incompatible QoS said and not silent, use_sim_time without a /clock."""
+"""What ROS users count on: namespaces apart, incompatible QoS is reported, use_sim_time without a /clock."""
 
 import time
 

@@ -34,7 +34,7 @@ def socket_on(hosts, host):
     return made
 
 
-def test_two_hosts_hear_each_other_until_the_network_is_cut_and_again_when_it_heals():
+def test_two_hosts_exchange_messages_until_the_network_is_cut_and_again_when_it_heals():
     with TwoHosts() as hosts, socket_on(hosts, "arm") as arm, socket_on(hosts, "desk") as desk:
 
         def arrives(text, wait):
@@ -117,7 +117,7 @@ def test_a_cut_of_50_ms_is_bridged_or_stops_the_arm_and_it_recovers(loop):
     cut = loop.cut_for(0.05)
     loop.wait_for(
         "the motion's end, or a stop",
-        lambda: loop.desk.heard["controller/state"][-1][0] > cut.ended and loop.state in STOPPED,
+        lambda: loop.desk.received["controller/state"][-1][0] > cut.ended and loop.state in STOPPED,
     )
     if cut.unanswered is None and cut.disabled_after is None:
         assert loop.state == State.HOLDING
@@ -134,7 +134,7 @@ def test_a_cut_of_500_ms_is_safe_on_both_hosts_and_the_arm_moves_again_after_rec
         0.5, lambda cut: cut.unanswered is not None and cut.disabled_after is not None
     )
     assert cut.unanswered <= RATE * TORQUE_TIMEOUT + SLACK
-    loop.wait_for("states at the desk", lambda: cut.heard_again_after is not None)
+    loop.wait_for("states at the desk", lambda: cut.received_again_after is not None)
     assert loop.state in STOPPED
     assert "no fresh torque: the safe action is applied" in loop.processes.log("simulator")
     log = loop.processes.log("controller")
@@ -144,19 +144,21 @@ def test_a_cut_of_500_ms_is_safe_on_both_hosts_and_the_arm_moves_again_after_rec
 
 
 @pytest.mark.real_time
-def test_a_cable_that_is_pulled_for_good_is_said_on_both_hosts_and_all_end_cleanly(loop):
+def test_a_cable_that_is_pulled_for_good_is_reported_on_both_hosts_and_all_end_cleanly(loop):
     loop.set_in_motion()
     since = {host: loop.witness[host].count("/diagnostics") for host in ADDRESSES}
     cut = two_hosts.Cut(loop)
     loop.hosts.unplug("arm")
 
-    def said(host, name, level, text):
+    def reported(host, name, level, text):
         diagnosis = loop.witness[host].diagnosis(name, since[host])
         return diagnosis and diagnosis[0] >= level and text in diagnosis[1]
 
-    loop.wait_for("the simulator's word", lambda: said("arm", "simulator", WARN, "no fresh torque"))
-    loop.wait_for("the observer's word", lambda: said("desk", "observer", ERROR, "no usable"))
-    loop.wait_for("the controller's word", lambda: said("desk", "controller", ERROR, ""))
+    loop.wait_for(
+        "the simulator's warning", lambda: reported("arm", "simulator", WARN, "no fresh torque")
+    )
+    loop.wait_for("the observer's error", lambda: reported("desk", "observer", ERROR, "no usable"))
+    loop.wait_for("the controller's error", lambda: reported("desk", "controller", ERROR, ""))
     assert cut.unanswered <= RATE * TORQUE_TIMEOUT + SLACK
     assert loop.arm.newest("arm_state", "torque") == 0.0
     assert loop.state in (State.INACTIVE, State.FAULT)

@@ -107,7 +107,7 @@ class TwoHosts:
             _enter(LIBC.setns, self._home, CLONE_NEWNET)
 
     def cut(self):
-        """The switch forwards nothing any more; no host is told."""
+        """Stop the switch; the hosts are not notified."""
         self._switch.link("set", index=self._bridge, state="down")
 
     def heal(self):
@@ -153,7 +153,7 @@ WITNESS = Path(__file__).with_name("host_witness.py")
 
 
 class Witness:
-    """A `host_witness` on a host; `heard` holds what it says of each topic, as (seconds, values)."""
+    """A `host_witness` on a host; `received` has each topic's messages as (seconds, values)."""
 
     def __init__(self, hosts, host, settings, domain, log):
         with hosts.on(host), open(log, "wb") as errors:
@@ -165,14 +165,14 @@ class Witness:
                 env={**environment(domain), **settings},
                 text=True,
             )
-        self.heard = {}
+        self.received = {}
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def _read(self):
         for line in self._process.stdout:
             topic, at, values = json.loads(line)
-            self.heard.setdefault(topic, []).append((at, values))
+            self.received.setdefault(topic, []).append((at, values))
 
     def tell(self, *command):
         """Have it move the arm or recover the controller."""
@@ -180,22 +180,22 @@ class Witness:
         self._process.stdin.flush()
 
     def all(self, topic, since=0):
-        """What was said on a topic after the first `since` messages."""
-        return [values for _, values in self.heard.get(topic, [])[since:]]
+        """Values on a topic after the first `since` messages."""
+        return [values for _, values in self.received.get(topic, [])[since:]]
 
     def count(self, topic):
         """How many messages there were."""
-        return len(self.heard.get(topic, ()))
+        return len(self.received.get(topic, ()))
 
     def newest(self, topic, key):
         """A value of the last message; None before the first."""
-        heard = self.heard.get(topic)
-        return heard[-1][1].get(key) if heard else None
+        received = self.received.get(topic)
+        return received[-1][1].get(key) if received else None
 
     def diagnosis(self, name, since=0):
         """(level, message) of a node's last diagnostics; None where there are none."""
-        said = [d[name] for d in self.all("/diagnostics", since) if name in d]
-        return tuple(said[-1]) if said else None
+        reported = [d[name] for d in self.all("/diagnostics", since) if name in d]
+        return tuple(reported[-1]) if reported else None
 
     @property
     def alive(self):
@@ -320,7 +320,7 @@ class Loop:
         """A small motion, to its end."""
 
         def there(goal):
-            newest = self.desk.heard["controller/state"][-1][1]
+            newest = self.desk.received["controller/state"][-1][1]
             arrived = abs(newest["reference"] - goal) < 1e-12 and abs(newest["error"]) < 0.05
             return arrived and newest["state"] == State.HOLDING
 
@@ -350,7 +350,7 @@ class Loop:
 
 
 class Cut:
-    """What was heard up to a cut, and what came of it."""
+    """What had arrived before a cut, and what arrived after it."""
 
     def __init__(self, loop):
         self._loop = loop
@@ -362,7 +362,7 @@ class Cut:
 
     def after(self, host, topic):
         """(seconds, values) of all messages since."""
-        return self._loop.witness[host].heard.get(topic, [])[self.since[host][topic] :]
+        return self._loop.witness[host].received.get(topic, [])[self.since[host][topic] :]
 
     @property
     def unanswered(self):
@@ -378,11 +378,11 @@ class Cut:
 
     @property
     def disabled_after(self):
-        """From the cut to the controller's DISABLED, as heard at the desk [s]; None: it went on."""
+        """From the cut to the controller's DISABLED, as received at the desk [s]; None: it continued."""
         return self._first("desk", "joint_torque", lambda m: m["mode"] == JointTorque.DISABLED)
 
     @property
-    def heard_again_after(self):
+    def received_again_after(self):
         """From the end of the cut to the first state that comes to the desk [s]; None: none yet."""
         came = (at for at, _ in self.after("desk", "arm_state"))
         return next((at - self.ended for at in came if at > self.ended), None)
@@ -408,7 +408,7 @@ def main():
         for seconds in CUTS:
             loop.set_in_motion()
             cut = loop.cut_for(seconds)
-            again = loop.wait_for("states at the desk", lambda cut=cut: cut.heard_again_after)
+            again = loop.wait_for("states at the desk", lambda cut=cut: cut.received_again_after)
             time.sleep(0.5)
             safe = None if cut.unanswered is None else cut.unanswered / RATE
             times = (_ms(t) for t in (safe, cut.disabled_after, again))

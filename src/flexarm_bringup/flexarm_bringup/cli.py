@@ -17,7 +17,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 #: Below the options of every command.
 EXIT_CODES = (
-    "exit code: 0 done, 1 an error or a failed check, said on standard error, 2 wrong usage, 130 Ctrl-C,"
+    "exit code: 0 done, 1 an error or a failed check, reported on standard error, 2 wrong usage, 130 Ctrl-C,"
     " 143 terminated"
 )
 
@@ -72,7 +72,9 @@ COMMANDS = {
     "demo": Command(
         "flexarm_tools.case_study.demo",
         "run_demo",
-        ("run the paper's case study with three nodes; figures, bags and a table beside print"),
+        (
+            "run the paper's case study with three nodes; figures, bags and a table beside the published numbers"
+        ),
     ),
     "simulate": Command(
         "flexarm_tools.simulate",
@@ -235,7 +237,7 @@ def bind_angles(words):
 
 
 def main(argv=None):
-    """Entry point; exit code 0, 1 for an error that has been said, 2 for wrong usage."""
+    """Entry point; exit code 0, 1 for an error that has been reported, 2 for wrong usage."""
     words = bind_angles(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ""
     # As Ctrl-C: what was started is stopped on the way out.
@@ -247,7 +249,7 @@ def main(argv=None):
     except FlexarmError as error:
         print(f"flexarm {name}: {error}", file=sys.stderr)
         sys.exit(1)
-    except BrokenPipeError:  # whoever reads it has enough, `head` say
+    except BrokenPipeError:  # the reader has enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
     except OSError as error:

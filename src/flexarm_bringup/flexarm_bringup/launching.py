@@ -124,7 +124,7 @@ def one_arm(values):
         Start("flexarm_control", "controller", parameters=list(common), **own),
     ]
     if is_true(values["with_simulator"]):
-        # Not paused at its start: nobody is to unpause it.
+        # Not paused at its start, because nothing would unpause it.
         pace = {"lockstep": is_true(values["lockstep"]), "pause_at": -1.0}
         starts.insert(0, Start("flexarm_sim", "simulator", parameters=[*common, pace], **own))
     if is_true(values["with_shape"]):

@@ -63,8 +63,8 @@ def test_every_command_is_listed_with_a_line_of_its_own(capsys):
 )
 def test_json_is_all_that_standard_output_gets(words, key, tmp_path, capsys):
     words = [word.format(tmp=tmp_path) for word in words]
-    said = json.loads(text_of([*words, "--json"], capsys))
-    assert key in said
+    printed = json.loads(text_of([*words, "--json"], capsys))
+    assert key in printed
 
 
 def test_a_dry_run_says_the_same_in_both_ways(capsys):
@@ -75,7 +75,7 @@ def test_a_dry_run_says_the_same_in_both_ways(capsys):
     assert f"{machines['vibration_energy_J']['left_at_the_end']:.3g} J left" in people
 
 
-def test_a_recording_is_told_as_json(capsys):
+def test_a_recording_is_described_as_json(capsys):
     class Bag:
         def write(self, *message):
             pass
@@ -84,9 +84,9 @@ def test_a_recording_is_told_as_json(capsys):
     taken.take({"arm_state": [b"a", b"b"]}, 1_000_000_000)
     taken.take({"joint_torque": [b"c"]}, 3_500_000_000)
     taken.tell("there", as_json=True)
-    said = json.loads(capsys.readouterr().out)
-    assert (said["out"], said["arm"], said["seconds"]) == ("there", "R", 2.5)
-    assert (said["messages"]["arm_state"], said["messages"]["joint_torque"]) == (2, 1)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["out"], printed["arm"], printed["seconds"]) == ("there", "R", 2.5)
+    assert (printed["messages"]["arm_state"], printed["messages"]["joint_torque"]) == (2, 1)
 
 
 def test_a_reader_that_has_enough_is_no_error():

@@ -53,7 +53,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def dumps(thing, arm):
-    """A law, plan or the like as bytes, without the models of `arm` in it.
+    """A `thing`, such as a law or a plan, as bytes without the models of `arm`.
 
     Raises
     ------

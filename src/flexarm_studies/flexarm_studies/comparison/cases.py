@@ -69,7 +69,7 @@ CASES = (
 
 
 def find(names):
-    """Cases by arm name.
+    """The cases of the arms `names`.
 
     Raises
     ------
