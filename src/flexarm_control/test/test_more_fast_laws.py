@@ -203,21 +203,20 @@ def test_the_torque_uses_the_gain_of_the_present_configuration(long_reach_schedu
 
 
 def test_a_range_too_wide_for_its_grid_is_refused_with_where_and_what_pole(arms):
-    with pytest.raises(
-        DesignError, match=r"with 2 points.*a pole at.*configuration \[.*raise fast\.grid"
-    ):
+    with pytest.raises(DesignError, match=r"a pole.* at .* 1/s.*configuration \[") as refused:
         design_law(
             FAST, "scheduled_lqr", arms["long_reach"], {"alpha": 1.0, "grid": 2, "r": [0.01]}
         )
+    assert (refused.value.field, refused.value.value) == ("fast.grid", 2)
 
 
 def test_too_many_designs_are_refused_with_the_numbers(arms):
-    with pytest.raises(
-        DesignError,
-        match=r"41 points for each of 3 joints \(shoulder_pitch, elbow_pitch, wrist_pitch\) make 68921"
-        r" designs, more than 20000; lower fast\.grid to 27",
-    ):
+    with pytest.raises(DesignError, match=r"lower fast\.grid to 27") as refused:
         design_law(FAST, "scheduled_lqr", arms["long_reach"], {"grid": 41})
+    error = refused.value
+    joints = "3 joints (shoulder_pitch, elbow_pitch, wrist_pitch)"
+    assert error.problem == f"points for each of {joints} make 68921 designs"
+    assert (error.field, error.value, error.limit) == ("fast.grid", 41, "at most 20000")
 
 
 def test_a_joint_may_be_held_out_of_the_grid(arms):
@@ -240,12 +239,12 @@ def test_the_whole_loop_is_checked_in_the_middle_of_the_range(arms, monkeypatch)
 
 
 def test_a_range_turned_around_is_refused(arms):
-    with pytest.raises(
-        DesignError, match=r"fast\.low\[1\]: 1 rad of joint2 is above fast\.high\[1\], -1"
-    ):
+    with pytest.raises(DesignError) as refused:
         design_law(
             FAST, "scheduled_lqr", arms["two_link"], {"low": [0.0, 1.0], "high": [0.0, -1.0]}
         )
+    error = refused.value
+    assert (error.field, error.value, error.limit) == ("fast.low[1]", 1.0, "-1 rad")
 
 
 # --------------------------------------------------------------------------- pole_placement
@@ -491,10 +490,10 @@ def test_the_default_observer_is_stable_in_the_whole_loop_a_much_faster_one_need
 
 def test_a_period_that_is_too_long_is_refused(arms):
     arm = arms["R"]  # 87.41 rad/s: half a period is 36 ms
-    with pytest.raises(
-        DesignError, match=r"fast\.period: 0\.035 s.*0\.03235 s.*link1_y_mode2.*sample faster"
-    ):
+    with pytest.raises(DesignError, match=r"link1_y_mode2.*sample faster") as refused:
         design_law(FAST, "output_feedback", arm, {"period": 0.035})
+    error = refused.value
+    assert (error.field, error.value, error.limit) == ("fast.period", 0.035, "0.03235 s")
     with pytest.raises(DesignError, match=r"0\.035 s between samples"):
         design_law(FAST, "output_feedback", arm, {}).state_space(0.035)
     with pytest.raises(DesignError, match=r"poles of up to 5\d\d.* rad/s.*sampled every 0\.006 s"):

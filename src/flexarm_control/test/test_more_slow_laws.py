@@ -130,9 +130,9 @@ def test_a_parameter_of_one_name_is_declared_alike_in_all_slow_laws():
     [
         ("computed_torque", {"ki": [-1.0]}, r"slow\.ki\[0\]: -1\.0 .*is below"),
         ("computed_torque", {"feedforward_at": "rest"}, r"slow\.feedforward_at: 'rest'"),
-        ("resolved_acceleration", {"singularity": 0.0}, r"slow\.singularity: 0\.0 is below"),
+        ("resolved_acceleration", {"singularity": 0.0}, r"slow\.singularity: 0\.0 .*is below"),
         ("resolved_acceleration", {"tip_kp": [6.25]}, r"slow\.tip_kp: .* is not a number"),
-        ("sliding_mode", {"boundary_layer": [0.0]}, r"slow\.boundary_layer\[0\]: 0\.0 is below"),
+        ("sliding_mode", {"boundary_layer": [0.0]}, r"slow\.boundary_layer\[0\]: 0\.0 .*is below"),
         ("sliding_mode", {"inertia_error": 1.0}, r"slow\.inertia_error: 1\.0 is above"),
         ("sliding_mode", {"lambda": [1.0, 2.0]}, r"slow\.lambda: 2 values where 1"),
         ("adaptive_model_following", {"payload_scale_max": 0.5}, r"payload_scale_max: 0\.5 is below"),
@@ -226,8 +226,10 @@ def test_feedforward_at_the_reference_does_not_feed_back_measured_speed_through_
 
 
 def test_an_integral_that_would_be_unstable_is_refused(rigid):
-    with pytest.raises(DesignError, match=r"slow\.ki\[1\]: 31\.25 .* kp kv = 31\.25 .* joint2"):
+    with pytest.raises(DesignError, match="joint2") as refused:
         law_of("computed_torque", rigid, ki=[1.0, 31.25])
+    error = refused.value
+    assert (error.field, error.value, error.limit) == ("slow.ki[1]", 31.25, "31.25 1/s^3")
     law = law_of("computed_torque", rigid, ki=[31.0])
     assert law.error_gains() is None
     poles = np.roots([1.0, 5.0, 6.25, 31.0])
@@ -612,8 +614,9 @@ def test_what_can_not_be_learnt_is_refused(arm_r):
     empty = arm_r.with_payload(0.0)
     with pytest.raises(DesignError, match=r"payload\.mass: 0 in arm R"):
         adaptive(empty)
-    with pytest.raises(DesignError, match=r"slow\.kv\[0\]: 4 .* kv of at least 5"):
+    with pytest.raises(DesignError) as refused:
         adaptive(arm_r, kv=[4.0])
+    assert (refused.value.field, refused.value.limit) == ("slow.kv[0]", "at least 5")
 
 
 class Repeated:

@@ -197,7 +197,7 @@ def test_the_loop_waits_under_the_safe_action_until_the_observer_has_converged()
 
 def test_a_loop_that_never_gets_ready_says_why():
     loop = ClosedLoop("R", SLOW, NONE, {"type": "filtered_derivative", "bandwidth": 1.0})
-    loop.LONGEST_START = 0.1
+    loop.MAX_START = 0.1
     with pytest.raises(MessageError, match=r": modal_rate is not known yet"):
         loop.run(motion(loop), 0.1)
 

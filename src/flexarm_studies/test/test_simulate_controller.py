@@ -202,7 +202,7 @@ def test_a_rigid_joint_moves_by_hand_computed_steps_under_late_torque():
 
 @pytest.mark.parametrize("delay", [-1e-3, 1.5, np.nan])
 def test_an_impossible_delay_is_refused(delay):
-    with pytest.raises(FlexarmError, match=r"delay .* s: from 0 to 1 s are possible"):
+    with pytest.raises(FlexarmError, match=r"^delay: .* s is no usable delay \(from 0 to 1 s\)"):
         run(Scenario("R", PAPER, delay=delay, **SHORT))
 
 
@@ -527,7 +527,7 @@ def test_types_that_are_not_given_are_those_of_the_nodes():
         ("observer.alpha=1.0", r"observer\.alpha: no such parameter of 'filtered_derivative'"),
         ("torque_limt=[1.0]", r"torque_limt: no such parameter.*did you mean torque_limit\?"),
         ("arm=P3", r"arm: no such parameter"),
-        ("slow.kp", r"'slow\.kp': write name=value"),
+        ("slow.kp", r"'slow\.kp' is no setting; write name=value"),
         ("slow.kp=[1.0", r"slow\.kp: '\[1\.0' is not YAML"),
         ("slow.type=3", r"slow\.type: 3 is not a name"),
     ],

@@ -114,6 +114,11 @@ def typed(given, prefix):
     values = dict(given)
     name = values.pop("type", None)
     if not isinstance(name, str):
-        what = "missing" if name is None else f"{name!r} is not a name"
-        raise ParameterError(f"{prefix}.type: {what}; write the name of a law, none for no control")
+        found = {} if name is None else {"value": name}
+        raise ParameterError(
+            "is not a name" if found else "missing",
+            field=f"{prefix}.type",
+            hint="write the name of a law, none for no control",
+            **found,
+        )
     return name, values

@@ -171,14 +171,14 @@ def check(law, q, rate, margin=0.0):
         slowest = poles(law, q, 1.0 / rate)[0]
     except np.linalg.LinAlgError as error:
         raise DesignError(
-            f"the poles of the full-order closed loop, sampled at {rate:g} Hz, can't be computed ({error}): the gains"
-            " are beyond what a double holds: lower them"
+            f"the poles of the full-order closed loop, sampled at {rate:g} Hz, can't be computed ({error})",
+            hint="lower the gains, they are beyond what a double holds",
         ) from None
     if slowest.real < -margin + ROUNDING:
         return
     where = f"{slowest.real:.4g}" + (f" +- {abs(slowest.imag):.4g}j" if slowest.imag else "")
     raise DesignError(
         f"the full-order closed loop, sampled at {rate:g} Hz, has a pole at {where} 1/s, not left of"
-        f" -stability_margin = {-margin:g}, at joint configuration {np.round(q, 4).tolist()}: lower the gains"
-        " (slow.kp, slow.kv, fast.q, fast.alpha), take manifold.type corrected, or a higher rate"
+        f" -stability_margin = {-margin:g}, at joint configuration {np.round(q, 4).tolist()}",
+        hint="lower the gains (slow.kp, slow.kv, fast.q, fast.alpha), take manifold.type corrected, or a higher rate",
     )

@@ -91,17 +91,20 @@ def regulator(model, q, parameters):
     ok, worst = is_stabilisable(A2, B2, alpha)
     if not ok:
         raise DesignError(
-            f"fast.alpha: at joint configuration {q.tolist()} the torques can't reach"
-            f" {least_reached(model, A2, B2, alpha)}, which must decay faster than {alpha} 1/s (smallest"
-            f" singular value {worst:.2g}); lower fast.alpha or leave that mode out of the controller's arm file"
+            f"at joint configuration {q.tolist()} the torques can't reach {least_reached(model, A2, B2, alpha)},"
+            f" which must decay faster than {alpha} 1/s (smallest singular value {worst:.2g})",
+            field="fast.alpha",
+            hint="lower fast.alpha or leave that mode out of the controller's arm file",
         )
     K_f, V = _solve(A2 + alpha * np.eye(A2.shape[0]), B2, q, parameters)
     poles = np.linalg.eigvals(A2 + B2 @ K_f)
     worst = poles.real.max()
     if not worst < -alpha - 1e-9 * np.abs(poles).max():  # rounding may put an undamped pole there
         raise DesignError(
-            f"fast: at joint configuration {q.tolist()} the closed boundary layer's slowest pole is at"
-            f" {worst:.4g} 1/s, not left of -alpha = {-alpha}; raise fast.q or lower fast.alpha"
+            f"at joint configuration {q.tolist()} the closed boundary layer's slowest pole is at {worst:.4g} 1/s, not"
+            f" left of -alpha = {-alpha}",
+            field="fast",
+            hint="raise fast.q or lower fast.alpha",
         )
     return Regulator(A2, B2, V, K_f)
 
@@ -115,9 +118,9 @@ def _solve(shifted, B2, q, parameters):
         gain, V, _ = control.lqr(shifted, B2, np.diag(parameters["q"]), np.diag(parameters["r"]))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
-            f"fast: at joint configuration {q.tolist()} the Riccati equation (20) has no stabilising"
-            f" solution for q = {list(parameters['q'])}, r = {list(parameters['r'])},"
-            f" alpha = {parameters['alpha']}: {error}"
+            f"at joint configuration {q.tolist()} the Riccati equation (20) has no stabilising solution for"
+            f" q = {list(parameters['q'])}, r = {list(parameters['r'])}, alpha = {parameters['alpha']}: {error}",
+            field="fast",
         ) from None
     return -np.asarray(gain), np.asarray(V)
 

@@ -69,7 +69,7 @@ class OutputFeedback(FastLaw):
     #: Designs are kept for this many different time steps; a new one takes about 0.1 ms.
     KEPT = 64
     #: Part of half a period of the fastest mode, beyond which amplitudes do not correct.
-    LONGEST = 0.9
+    MAX_PART = 0.9
     #: After so many samples in a row without a correction the law gives up.
     BLIND = 20
 
@@ -80,7 +80,7 @@ class OutputFeedback(FastLaw):
         self.A2, self.B2, self._K_f = self._design.A2, self._design.B2, self._design.K_f
         m = model.n_modes
         poles, vectors = np.linalg.eig(self.A2) if m else (np.zeros(1), np.zeros((0, 1)))
-        self._longest = self.LONGEST * np.pi / max(poles.imag.max(), 1e-300)
+        self._longest = self.MAX_PART * np.pi / max(poles.imag.max(), 1e-300)
         self._fastest = dominant_mode(model, vectors[:, np.argmax(poles.imag)]) if m else ""
         self.estimate, self.predicted = np.zeros(2 * m), np.zeros(2 * m)
         self._steps = {}
@@ -96,17 +96,20 @@ class OutputFeedback(FastLaw):
         if poles.size and not np.abs(poles).max() < 1.0:
             fastest = np.abs(np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)).max()
             raise DesignError(
-                f"fast.period: at joint configuration {q.tolist()} closed fast poles of up to {fastest:.4g} rad/s"
-                f" are unstable in a loop sampled every {period:g} s (largest pole {np.abs(poles).max():.4g}); lower"
-                " fast.alpha and fast.q, raise fast.r, or sample faster"
+                f"at joint configuration {q.tolist()} closed fast poles of up to {fastest:.4g} rad/s are unstable in a"
+                f" loop sampled every {period:g} s (largest pole {np.abs(poles).max():.4g})",
+                field="fast.period",
+                hint="lower fast.alpha and fast.q, raise fast.r, or sample faster",
             )
 
     def _refuse_long(self, dt):
         if dt > self._longest:
             raise DesignError(
-                f"fast.period: {dt:g} s between samples is more than {self._longest:.4g} s,"
-                f" {self.LONGEST} of half a period of {self._fastest}; sample faster or leave that mode out of the"
-                " controller's arm file"
+                f"s between samples is more than {self.MAX_PART} of half a period of {self._fastest}",
+                field="fast.period",
+                value=dt,
+                limit=f"{self._longest:.4g} s",
+                hint="sample faster or leave that mode out of the controller's arm file",
             )
 
     def _step(self, dt):

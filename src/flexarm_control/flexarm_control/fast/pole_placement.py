@@ -85,9 +85,10 @@ class PolePlacement(FastLaw):
         ):
             if reach < self.UNREACHED:
                 raise DesignError(
-                    f"fast.damping: at joint configuration {q.tolist()} the torques can't reach"
-                    f" {dominant_mode(self.model, vector)}, at {abs(pole):.4g} rad/s (singular value"
-                    f" {reach:.2g}); give it the damping 0.0, which leaves it as it is"
+                    f"at joint configuration {q.tolist()} the torques can't reach"
+                    f" {dominant_mode(self.model, vector)}, at {abs(pole):.4g} rad/s (singular value {reach:.2g})",
+                    field="fast.damping",
+                    hint="give it the damping 0.0, which leaves it as it is",
                 )
 
     def _refuse_missed(self, q):
@@ -97,9 +98,11 @@ class PolePlacement(FastLaw):
         i = int(np.argmax(distance[place]))
         if distance[place][i] > self.TOLERANCE:
             raise DesignError(
-                f"fast: at joint configuration {q.tolist()} the pole {self.poles[i]:.5g} 1/s came out at"
-                f" {closed[place[1][i]]:.5g} 1/s: mode {i // 2 + 1} is next to out of reach; give it the damping"
-                " 0.0, which leaves it as it is, or a damping and frequency_scale nearer to its own"
+                f"at joint configuration {q.tolist()} the pole {self.poles[i]:.5g} 1/s came out at"
+                f" {closed[place[1][i]]:.5g} 1/s: mode {i // 2 + 1} is next to out of reach",
+                field="fast",
+                hint="give it the damping 0.0, which leaves it as it is, or a damping and frequency_scale nearer to its"
+                " own",
             )
 
     def torque(self, z_f, q):

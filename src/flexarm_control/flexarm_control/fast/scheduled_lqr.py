@@ -105,7 +105,7 @@ class ScheduledLqr(FastLaw):
     )
 
     #: Most designs: some minutes of Riccati equations for an arm of ten modes.
-    MOST = 20000
+    MAX_DESIGNS = 20000
     #: At most as many random configurations are checked beside the middles of the cells.
     CHECKED = 1000
     #: Relative change of A2 or B2 below which a joint is taken not to matter.
@@ -134,8 +134,11 @@ class ScheduledLqr(FastLaw):
         self.low, self.high = (np.where(default, limits[:, i], (low, high)[i]) for i in (0, 1))
         for i in np.flatnonzero(self.low > self.high):
             raise DesignError(
-                f"fast.low[{i}]: {self.low[i]:.4g} rad of {self.model.joint_names[i]} is above fast.high[{i}],"
-                f" {self.high[i]:.4g} rad; give both"
+                f"rad of {self.model.joint_names[i]} is above fast.high[{i}]",
+                field=f"fast.low[{i}]",
+                value=float(self.low[i]),
+                limit=f"{self.high[i]:.4g} rad",
+                hint="give both",
             )
 
     def _find_joints(self):
@@ -162,12 +165,15 @@ class ScheduledLqr(FastLaw):
 
     def _refuse_too_many(self, grid):
         d = self.scheduled.size
-        if grid**d > self.MOST:
+        if grid**d > self.MAX_DESIGNS:
             names = ", ".join(self.model.joint_names[i] for i in self.scheduled)
             raise DesignError(
-                f"fast.grid: {grid} points for each of {d} joints ({names}) make {grid**d} designs, more than"
-                f" {self.MOST}; lower fast.grid to {int(self.MOST ** (1.0 / d) + 1e-9)}, or hold a joint with"
-                " fast.low = fast.high"
+                f"points for each of {d} joints ({names}) make {grid**d} designs",
+                field="fast.grid",
+                value=grid,
+                limit=f"at most {self.MAX_DESIGNS}",
+                hint=f"lower fast.grid to {int(self.MAX_DESIGNS ** (1.0 / d) + 1e-9)}, or hold a joint with fast.low ="
+                " fast.high",
             )
 
     def _grid(self, places):
@@ -192,10 +198,12 @@ class ScheduledLqr(FastLaw):
             worst = poles[np.argmax(poles.real)]
             if not worst.real < slowest:
                 raise DesignError(
-                    f"fast.grid: with {grid} points per joint the interpolated gain leaves a pole at"
-                    f" {worst.real:.4g} + {abs(worst.imag):.4g}j 1/s, not left of -alpha/2 = {slowest:.4g}, at joint"
-                    f" configuration {np.round(q, 4).tolist()}; raise fast.grid, narrow fast.low to fast.high,"
-                    " or lower fast.alpha"
+                    f"points per joint leave a pole of the interpolated gain at {worst.real:.4g} +"
+                    f" {abs(worst.imag):.4g}j 1/s, not left of -alpha/2 = {slowest:.4g}, at joint configuration"
+                    f" {np.round(q, 4).tolist()}",
+                    field="fast.grid",
+                    value=grid,
+                    hint="raise fast.grid, narrow fast.low to fast.high, or lower fast.alpha",
                 )
 
     @property

@@ -75,8 +75,9 @@ def regulator(model, q):
         P = solve_continuous_are(A + DECAY * omega * np.eye(len(A)), B, Q, np.eye(n))
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
-            f"feedforward model: no regulator of {model.arm.name} at joint configuration {np.round(q, 4).tolist()}"
-            f" ({error}); set feedforward: none"
+            f"no regulator of {model.arm.name} at joint configuration {np.round(q, 4).tolist()} ({error})",
+            field="feedforward model",
+            hint="set feedforward: none",
         ) from None
     return B.T @ P
 
@@ -134,7 +135,7 @@ def path_of(trajectory, start):
         When it does not begin at rest.
     """
     if np.abs(start[1:]).max() > SAME_START:
-        raise DesignError("feedforward: the motion does not begin at rest")
+        raise DesignError("the motion does not begin at rest", field="feedforward")
     fields = (trajectory.positions, trajectory.velocities, trajectory.accelerations)
     path = Path(trajectory.times_ns, [values for values in fields if values is not None], 1)
     path.begin(0, start)
@@ -165,8 +166,9 @@ def gains_along(model, path, period):
         largest = np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max()
         if largest >= 1.0:
             raise DesignError(
-                f"feedforward: the regulator of {model.arm.name} does not hold between joint configurations"
-                f" {np.round(q[at[i]], 3).tolist()} and {np.round(q[at[i + 1]], 3).tolist()} at {1.0 / period:g} Hz"
+                f"the regulator of {model.arm.name} does not hold between joint configurations"
+                f" {np.round(q[at[i]], 3).tolist()} and {np.round(q[at[i + 1]], 3).tolist()} at {1.0 / period:g} Hz",
+                field="feedforward",
             )
     return Gains(grid[at], gains)
 

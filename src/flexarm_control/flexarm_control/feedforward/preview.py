@@ -36,7 +36,7 @@ from .model import ModelFeedforward, Preparation, gains_along, path_of
 #: Longest time between two knots of the shift, over the period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
 #: At least and at most so many free coefficients per joint.
-FEWEST, MOST = 24, 160
+MIN_COUNT, MAX_COUNT = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
 #: Rounds of linearisation.
@@ -54,7 +54,7 @@ STABLE = 1.5
 #: Longest grid step over the period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A longer motion is not planned [samples].
-LONGEST = 20_000
+MAX_STEPS = 20_000
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,9 @@ class Preview(ModelFeedforward):
 def _finite(*arrays):
     """The arrays, if all of their numbers are finite."""
     if not all(np.isfinite(a).all() for a in arrays):
-        raise DesignError("preview: the arm does not stand this motion: give it more time")
+        raise DesignError(
+            "the arm does not stand this motion", field="preview", hint="give it more time"
+        )
     return arrays
 
 
@@ -142,17 +144,19 @@ class _Planner:
         omega = np.sqrt(np.maximum(squares, 1e-6))
         self.omega = omega[0]
         count = KNOTS_PER_PERIOD * self.duration * omega[0] / (2.0 * np.pi)
-        count = int(np.clip(np.ceil(count), FEWEST, MOST))
+        count = int(np.clip(np.ceil(count), MIN_COUNT, MAX_COUNT))
         knots = np.linspace(0.0, self.duration, count + 1)
         slow = max(1, int(np.sum(omega * knots[1] < FASTEST))) if m else 0
         self.rest = model.static_deflection(end[0])
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, STABLE / omega[-1])))
-        if self.steps > LONGEST:
+        if self.steps > MAX_STEPS:
             raise DesignError(
-                f"preview: a motion of {self.duration:g} s takes {self.steps} steps, at most {LONGEST}: plan it in"
-                " parts, or set feedforward: model"
+                f"a motion of {self.duration:g} s takes {self.steps} steps",
+                field="preview",
+                limit=f"at most {MAX_STEPS}",
+                hint="plan it in parts, or set feedforward: model",
             )
         self.h = self.duration / self.steps
         # Whole steps and the midpoints between, as Runge-Kutta wants them.
@@ -371,7 +375,10 @@ class _Planner:
         if not result.success:
             needed = np.abs(u).max(axis=0)
             raise DesignError(
-                f"preview: no motion within the torque limits {np.round(self.limit, 3).tolist()} N m leaves the arm"
-                f" at rest (the reference alone takes {np.round(needed, 3).tolist()} N m): give it more time"
+                f"no motion within the torque limits leaves the arm at rest: the reference alone takes"
+                f" {np.round(needed, 3).tolist()} N m",
+                field="preview",
+                limit=f"{np.round(self.limit, 3).tolist()} N m",
+                hint="give it more time",
             )
         return result.x[: n * count].reshape(n, count)

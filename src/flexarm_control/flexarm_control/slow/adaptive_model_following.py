@@ -88,8 +88,10 @@ class AdaptiveModelFollowing(SlowLaw):
         load = model.arm.payload
         if not load.mass and not np.any(load.inertia):
             raise DesignError(
-                f"payload.mass: 0 in arm {model.arm.name}: adaptive_model_following learns the payload in parts of"
-                " the arm file's; write the mass it is expected to have there"
+                f"in arm {model.arm.name}: adaptive_model_following learns the payload in parts of the arm file's",
+                field="payload.mass",
+                value=0,
+                hint="write the mass that it is expected to have there",
             )
         self.model = PayloadModel(model)
         self._one = rigid_arm(model.arm)
@@ -115,8 +117,11 @@ class AdaptiveModelFollowing(SlowLaw):
         if root.min() < 0.0:
             i = int(np.argmin(root))
             raise DesignError(
-                f"slow.kv[{i}]: {kv[i]:g} 1/s with slow.kp[{i}] = {kp[i]:g} 1/s^2 makes {self.model.joint_names[i]}"
-                f" oscillate; adaptive_model_following needs real poles: kv of at least {2.0 * kp[i] ** 0.5:g}"
+                f"1/s with slow.kp[{i}] = {kp[i]:g} 1/s^2 makes {self.model.joint_names[i]} oscillate",
+                field=f"slow.kv[{i}]",
+                value=float(kv[i]),
+                limit=f"at least {2.0 * kp[i] ** 0.5:g}",
+                hint="adaptive_model_following needs real poles",
             )
         root = np.sqrt(root)
         self.surface, self.approach = 0.5 * (kv - root), 0.5 * (kv + root)
@@ -133,8 +138,8 @@ class AdaptiveModelFollowing(SlowLaw):
             weight = max(weight, heavy @ np.linalg.solve(M, heavy))
         if not inertia > 0.0:
             raise DesignError(
-                f"payload: no joint of arm {self.model.arm.name} moves it: adaptive_model_following has nothing to"
-                " learn"
+                f"no joint of arm {self.model.arm.name} moves it: adaptive_model_following has nothing to learn",
+                field="payload",
             )
         gain = self.parameters["adaptation_gain"]
         slowest = max(self.approach.min(), 1e-6)

@@ -74,8 +74,11 @@ class ComputedTorque(SlowLaw):
         if unstable.any():
             i = int(np.argmax(unstable))
             raise DesignError(
-                f"slow.ki[{i}]: {self.ki[i]:g} 1/s^3 is not below kp kv = {self.kp[i] * self.kv[i]:g} 1/s^3: the"
-                f" error of {self.model.joint_names[i]} would grow; lower slow.ki or raise slow.kp, slow.kv"
+                f"1/s^3 is not below kp kv: the error of {self.model.joint_names[i]} would grow",
+                field=f"slow.ki[{i}]",
+                value=float(self.ki[i]),
+                limit=f"{self.kp[i] * self.kv[i]:g} 1/s^3",
+                hint="lower slow.ki or raise slow.kp, slow.kv",
             )
 
     def error_gains(self):

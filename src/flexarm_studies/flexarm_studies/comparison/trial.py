@@ -49,7 +49,7 @@ def _run(case, setup, noisy, seed):
         arm, setup.controller, noise=noisy, seed=seed, rate=case.rate, window=case.window
     )
     loop = scenarios.loop_of(scenario)
-    loop.LARGEST_ERROR = MAX_ERROR
+    loop.MAX_ERROR = MAX_ERROR
     controller = loop.controller
     if setup.law is not None:
         controller.law = setup.law(loop.model)

@@ -100,8 +100,13 @@ class ClosedLoop:
         return self._estimate
 
     def _set_delay(self, delay):
-        if not 0.0 <= delay <= self.LONGEST_DELAY:
-            raise FlexarmError(f"delay {delay} s: from 0 to {self.LONGEST_DELAY:g} s are possible")
+        if not 0.0 <= delay <= self.MAX_DELAY:
+            raise FlexarmError(
+                "s is no usable delay",
+                field="delay",
+                value=delay,
+                limit=f"from 0 to {self.MAX_DELAY:g} s",
+            )
         whole, rest = divmod(round(delay * 1e9), self.simulator.period_ns)
         self._share = rest / self.simulator.period_ns
         # Torques on their way, the oldest first; until the first arrives, safe actions.
@@ -135,11 +140,11 @@ class ClosedLoop:
         return e
 
     #: The observer has this long to converge [s].
-    LONGEST_START = 10.0
+    MAX_START = 10.0
     #: A longer delay than this is a wrong number [s].
-    LONGEST_DELAY = 1.0
+    MAX_DELAY = 1.0
     #: A joint farther than this off its reference is not controlled any more [rad].
-    LARGEST_ERROR = 2.0 * np.pi
+    MAX_ERROR = 2.0 * np.pi
 
     def step(self):
         """One sample: measure, estimate, control, and advance the plant; returns the torque sent or None."""
@@ -213,7 +218,7 @@ class ClosedLoop:
         simulator, length = self.simulator, round(duration * 1e9)
         begin, start, stamps, rows = simulator.time, trajectory.stamp_ns or None, [], []
         while start is None or simulator.stamp_ns <= start + length:
-            if start is None and simulator.time > begin + self.LONGEST_START:
+            if start is None and simulator.time > begin + self.MAX_START:
                 raise MessageError(f"the trajectory does not start: {self.controller.reason}")
             enabled = self._answer()
             stamps.append(simulator.stamp_ns)
@@ -258,7 +263,7 @@ class ClosedLoop:
         if np.abs(plant.delta).max(initial=0.0) > self._reach:
             return f"{self.model.arm.name} is bent by more than it is long"
         error = np.abs(plant.q - reference.position)
-        if error.max() > self.LARGEST_ERROR:
+        if error.max() > self.MAX_ERROR:
             i = int(np.argmax(error))
             return f"{self.model.joint_names[i]} is {error[i]:.3g} rad off its reference"
         return ""

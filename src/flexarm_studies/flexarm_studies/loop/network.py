@@ -44,14 +44,19 @@ class Network:
     """
 
     #: A longer delay than this is a wrong number [s].
-    LONGEST = 1.0
+    MAX_TIME = 1.0
 
     def __init__(self, loss=0.0, delay=0.0, jitter=0.0, seed=0):
         if not 0.0 <= loss <= 1.0:
-            raise FlexarmError(f"loss {loss}: a share from 0 to 1 is wanted")
+            raise FlexarmError("is no probability", field="loss", value=loss, limit="from 0 to 1")
         for name, value in (("delay", delay), ("jitter", jitter)):
-            if not 0.0 <= value <= self.LONGEST:
-                raise FlexarmError(f"{name} {value} s: from 0 to {self.LONGEST:g} s are possible")
+            if not 0.0 <= value <= self.MAX_TIME:
+                raise FlexarmError(
+                    f"s is no usable {name}",
+                    field=name,
+                    value=value,
+                    limit=f"from 0 to {self.MAX_TIME:g} s",
+                )
         self.loss, self.delay, self.jitter = loss, delay, jitter
         # A stream of its own beside those of the sensors' noise.
         self._random = np.random.default_rng([seed, 2])
@@ -111,11 +116,11 @@ class NetworkedLoop(ClosedLoop):
         A trajectory with stamp 0 gets one by which it will be known, so that it starts with a sample of the arm.
         """
         simulator = self.simulator
-        latest = simulator.time + self.LONGEST_START
+        latest = simulator.time + self.MAX_START
         while not self._answer():
             if simulator.time > latest:
                 reason = self.controller.reason or "no sample has arrived"
-                raise MessageError(f"no torque within {self.LONGEST_START:g} s: {reason}")
+                raise MessageError(f"no torque within {self.MAX_START:g} s: {reason}")
             self._advance(None)
         if not trajectory.stamp_ns:
             ahead = math.ceil(1e9 * LEAD / simulator.period_ns) * simulator.period_ns

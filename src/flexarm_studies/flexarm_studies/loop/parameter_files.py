@@ -31,7 +31,9 @@ def find(name):
         if path.is_file():
             return path
     shipped = ", ".join(sorted(p.stem for p in directory().glob("*.yaml")))
-    raise ParameterError(f"controller file {str(name)!r}: neither a file nor shipped ({shipped})")
+    raise ParameterError(
+        "is neither a file nor shipped", field="controller file", value=str(name), limit=shipped
+    )
 
 
 def load(name):

@@ -145,11 +145,13 @@ def parameters(file, settings=()):
 def _setting(text):
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
-        raise ParameterError(f"{text!r}: write name=value, such as slow.kp=[6.25]")
+        raise ParameterError(
+            "is no setting", value=text, hint="write name=value, such as slow.kp=[6.25]"
+        )
     try:
         return name.strip(), yaml.safe_load(value)
     except yaml.YAMLError as error:
-        raise ParameterError(f"{name}: {value!r} is not YAML: {error}") from None
+        raise ParameterError(f"is not YAML: {error}", field=name, value=value) from None
 
 
 def _check_name(name, values):
@@ -168,8 +170,8 @@ def _check_name(name, values):
     else:
         there, what = [*known, *(f"{p}.…" for p in COMPONENTS)], ""
     close = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    raise ParameterError(f"{name}: no such parameter{what}; there are {', '.join(there)}{hint}")
+    hint = f"there are {', '.join(there)}" + (f"; did you mean {close[0]}?" if close else "")
+    raise ParameterError(f"no such parameter{what}", field=name, hint=hint)
 
 
 def loop_of(scenario):
@@ -261,7 +263,9 @@ def run_loop(scenario, recorder=None):
         For a `repeat` that is no count; and as `run`.
     """
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
-        raise ParameterError(f"repeat {scenario.repeat}: an integer not below 1 is wanted")
+        raise ParameterError(
+            "is no count", field="repeat", value=scenario.repeat, limit="an integer, at least 1"
+        )
     loop = loop_of(scenario)
     motion = trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
     if "initial_position" not in scenario.controller and motion.times_ns[0] == 0:
@@ -302,7 +306,7 @@ def _check_times(scenario, duration):
     )
     for name, value in limits:
         if not 0.0 <= value <= 1e5:
-            raise ParameterError(f"{name} {value}: a number from 0 to 1e5 is wanted")
+            raise ParameterError("is out of range", field=name, value=value, limit="from 0 to 1e5")
 
 
 def _metrics(scenario, loop, record, end, duration):
