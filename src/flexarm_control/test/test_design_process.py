@@ -87,6 +87,7 @@ def test_a_model_of_another_arm_is_not_sent(arm_r, arm_p3):
         design_process.dumps([arm_p3], arm_r.arm)
 
 
+@pytest.mark.slow
 def test_the_process_designs_refuses_and_comes_again_when_it_has_died(arm_r):
     worker = DesignProcess(arm_r, niceness=0)
     try:

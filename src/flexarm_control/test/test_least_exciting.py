@@ -40,6 +40,7 @@ def test_the_torque_stays_within_its_limit_and_uses_it(motion):
     assert 3.49 < motion.excitation.peak_torque[0] <= 3.5 * (1.0 + 1e-5)
 
 
+@pytest.mark.slow
 def test_it_excites_less_than_the_families_of_the_same_duration(arm_r, motion):
     others = [profiles.quintic(0.0, QUARTER, 2.0), profiles.paper_profile(2.0)]
     others += [profiles.smooth(0.0, QUARTER, 2.0, k) for k in (3, 4)]

@@ -655,6 +655,7 @@ def peak_errors(plant, law, moves, dt=1e-3):
     return peaks
 
 
+@pytest.mark.slow
 def test_on_the_flexible_arm_a_repetition_is_tracked_better_than_with_the_wrong_payload(arm_r):
     fast, manifold = {"type": "lqr"}, {"type": "corrected"}
     law = design(arm_r, {"type": "adaptive_model_following"}, fast, manifold)

@@ -236,6 +236,7 @@ any_point = st.one_of(
     st.one_of(st.just(0), st.integers(), junk),
     st.one_of(st.lists(any_point, max_size=4), junk),
 )
+@pytest.mark.slow
 def test_whatever_comes_only_trajectory_errors_are_raised(names, stamp, points):
     try:
         trajectory = validate(names, ARM, stamp, points)

@@ -754,6 +754,7 @@ def mutate(draw, tree):
     suppress_health_check=list(HealthCheck),
 )
 @given(st.data())
+@pytest.mark.slow
 def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
     tree = copy.deepcopy(data.draw(st.sampled_from(BASES)))
     for _ in range(data.draw(st.integers(1, 3))):
@@ -774,6 +775,7 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
 
 @settings(max_examples=300, deadline=None, derandomize=True, database=None)
 @given(st.data())
+@pytest.mark.slow
 def test_a_file_with_damaged_characters_gives_an_arm_or_an_arm_file_error(data):
     text = list(FULL)
     for _ in range(data.draw(st.integers(1, 4))):

@@ -469,6 +469,7 @@ arms = {"seed": seeds, "layout": layouts(), "level": st.sampled_from(LEVELS)}
 
 @examples
 @given(**arms)
+@pytest.mark.slow
 def test_forces_are_those_of_a_second_derivation(seed, layout, level):
     arm = random_arm(seed, layout, level)
     chain, rng = Chain(arm), np.random.default_rng(seed)
@@ -493,6 +494,7 @@ def test_forces_are_those_of_a_second_derivation(seed, layout, level):
 
 @examples
 @given(**arms)
+@pytest.mark.slow
 def test_energies_and_momenta_are_sums_over_all_that_has_mass(seed, layout, level):
     arm = random_arm(seed, layout, level)
     chain = Chain(arm)
@@ -510,6 +512,7 @@ def test_energies_and_momenta_are_sums_over_all_that_has_mass(seed, layout, leve
 
 @examples
 @given(**arms)
+@pytest.mark.slow
 def test_energy_changes_by_the_work_of_torque_damping_and_friction(seed, layout, level):
     """The rate of energy is exact: no difference of energies is taken."""
     arm = random_arm(seed, layout, level)
@@ -595,6 +598,7 @@ def derivative(function, at, steps):
 
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("torque", [0.0, 1.7])
+@pytest.mark.slow
 def test_angular_momentum_about_the_first_joint_changes_by_its_torque_alone(level, torque):
     """Along the flow, by differences of eighth order.
 
@@ -710,6 +714,7 @@ def test_points_turn_and_move_as_in_the_second_derivation(seed, layout, level, l
 
 
 @pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.slow
 def test_jacobians_are_the_derivatives_of_points_and_frames(level):
     """By differences of the model's own points and frames."""
     arm = random_arm(41, [FULL, {}, FULL], level)
@@ -868,6 +873,7 @@ STRUCTURES = {
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.slow
 def test_straight_line_code_gives_the_accelerations_of_the_model(name):
     arm = STRUCTURES[name]
     chain = Chain(arm)
@@ -1137,6 +1143,7 @@ def test_torsional_frequencies_of_a_held_bar(shape):
 TIP = Payload(0.0, ((3e-3, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
+@pytest.mark.slow
 def test_torsional_frequencies_of_a_held_bar_with_a_load():
     bar = 2e-3 * 0.9
     ratio = 3e-3 / bar

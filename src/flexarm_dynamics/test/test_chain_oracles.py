@@ -229,6 +229,7 @@ planar_arms = pytest.mark.parametrize(
 STATES = 5
 
 
+@pytest.mark.slow
 def test_symbolic_arm_against_quadrature():
     errors = symbolic.check(states=2)
     # h is differenced numerically there.

@@ -206,6 +206,7 @@ states = st.fixed_dictionaries(
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(st.tuples(states, st.integers(0, 2**40)), min_size=1, max_size=5))
+@pytest.mark.slow
 def test_any_stream_of_states_is_a_finite_estimate_or_a_message_error(stream):
     reader = StateReader(REAL)
     observer = ArmObserver(MODEL, design_observer("filtered_derivative", MODEL, {}))
@@ -371,6 +372,7 @@ print("written")
 
 
 @pytest.mark.parametrize("checked", ("0", "1"))
+@pytest.mark.slow
 def test_arrays_written_in_place_are_in_the_published_message(checked):
     environment = dict(os.environ, ROS_PYTHON_CHECK_FIELDS=checked)
     done = subprocess.run(

@@ -106,6 +106,7 @@ def within(found, limits):
         ("finite slope", 3, {"tip": 1e-6, "theta1": 1e-8, "deflection": 1e-6}),
     ],
 )
+@pytest.mark.slow
 def test_one_link_follows_two_multibody_codes(parameters, level, modes, limits):
     """A torque pulse there and back."""
     table = np.genfromtxt(data() / "one_link_pulse.csv", delimiter=",", names=True)
@@ -133,6 +134,7 @@ def test_one_link_follows_two_multibody_codes(parameters, level, modes, limits):
         ("", "finite slope", 3, {"theta1": 5e-5, "tip": 2e-5, "elbow": 2e-5, "alpha2": 2e-5}),
     ],
 )  # fmt: skip
+@pytest.mark.slow
 def test_two_links_follow_two_multibody_codes(parameters, case, level, modes, limits):
     """Sinusoidal torques, and a tenth of them; what each level can not know is in the limits."""
     name = "two_link_torque" + ("_x0p1" if case else "")
@@ -214,6 +216,7 @@ def final(chain, method, step, count, start, torque, change, **options):
 @pytest.mark.parametrize(
     "method, order, step", [("rk4", 4, 1e-3), ("dop853", 8, 4e-3), ("implicit", 2, 5e-4)]
 )
+@pytest.mark.slow
 def test_order_of_the_integrators(level, method, order, step):
     """Torque linear in time, friction and damping; steps halved twice."""
     arm = planar(EI=(20.0, 30.0), damping=(0.02,), friction=Friction(0.05, 0.1, 0.5))
@@ -323,6 +326,7 @@ FREE = {
 
 
 @pytest.mark.parametrize("name", FREE)
+@pytest.mark.slow
 def test_free_motion_keeps_its_energy_for_ten_seconds(name):
     chain = Chain(FREE[name])
     for more, drift in ((1, 1e-7), (2, 1e-9)):  # than the substeps that the plant takes
@@ -420,6 +424,7 @@ def test_a_beam_spun_up_past_its_first_frequency_stays_straight_if_it_keeps_its_
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("workers", [1, 2, None])
+@pytest.mark.slow
 def test_a_batch_equals_its_runs_one_by_one_bit_for_bit(method, workers):
     rng = np.random.default_rng(11)
     chains = [Chain(planar(EI=EI)) for EI in ((4.0, 6.0), (5.0, 5.5))]

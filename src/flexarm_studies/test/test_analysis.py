@@ -221,6 +221,7 @@ def run(capsys, *words):
     return ended.value.code, out.out, out.err
 
 
+@pytest.mark.slow
 def test_the_command_writes_json_and_figures(capsys, tmp_path):
     words = ("R", "paper_composite", "--quick", "--configurations", "3", "--json")
     code, out, err = run(capsys, *words, "--out", str(tmp_path))

@@ -42,6 +42,7 @@ def test_samples_differ_are_in_their_ranges_and_are_their_number_s_own(spec):
     assert mc.draw(replace(spec, seed=8), 3) != drawn[3]
 
 
+@pytest.mark.slow
 def test_one_and_two_workers_and_threads_give_the_same(spec, results):
     assert mc.run(spec, COUNT, workers=2) == results
     with ThreadPoolExecutor(1) as executor:

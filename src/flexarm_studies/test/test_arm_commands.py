@@ -299,6 +299,7 @@ def test_a_motion_that_can_not_be_followed_is_refused(tmp_path, capsys, content,
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_commands_need_no_ros(tmp_path):
     """In a process of its own in which rclpy and the messages can't be imported."""
     code = (

@@ -13,6 +13,8 @@ from flexarm_studies.loop import metrics
 from flexarm_studies.loop.closed_loop import ClosedLoop
 from flexarm_studies.loop.scenario import Scenario, parameters, run
 
+pytestmark = pytest.mark.slow
+
 #: The defaults of the controller node.
 SLOW, FAST = {"type": "linear_model_following"}, {"type": "lqr"}
 MANIFOLD = {"type": "corrected"}

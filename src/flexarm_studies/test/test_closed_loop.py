@@ -21,6 +21,8 @@ from flexarm_studies.case_study.runs import RUNS
 from flexarm_studies.loop import metrics
 from flexarm_studies.loop.closed_loop import ClosedLoop, continuous_loop
 
+pytestmark = pytest.mark.slow
+
 ERRATA = Path(__file__).parents[3] / "tests" / "data" / "errata.json"
 SLOW = {"type": "linear_model_following"}
 NONE = {"type": "none"}

@@ -19,6 +19,8 @@ from flexarm_studies.comparison.baselines import FullStateLqr, JointPid, lqr_gai
 from flexarm_studies.comparison.tuning import Free, tune
 from flexarm_studies.loop import scenario
 
+pytestmark = pytest.mark.slow
+
 R, ONE, TWO, LONG = cases.CASES
 
 

@@ -11,6 +11,8 @@ from numpy.testing import assert_allclose
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE_FOOT
 from flexarm_studies.case_study import figures
 
+pytestmark = pytest.mark.slow
+
 NAMES = [
     "fig02_reference_velocity",
     "fig03_joint_angle_error",

@@ -39,6 +39,7 @@ def shaken(given):
     return truth, measured, identify(given, measured)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth_and_are_narrow_but_not_too_wide():
     table = coverage.run(ARMS, seed=1, rate=RATE, settings=SHORT)
     assert not any(row["left_out"] for row in table.values())

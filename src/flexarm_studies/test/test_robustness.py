@@ -187,6 +187,7 @@ def test_levels_are_a_range_or_one():
 
 
 @pytest.mark.parametrize(("controller", "until"), [("paper_lab", 8.0), ("lab", 4.0)])
+@pytest.mark.slow
 def test_the_case_study_with_a_laboratorys_sensing(controller, until):
     """Half a microstrain, 12 bits, 4096 counts, torque 2 ms late, 500 Hz, no joint velocity."""
     scenario = Scenario(
