@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation node: `arm_state` in, `joint_torque` out, as the controller does, to find the arm's parameters by."""
+"""Excitation node: `arm_state` in, `joint_torque` out in place of the controller, for identification."""
 
 import os
 
@@ -31,8 +31,8 @@ PARAMETERS = (
     ),
 )
 
-#: How long the last torque, DISABLED, is waited for to arrive.
-LAST_WORD = Duration(seconds=0.2)
+#: Timeout for delivering the final DISABLED message.
+FINAL_TIMEOUT = Duration(seconds=0.2)
 
 
 def parameter_groups():
@@ -53,8 +53,8 @@ class ExciteNode(ArmNode):
         self.core = ExcitationRun(model.build(self.arm), parameters.group("", names))
         self._reader, self._sample = StateReader(self.arm), ArmSample(len(self.arm.joints))
         self._torque = TorqueWriter(self.arm, int.from_bytes(os.urandom(4), "little"))
-        self._ticks, self._seen, self._told = 0, False, False
-        self._heard = False
+        self._ticks, self._seen, self._reported_end = 0, False, False
+        self._connected = False
         options = qos.overridable()
         self._torque_pub = self.make_publisher(
             JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
@@ -70,9 +70,9 @@ class ExciteNode(ArmNode):
         if not self.active:
             return
         self._ticks, self._seen = 0, True
-        if not self._heard:
-            self._heard = self._is_heard()
-            if not self._heard:
+        if not self._connected:
+            self._connected = self._has_readers()
+            if not self._connected:
                 return
         try:
             self._reader.read(msg, self._sample)
@@ -81,10 +81,10 @@ class ExciteNode(ArmNode):
             self.core.stop(str(error))
             enabled = False
         self._torque_pub.publish(self._torque.answer(self._sample, enabled, self.core.torque))
-        self._tell()
+        self._report_end()
 
-    def _is_heard(self):
-        """Whether all that are to hear the torque are connected; others may listen, too, and come sooner."""
+    def _has_readers(self):
+        """Whether all required readers of the torque are connected; other subscribers don't count as the recorder."""
         if self._torque_pub.get_subscription_count() < self.parameters["readers"]:
             return False
         name = self.parameters["recorder"]
@@ -93,20 +93,20 @@ class ExciteNode(ArmNode):
         readers = self.get_subscriptions_info_by_topic(self._torque_pub.topic_name)
         return any(reader.node_name == name for reader in readers)
 
-    def _tell(self):
-        """Say once how it ended."""
-        if self._told or self.core.stage in (Stage.SETTLING, Stage.SHAKING):
+    def _report_end(self):
+        """Log once how the excitation ended."""
+        if self._reported_end or self.core.stage in (Stage.SETTLING, Stage.SHAKING):
             return
-        self._told = True
+        self._reported_end = True
         if self.core.stage is Stage.DONE:
             self.get_logger().info("excitation complete; torque disabled")
         else:
             self.get_logger().error(f"excitation stopped: {self.core.reason}")
 
     def _watch(self):
-        """Steady clock: the states have stopped."""
+        """Stop when no state has come for `state_timeout`, by the steady clock."""
         self._ticks += 1
-        # Before it shakes there is no torque to take back.
+        # Before the excitation there is no torque to disable.
         if self._ticks < 6 or not self._seen or self.core.stage is not Stage.SHAKING:
             return
         self._seen = False
@@ -117,7 +117,7 @@ class ExciteNode(ArmNode):
     def _end(self, reason):
         self.core.stop(reason)
         self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
-        self._tell()
+        self._report_end()
 
     def start(self):
         kind = self.parameters["kind"]
@@ -127,8 +127,8 @@ class ExciteNode(ArmNode):
 
     def stop(self):
         self._end("the node was stopped")
-        # A node that ends takes with it what has not been read yet.
-        self._torque_pub.wait_for_all_acked(LAST_WORD)
+        # Messages that are not delivered when a node ends are lost.
+        self._torque_pub.wait_for_all_acked(FINAL_TIMEOUT)
 
     def diagnose(self):
         core = self.core

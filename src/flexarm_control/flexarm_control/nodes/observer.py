@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
-from math import isnan
 from time import perf_counter
 
-import numpy as np
 from std_srvs.srv import Trigger
 
 from flexarm_dynamics import registry
@@ -15,16 +13,13 @@ from flexarm_dynamics.parameters import sizes
 from flexarm_msgs.msg import ArmState, ObserverState
 from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
-from flexarm_ros.node import ARM, ERROR, OK, WARN, ArmNode, run
+from flexarm_ros.node import ARM, ArmNode, run
 from flexarm_ros.start import leave
-from flexarm_ros.statistics import Gaps, Latency, Percentiles
 
 from ..composite import assembly
 from ..loop.samples import ArmSample
 from ..observers import arm_observer, gauge_health
-
-#: So large a part of the samples may get lost in a second before it is worth a warning.
-MANY_LOST = 0.01
+from .observer_statistics import ObserverStatistics
 
 
 def parameter_groups():
@@ -43,18 +38,14 @@ class ObserverNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(sizes(self.model))
-        arm_observer.ArmObserver(self.model, self._design(), **self._common()).warm_up()
-        self.core = arm_observer.ArmObserver(self.model, self._design(), **self._common())
+        self._new_core().warm_up()
+        self.core = self._new_core()
         parameters.on_change(self._changed)
         arm = self.arm
         self._reader = StateReader(arm)
         self._sample = ArmSample(len(arm.joints), len(arm.modes), len(arm.gauges))
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
-        self._samples, self._refused, self._samples_before = 0, 0, 0
-        self._refused_before, self._refusal = 0, ""
-        self._latency, self._gaps = Latency(), Gaps()
-        self._innovation, self._squared = Percentiles(), Percentiles()
-        self._size = np.zeros(len(arm.modes))
+        self._statistics = ObserverStatistics(len(arm.modes))
         options = qos.overridable()
         self._estimate_pub = self.make_publisher(
             ArmState, "arm_state_estimate", qos.LINE, qos_overriding_options=options
@@ -69,6 +60,9 @@ class ObserverNode(ArmNode):
             )
         )
 
+    def _new_core(self):
+        return arm_observer.ArmObserver(self.model, self._design(), **self._common())
+
     def _design(self):
         name = self.parameters["observer.type"]
         law = registry.find(arm_observer.OBSERVERS, name)
@@ -77,11 +71,11 @@ class ObserverNode(ArmNode):
         return arm_observer.design_observer(name, self.model, values)
 
     def _common(self):
-        """What belongs to no single law."""
+        """Parameters that belong to no single law."""
         return self.parameters.group("observer.", {p.name for p in arm_observer.PARAMETERS})
 
     def _changed(self, names):
-        """Swap in a new observer, which goes on from the old one's estimate."""
+        """Replace the observer by a new one, which continues from the old one's estimate."""
         common = self._common()
         self.core.bandwidth, self.core.delay = common["joint_velocity_bandwidth"], common["delay"]
         self.core.smooth_position = common["smooth_position"]
@@ -97,20 +91,18 @@ class ObserverNode(ArmNode):
         if not self.active:
             return
         started = perf_counter()
-        self._gaps.add(msg.session, msg.sequence)
+        self._statistics.received(msg)
         sample, writer, core = self._sample, self._writer, self.core
         try:
             self._reader.read(msg, sample)
             known = core.step(sample)
         except MessageError as error:
-            self._refused += 1
-            self._refusal = str(error)
+            self._statistics.refused(error)
             self.report(f"arm_state {msg.sequence}: {error}")
             self._forward_unknown(msg)
             return
-        if known is None:  # older than the last one: the controller has no use for it
+        if known is None:  # older than the last one: useless for the controller
             return
-        self._samples += 1
         writer.head(sample.stamp_ns, sample.session, sample.sequence)
         writer.write("joint_position", core.position)
         writer.write("joint_velocity", core.velocity)
@@ -119,7 +111,7 @@ class ObserverNode(ArmNode):
         writer.write("modal_amplitude", core.amplitude)
         writer.write("modal_rate", core.rate if known else None)
         self._estimate_pub.publish(writer.message)
-        self._measure(started)
+        self._statistics.estimated(core.observer, perf_counter() - started)
         if self._state_pub.get_subscription_count():
             name = self.parameters["observer.type"]
             self._state_pub.publish(
@@ -128,17 +120,8 @@ class ObserverNode(ArmNode):
                 )
             )
 
-    def _measure(self, started):
-        """What diagnostics tell of this sample."""
-        self._latency.add(perf_counter() - started)
-        observer = self.core.observer
-        self._squared.add(observer.innovation_squared)
-        if observer.innovation.size == self._size.size:
-            np.abs(observer.innovation, out=self._size)
-            self._innovation.add(self._size.max(initial=0.0))
-
     def _on_calibrate(self, request, response):
-        """Service: the gauges' bias from the samples at hand; answers at once."""
+        """Service: set the gauges' bias from the last samples; answers at once."""
         core = self.core
         try:
             if not self.active:
@@ -148,10 +131,10 @@ class ObserverNode(ArmNode):
             response.success, response.message = False, str(error)
             return response
         names = self.arm.gauge_names
-        said = gauge_health.calibration_text(names, old, new, core.calibration.samples)
+        text = gauge_health.calibration_text(names, old, new, core.calibration.samples)
         lines = gauge_health.calibration_yaml(names, new)
         self.get_logger().info(f"gauges calibrated; for the arm file:\n{lines}")
-        response.success, response.message = True, said
+        response.success, response.message = True, text
         return response
 
     def _forward_unknown(self, msg):
@@ -168,52 +151,7 @@ class ObserverNode(ArmNode):
         self._estimate_pub.publish(out)
 
     def diagnose(self):
-        observer = self.core.observer
-        rate, self._samples_before = self._samples - self._samples_before, self._samples
-        lost = self._gaps.take()
-        values = {
-            "observer": self.parameters["observer.type"],
-            "samples per second": rate,
-            "samples refused": self._refused,
-            "samples lost": self._gaps.lost,
-            **self._latency.values(),
-            "converged": observer.converged,
-            **self._innovations(),
-            **observer.parameters_estimated,
-        }
-        refused, self._refused_before = self._refused - self._refused_before, self._refused
-        if not self.active:
-            return OK, "not active", values
-        if refused:
-            return ERROR, f"{refused} states refused: {self._refusal}", values
-        if rate == 0:
-            return ERROR, "no usable arm_state: start the simulator or driver", values
-        if not observer.converged:
-            return WARN, "not converged yet", values
-        if self.core.gauges and (wrong := self.core.gauges.warnings()):
-            return WARN, "; ".join(wrong), values
-        if not observer.consistent:
-            wrong = "innovations are larger than the noise explains: raise observer noise levels, or mend the arm file"
-            return WARN, wrong, values
-        if lost > MANY_LOST * (rate + lost):
-            return (
-                WARN,
-                f"{lost} of {rate + lost} samples lost on their way from the driver",
-                values,
-            )
-        return OK, "", values
-
-    def _innovations(self):
-        """Measured minus predicted amplitude in the last second, where the observer predicts one."""
-        (largest,) = self._innovation.take()
-        median, squared = self._squared.take(50.0)
-        values = {}
-        if not isnan(largest):
-            values["largest innovation [m, rad]"] = f"{largest:.3g}"
-        if not isnan(squared):
-            values["normalised innovation squared p50"] = f"{median:.3g}"
-            values["normalised innovation squared max"] = f"{squared:.3g}"
-        return values
+        return self._statistics.diagnose(self.core, self.parameters["observer.type"], self.active)
 
 
 def main(args=None):
