@@ -1,9 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text that a run writes into a document, between two lines that mark its place."""
+"""Markdown: tables, and text that a command writes between two markers of a document."""
 
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
+
+
+def table(columns, rows):
+    """Return the lines of a Markdown table.
+
+    Parameters
+    ----------
+    columns : sequence of str
+    rows : iterable of sequence
+        Numbers get three digits; None is a dash.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
+    return lines + ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]
+
+
+def _cell(value):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "-" if value is None else str(value)
 
 
 def write_between(file, begin, end, text):

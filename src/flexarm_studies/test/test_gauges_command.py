@@ -83,7 +83,7 @@ def test_the_best_set_is_the_best_of_all(criterion):
 def test_exchange_finds_the_best_set_of_a_links_positions(criterion, monkeypatch):
     rows = rows_of("R")
     every, _ = gauges.best_sets(rows, 4, criterion)
-    monkeypatch.setattr(gauges, "MOST_SETS", comb(gauges.GRID, 2))
+    monkeypatch.setattr(gauges, "MAX_SETS", comb(gauges.GRID, 2))
     (found,), _ = gauges.best_sets(rows, 4, criterion)
     assert found == every[0]
 
@@ -117,7 +117,8 @@ def test_the_best_places_are_better_than_the_present_ones_and_one_more_helps(cap
 def test_modes_that_the_gauges_cannot_tell_apart_are_named(capsys):
     code, out, _ = run(capsys, "R", "--modes", "3")
     assert code == 0
-    assert "root, middle can't tell link1_y_mode1" in out and "link1_y_mode3 apart" in out
+    assert "root, middle can't distinguish link1_y_mode1" in out
+    assert "link1_y_mode3, which cause the same strains" in out
     assert "not enough" in out and "best" in out
 
 
@@ -125,8 +126,8 @@ def test_two_gauges_side_by_side_hardly_tell_two_modes_apart(tmp_path, capsys):
     path = tmp_path / "near.yaml"
     path.write_text(arm_file.find("R").read_text().replace("position: 2.0", "position: 0.05"))
     out = run(capsys, str(path))[1]
-    assert "link1_y_mode1 and link1_y_mode2 are hardly told apart" in out
-    assert "hardly" not in run(capsys, "R")[1]
+    assert "link1_y_mode1 and link1_y_mode2 are hard to distinguish" in out
+    assert "hard to" not in run(capsys, "R")[1]
 
 
 def test_every_link_and_direction_has_its_own_gauges(capsys):
@@ -139,9 +140,9 @@ def test_every_link_and_direction_has_its_own_gauges(capsys):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("rigid",), "rigid has no modes to observe"),
-        (("R", "--count", "1"), "--count 1: link1 has 2 modes to observe in y"),
-        (("R", "--count", "22"), "--count 22: at most 21"),
+        (("rigid",), "modes to observe: of rigid are none"),
+        (("R", "--count", "1"), "--count: 1 gauges can't observe the 2 modes of link1 in y"),
+        (("R", "--count", "22"), "--count: 22 gauges are more than there are positions (21)"),
         (("R", "--modes", "0"), "0 modes"),
         (("nothing",), "neither a file nor a shipped arm"),
     ],

@@ -651,18 +651,18 @@ def test_a_lost_arm_is_exit_code_1_with_the_reason_and_the_figures(capsys, tmp_p
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--controller", "paper_composite"), "--trajectory is missing"),
+        (("--controller", "paper_composite"), "--trajectory: is missing"),
         (("--controller", "nowhere", "--trajectory", "paper"), "neither a file nor shipped"),
-        ((*CONTROLLED, "--torque", "x.csv"), "--torque: not with --controller"),
-        ((*CONTROLLED, "--modes", 3), "--modes: not with --controller"),
-        ((*CONTROLLED, "--foreshortening"), "--foreshortening: not with --controller"),
+        ((*CONTROLLED, "--torque", "x.csv"), "--torque: is not possible with --controller"),
+        ((*CONTROLLED, "--modes", 3), "--modes: is not possible with --controller"),
+        ((*CONTROLLED, "--foreshortening"), "--foreshortening: is not possible with --controller"),
         ((*CONTROLLED, "--set", "slow.kp=[6]"), "slow.kp: [6] is a list of integers"),
         ((*CONTROLLED, "--set", "slow.kp=[6.0]", "x=1"), "x: no such parameter"),
         ((*CONTROLLED, "--payload-scale", -1), "R: payload times -1.0"),
         ((*CONTROLLED, "--plant-modes", 99), "plant_modes: 99 is above"),
-        (("--payload-scale", 2), "--payload-scale: only with --controller"),
-        (("--noise",), "--noise: only with --controller"),
-        (("--set", "slow.kp=[1.0]"), "--set: only with --controller"),
+        (("--payload-scale", 2), "--payload-scale: is possible only with --controller"),
+        (("--noise",), "--noise: is possible only with --controller"),
+        (("--set", "slow.kp=[1.0]"), "--set: is possible only with --controller"),
     ],
 )
 def test_wrong_options_are_exit_code_1_and_named(capsys, words, message):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of an arm and of its natural modes."""
+"""Draws an arm and its natural modes."""
 
 import numpy as np
 
 from .options import check_file
 
-#: So many modes are drawn.
-MOST_MODES = 4
+#: Maximum number of drawn modes.
+MAX_MODES = 4
 
 
 def draw(arm_model, q, path):
@@ -32,7 +32,7 @@ def draw(arm_model, q, path):
     arm = arm_model.arm
     chain = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
     omega, shapes = arm_model.normal_modes(q, locked=True)
-    shown = min(MOST_MODES, omega.size)
+    shown = min(MAX_MODES, omega.size)
     straight = axis_points(chain, q, np.zeros(chain.n_modes))
     reach = max(np.abs(straight).max(), sum(link.length for link in arm.links))
     long = np.argmax(np.ptp(np.concatenate(straight), axis=0))
@@ -60,7 +60,7 @@ def draw(arm_model, q, path):
             ax.set_title(f"mode {k}: {omega[k - 1] / (2.0 * np.pi):.3g} Hz", fontsize=10)
         else:
             ax.set_title(f"{arm.name}, at rest", fontsize=10)
-        # Seen along the direction in which it neither extends nor moves.
+        # The view is along the direction in which the arm neither extends nor moves.
         moves = np.abs(np.concatenate(lines) - np.concatenate(straight)).max(axis=0)
         moves += 1e-3 * np.ptp(np.concatenate(straight), axis=0) + 1e-9 * np.array([3, 2, 1])
         a, b = sorted((long, next(i for i in np.argsort(moves)[::-1] if i != long)))
@@ -80,7 +80,7 @@ def draw(arm_model, q, path):
         ax.set_ylabel(f"{'xyz'[b]} [m]")
         ax.grid(alpha=0.3)
     figure.suptitle(
-        "joints locked; grey: straight, dots: joints, diamond: tip, squares: gauges; modes scaled for the eye",
+        "joints locked; grey: straight, dots: joints, diamond: tip, squares: gauges; modes scaled to be visible",
         fontsize=8,
     )
     figure.savefig(path, dpi=120)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""``flexarm gauges``: how well an arm's strain gauges tell its modes, and where they would do it best. No ROS.
+r"""``flexarm gauges``: how well an arm's strain gauges resolve its modes, and their best positions.
 
 With rows R and the rms error sigma of a reading, the amplitudes of the observed modes have the covariance
 
 .. math:: C = (R^T W R)^{-1}, \qquad W = \sigma^{-2} ,
 
-link by link and direction by direction, for a gauge strains by its own link's bending in its own direction alone.
-Sets of positions on a grid of every twentieth of the link are ranked by the criterion
+separately for each link and direction, since a gauge measures only its own link's bending in its own direction.
+Sets of positions on a grid, at every twentieth of the link, are ranked by the criterion
 
 - A: trace C, the sum of the variances (the default),
 - D: det C, the volume of the ellipsoid of errors,
 - condition: condition number of R with its columns scaled to one,
 
-all sets where these are at most `MOST_SETS`, else by taking the best gauge in one after the other and exchanging
-single ones until that no longer helps.
+Up to `MAX_SETS` sets are all compared. Otherwise the best gauge is added one after the other, and single gauges are
+exchanged until that no longer helps.
 """
 
 import json
@@ -29,18 +29,18 @@ from flexarm_dynamics.arm.strain_map import StrainMap, confused, gauge_rows, rea
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
-from .options import check_file
+from .options import add_arm_arguments, check_file
 
 CRITERIA = ("A", "D", "condition")
 #: Candidate positions per link: every twentieth of its length, ends included.
 GRID = 21
-#: So many sets of positions are compared one and all, in about a second.
-MOST_SETS = 250_000
-#: Rms error and distance from the neutral axis that are assumed where a link has no gauge that says [strain], [m].
+#: Up to this number all sets of positions are compared, in about a second.
+MAX_SETS = 250_000
+#: Assumed rms error and distance from the neutral axis if no gauge of the link states them [strain], [m].
 ASSUMED_NOISE, ASSUMED_DISTANCE = 1e-6, 1e-3
-#: Patterns of strain of two modes whose angle has a larger cosine are hardly told apart.
+#: Two modes are hard to distinguish if the cosine between their patterns of strain is larger.
 ALIKE = 0.98
-#: So many of the best sets are listed.
+#: Number of the best sets that are listed.
 LISTED = 3
 
 
@@ -50,18 +50,18 @@ def add_arguments(parser):
         "Noise and condition number of the present gauges, and the best positions on each link."
     )
     parser.epilog = "example: flexarm gauges R --count 3 --plot results/gauges.png"
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add_arm_arguments(parser)
     parser.add_argument(
         "--modes",
         type=int,
         metavar="N",
-        help="tell N modes per flexible direction (the arm file's observed_modes if not given)",
+        help="resolve N modes per flexible direction (the arm file's observed_modes if not given)",
     )
     parser.add_argument(
         "--count",
         type=int,
         metavar="K",
-        help="gauges per link and direction (as many as there are)",
+        help="gauges per link and direction (as many as the arm has)",
     )
     parser.add_argument(
         "--criterion",
@@ -69,7 +69,6 @@ def add_arguments(parser):
         default="A",
         help="A: sum of the variances; D: their ellipsoid's volume; condition: condition number",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--plot", metavar="FILE", help="draw curvatures and positions")
 
 
@@ -96,9 +95,9 @@ def study(arm_model, observed, count=None, criterion="A"):
     ----------
     arm_model : ArmModel
     observed : sequence of str
-        Modes that the gauges are to tell.
+        Modes that the gauges are to resolve.
     count : int, optional
-        Gauges per link and direction; as many as there are, at least one per mode, if not given.
+        Gauges per link and direction; if not given, as many as the arm has, at least one per mode.
     criterion : str
         One of `CRITERIA`.
 
@@ -109,7 +108,7 @@ def study(arm_model, observed, count=None, criterion="A"):
     """
     arm = arm_model.arm
     if not observed:
-        raise FlexarmError(f"{arm.name} has no modes to observe: it is rigid")
+        raise FlexarmError(f"of {arm.name} are none: it is rigid", field="modes to observe")
     places = []
     for key in dict.fromkeys((m.link, m.direction) for m in arm.modes if m.name in observed):
         names = [m.name for m in arm.modes if (m.link, m.direction) == key and m.name in observed]
@@ -117,10 +116,18 @@ def study(arm_model, observed, count=None, criterion="A"):
         wanted = max(len(present), len(names)) if count is None else count
         if wanted < len(names):
             raise FlexarmError(
-                f"--count {wanted}: {key[0]} has {len(names)} modes to observe in {key[1]}, which need as many gauges"
+                f"gauges can't observe the {len(names)} modes of {key[0]} in {key[1]}",
+                field="--count",
+                value=wanted,
+                limit=f"at least {len(names)}",
             )
         if wanted > GRID:
-            raise FlexarmError(f"--count {wanted}: at most {GRID} candidate positions on a link")
+            raise FlexarmError(
+                "gauges are more than there are positions",
+                field="--count",
+                value=wanted,
+                limit=GRID,
+            )
         places.append(_place(arm_model, key, names, present, wanted, criterion))
     return {"arm": arm.name, "criterion": criterion, "places": places}
 
@@ -155,7 +162,7 @@ def _place(arm_model, key, names, present, count, criterion):
 
 
 def _typical(present):
-    """Surface distance, rms error of a reading, and what of it had to be assumed."""
+    """Surface distance, rms error of a reading, and which of them had to be assumed."""
     assumed = []
     distance = abs(present[0].surface_distance) if present else ASSUMED_DISTANCE
     if not present:
@@ -178,7 +185,7 @@ def _weighted(arm_model, names, present):
 
 
 def _present(arm_model, names, present):
-    """What the arm file's gauges give."""
+    """Quality of the arm file's gauges."""
     found = {"names": [g.name for g in present], "positions": [g.position for g in present]}
     if not present:
         return {**found, "condition": None, "amplitude_noise": None, "unseen": names, "alike": []}
@@ -212,7 +219,7 @@ def _quality(rows):
 
 
 def criterion_of(rows, criterion):
-    """The criterion of many sets of gauges; infinite for one that can't tell the modes.
+    """The criterion of many sets of gauges; infinite for a set that can't resolve the modes.
 
     Parameters
     ----------
@@ -258,7 +265,7 @@ def best_sets(rows, count, criterion):
         Of the rows of a set: the less the better.
     """
     candidates = rows.shape[0]
-    if comb(candidates, count) > MOST_SETS:
+    if comb(candidates, count) > MAX_SETS:
         chosen = _exchange(rows, count, criterion)
         return [chosen], criterion_of(rows[list(chosen)][None], criterion)
     sets = np.array(list(combinations(range(candidates), count)))
@@ -270,10 +277,10 @@ def best_sets(rows, count, criterion):
 
 
 def _exchange(rows, count, criterion):
-    """A set that no exchange of a single candidate makes better."""
+    """A set that no exchange of a single candidate improves."""
     modes = rows.shape[1]
-    # The start: best of all sets of as many as there are modes, where these are few enough, else spread evenly.
-    start = modes if comb(rows.shape[0], modes) <= MOST_SETS else count
+    # The start is the best of all sets with one gauge per mode, if these are few enough, else an even spread.
+    start = modes if comb(rows.shape[0], modes) <= MAX_SETS else count
     if start == count:
         chosen = list(np.unique(np.linspace(0, rows.shape[0] - 1, count).astype(int)))
     else:
@@ -290,14 +297,14 @@ def _exchange(rows, count, criterion):
 
 
 def _best_one(rows, chosen, criterion):
-    """The candidate that is best beside the chosen ones."""
+    """The candidate that is best in addition to the chosen ones."""
     left = [i for i in range(rows.shape[0]) if i not in chosen]
     values = criterion_of(rows[[[*chosen, i] for i in left]], criterion)
     return left[int(np.argmin(values))]
 
 
 def _next(arm_model, names, present, rows, grid, criterion):
-    """Where one gauge more would help most, beside the present ones; best first."""
+    """Best positions of one gauge more, in addition to the present ones."""
     if len(present) + 1 < len(names) or not present:
         return []
     have = _weighted(arm_model, names, present)
@@ -323,7 +330,7 @@ def text(d):
         for s in p["next"][:1]:
             yield _line("one more", [s["position"]], s, unit)
         if "impossible" in p:
-            yield f"  no gauges on this link can tell {', '.join(p['impossible'])} apart"
+            yield f"  no gauges on this link can distinguish {', '.join(p['impossible'])}"
     if "plot" in d:
         yield f"plot: {d['plot']}"
 
@@ -338,15 +345,15 @@ def _present_lines(p, unit):
     else:
         yield f"  now {', '.join(f'{x:.4g}' for x in now['positions'])}: not enough"
     if now["unseen"]:
-        yield f"  warning: {', '.join(now['unseen'])} strains none of {', '.join(now['names'])}"
+        yield f"  warning: {', '.join(now['unseen'])} causes no strain at {', '.join(now['names'])}"
     if now["alike"]:
         yield (
-            f"  warning: {', '.join(now['names'])} can't tell {' and '.join(now['alike'])} apart: the same strains"
-            " come from either; move a gauge or add one"
+            f"  warning: {', '.join(now['names'])} can't distinguish {' and '.join(now['alike'])}, which cause the"
+            " same strains; move a gauge or add one"
         )
     elif now["condition"] is not None:
         for a, b, cosine in now["hardly"]:
-            yield f"  warning: {a} and {b} are hardly told apart: their strains are alike by {cosine:.3f}"
+            yield f"  warning: {a} and {b} are hard to distinguish: the cosine between their strains is {cosine:.3f}"
 
 
 def _line(label, positions, quality, unit):

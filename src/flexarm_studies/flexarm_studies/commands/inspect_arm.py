@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm frequencies`` and ``flexarm show``: what an arm file makes of an arm. No ROS."""
+"""``flexarm frequencies`` and ``flexarm show``: natural frequencies and properties of an arm file's arm."""
 
 import json
 
@@ -10,20 +10,19 @@ from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
 
 from .arm_figure import draw
-from .options import add_model_arguments, angles, load_arm
+from .options import add_arm_arguments, add_model_arguments, angles, load_arm
 
-#: A tip that sags by more than this part of its link is beyond small deflections.
+#: A tip that sags by more than this fraction of its link's length is beyond small deflections.
 LARGE_SAG = 0.05
 #: Control rate that warnings about fast modes refer to [Hz].
 USUAL_RATE = 1000.0
 
 
 def _add_arm(parser):
-    """What both commands take: an arm, where, which model of it, and how to print."""
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    """Add the arguments of both commands: the arm, its joint angles and model, and ``--json``."""
+    add_arm_arguments(parser)
     parser.add_argument("--at", metavar="q1,q2,...", help="joint angles [rad]; zero if not given")
     add_model_arguments(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def add_frequency_arguments(parser):
@@ -35,9 +34,9 @@ def add_frequency_arguments(parser):
     _add_arm(parser)
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
-        "--locked", action="store_true", help="joints locked alone (both if neither is given)"
+        "--locked", action="store_true", help="only with joints locked (both if neither is given)"
     )
-    which.add_argument("--free", action="store_true", help="joints free alone")
+    which.add_argument("--free", action="store_true", help="only with joints free")
     parser.add_argument(
         "--shapes", action="store_true", help="joint angles and modal amplitudes of each mode"
     )
@@ -81,7 +80,7 @@ def frequencies(options):
 
 def add_show_arguments(parser):
     """Arguments of ``show``."""
-    parser.description = "Says what an arm file describes, and what to mind."
+    parser.description = "Describes the arm of an arm file, with warnings."
     parser.epilog = "example: flexarm show long_reach --at 0,0.5,0,0 --plot"
     _add_arm(parser)
     parser.add_argument(
@@ -169,7 +168,7 @@ def describe(arm_model, q):
 
 
 def warnings(arm_model, q, result):
-    """What a user of this arm should know; fills the sag and the condition of the strain map."""
+    """Warnings for users of this arm; fills in the sag and the condition of the strain map."""
     arm, found = arm_model.arm, []
     try:
         delta = arm_model.static_deflection(q)
@@ -177,11 +176,11 @@ def warnings(arm_model, q, result):
             link.name: arm_model.tip_deflection(delta, link.name).tolist() for link in arm.links
         }
         for link in arm.links:
-            part = np.hypot(*result["sag"][link.name]) / link.length
-            if part > LARGE_SAG and not (arm.foreshortening or arm.finite_slope):
+            fraction = np.hypot(*result["sag"][link.name]) / link.length
+            if fraction > LARGE_SAG and not (arm.foreshortening or arm.finite_slope):
                 found.append(
-                    f"{link.name} sags by {100 * part:.1f} % of its length under gravity: small deflections end"
-                    " about there; --finite-slope (finite_slope: true) holds for more"
+                    f"{link.name} sags by {100 * fraction:.1f} % of its length under gravity, beyond small deflections:"
+                    " use --finite-slope (finite_slope: true)"
                 )
     except ModelError as error:
         found.append(str(error))
@@ -200,13 +199,13 @@ def warnings(arm_model, q, result):
     fast = [f for f in result["frequencies_hz"]["free"] if f > USUAL_RATE / 4.0]
     if fast:
         found.append(
-            f"{len(fast)} of the free modes above {USUAL_RATE / 4.0:g} Hz, up to {fast[-1]:.4g} Hz: too fast to"
-            f" be damped at {USUAL_RATE:g} samples a second"
+            f"{len(fast)} of the free modes are above {USUAL_RATE / 4.0:g} Hz, up to {fast[-1]:.4g} Hz: too fast"
+            f" to be damped at {USUAL_RATE:g} samples per second"
         )
     for link in arm.links:
         for direction, f in link.flexible.items():
             if not f.damping:
-                found.append(f"{link.name} has no damping in {direction}: it rings for ever")
+                found.append(f"{link.name} has no damping in {direction}: it never stops vibrating")
     return found
 
 
@@ -232,7 +231,7 @@ def text(d):
             f"{j['name']:18}{j['hub_inertia']:10.4g}{j['reflected_rotor_inertia']:10.4g}{j['motor_mass']:10.4g}"
             f"{j['inertia_of_the_straight_arm']:12.4g}{limit:>10}  {j['safe_action']}"
         )
-    yield f"(all: what the joint feels of the straight arm at q = {d['q']})"
+    yield f"(all: inertia of the straight arm about the joint at q = {d['q']})"
     yield ""
     yield f"{'link':18}{'length':>10}{'mass':>10}  flexible"
     yield f"{'':18}{'m':>10}{'kg':>10}"

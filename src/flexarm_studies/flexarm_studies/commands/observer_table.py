@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm observers``: how well each observer tells the rates of an arm, by noise, rate and delay. No ROS.
+"""``flexarm observers``: the errors of each observer's rates, by noise, sample rate and delay.
 
-The arm is simulated once per rate, its joints led by a collocated PD law on the true state through steps of the
-reference, which shake the modes. Every observer hears the same samples: joint positions and strains, with the
-noise and counts that are asked for, and the torque, but no joint velocity. Errors are rms over the run after its
-first tenth, in percent of what is estimated, itself rms, over the same time. With a delay the estimate is compared
-with the state so much later, predicted and not predicted.
+The arm is simulated once per rate. A collocated PD law on the true state leads its joints through steps of the
+reference, which excite the modes. Every observer receives the same samples: joint positions and strains, with the
+given noise and counts, and the torque, but no joint velocity. Errors are rms over the run after its first tenth, in
+percent of the rms of the estimated state. With a delay, the estimate is compared with the state after the delay,
+once with prediction and once without.
 """
 
 import json
@@ -17,22 +17,23 @@ from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import OBSERVERS, observe
 from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_sim.plant import Plant
 from flexarm_sim.sensors import Sensors
 
+from .. import markdown
 from ..progress import Progress
+from .options import add_arm_arguments, in_range, numbers
 
-#: Observers that hear the truth have no error to show.
+#: Observers that receive the true rates have no error.
 LEFT_OUT = ("true_rates",)
 #: Steps of the reference: size [rad] and time between them [s].
 STEP, EVERY = 0.2, 0.4
-#: Frequency of the PD law in parts of the lowest bending frequency, at most so much [rad/s]; damping ratio.
-SHARE, FASTEST, DAMPING = 0.4, 20.0, 0.5
-#: Largest share of a joint's speed that its damping takes in one period.
-HELD = 0.3
-MOST_SAMPLES = 1_000_000
+#: Frequency of the PD law as a fraction of the lowest bending frequency, its maximum [rad/s], and damping ratio.
+FREQUENCY_RATIO, MAX_FREQUENCY, DAMPING = 0.4, 20.0, 0.5
+#: Maximum fraction of a joint's speed that its damping removes in one period.
+MAX_DAMPED = 0.3
+MIN_SAMPLES, MAX_SAMPLES = 10, 1_000_000
 COLUMNS = (
     "observer", "rate [Hz]", "noise", "delay [ms]", "predicted", "mode 1 [%]", "all modes [%]", "joints [%]"
 )  # fmt: skip
@@ -41,10 +42,10 @@ COLUMNS = (
 def add_arguments(parser):
     """Arguments of ``observers``."""
     parser.description = (
-        "Simulates an arm that is shaken, and compares what each observer makes of its samples."
+        "Simulates an arm in motion, and compares the estimates of all observers from its samples."
     )
     parser.epilog = "example: flexarm observers R --rates 1000,250 --delays 0,0.01"
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add_arm_arguments(parser, "rows as JSON")
     parser.add_argument("--rates", default="1000,250", help="samples per second (1000,250)")
     parser.add_argument(
         "--strain-noise", type=float, default=5e-7, help="noise of every gauge, rms strain (5e-7)"
@@ -54,16 +55,15 @@ def add_arguments(parser):
     parser.add_argument("--observers", help="names, separated by commas (all but true_rates)")
     parser.add_argument("--duration", type=float, default=2.0, help="simulated time [s] (2)")
     parser.add_argument("--seed", type=int, default=0, help="of reference and noise (0)")
-    parser.add_argument("--json", action="store_true", help="rows as JSON")
 
 
 def observers(options):
     """Print the table."""
     rows = table(
         options.arm,
-        _numbers("--rates", options.rates, 1.0, 20000.0),
+        [in_range("--rates", v, 1.0, 20000.0) for v in numbers("--rates", options.rates)],
         {"none": (0.0, 0), "given": (options.strain_noise, options.counts)},
-        _numbers("--delays", options.delays, 0.0, 0.1),
+        [in_range("--delays", v, 0.0, 0.1) for v in numbers("--delays", options.delays)],
         options.observers.split(",") if options.observers else None,
         options.duration,
         options.seed,
@@ -72,10 +72,7 @@ def observers(options):
     if options.json:
         print(json.dumps(rows, indent=1))
         return
-    print("| " + " | ".join(COLUMNS) + " |")
-    print("|" + " --- |" * len(COLUMNS))
-    for row in rows:
-        print("| " + " | ".join(_word(row[c]) for c in COLUMNS) + " |")
+    print("\n".join(markdown.table(COLUMNS, ([row[c] for c in COLUMNS] for row in rows))))
 
 
 def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress=None):
@@ -92,7 +89,7 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress
     delays : sequence of float
         [s]
     names : sequence of str, optional
-        Observers; all that are installed but `LEFT_OUT`.
+        Observers; all installed ones except `LEFT_OUT` if not given.
     duration : float
         [s]
     seed : int
@@ -112,10 +109,9 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress
         names = [n for n in registry.names(OBSERVERS) if n not in LEFT_OUT]
     rows = []
     for rate in rates:
-        if not 10.0 <= rate * duration <= MOST_SAMPLES:
-            raise FlexarmError(
-                f"{rate:g} Hz for {duration:g} s: from 10 to {MOST_SAMPLES} samples are possible"
-            )
+        in_range(
+            f"samples of {duration:g} s at {rate:g} Hz", rate * duration, MIN_SAMPLES, MAX_SAMPLES
+        )
         if progress is not None:
             progress.step(f"{known.name} at {rate:g} Hz")
         truth, torques = motion(model.build(known), rate, duration, seed)
@@ -124,10 +120,10 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress
             for i, name in enumerate(names):
                 for delay, predicted in _cases(delays):
                     values = {"delay": delay if predicted else 0.0}
-                    heard = listen(
+                    found = estimates(
                         sensed, observe(sensed, name, values), truth, torques, rate, seed
                     )
-                    errors = _errors(heard, truth, delay * rate, sensed)
+                    errors = _errors(found, truth, delay * rate, sensed)
                     head = (name, rate, label, 1e3 * delay, predicted)
                     rows.append(dict(zip(COLUMNS, (*head, *errors), strict=True)))
                 if progress is not None:
@@ -139,12 +135,12 @@ def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress
 
 
 def _cases(delays):
-    """(delay, whether it is predicted across); both where there is one."""
+    """Pairs of a delay and whether the observer predicts it; a delay of 0 is not predicted."""
     return [(d, p) for d in delays for p in ((False, True) if d else (False,))]
 
 
 def motion(arm, rate, duration, seed=0):
-    """States and torques of the arm, led through steps.
+    """States and torques of the arm, along steps of its reference.
 
     Returns
     -------
@@ -155,12 +151,13 @@ def motion(arm, rate, duration, seed=0):
     """
     n, m = arm.n_joints, arm.n_modes
     plant, random = Plant(arm, 1.0 / rate, "dop853"), np.random.default_rng(seed)
-    lowest = arm.frequencies()[0] if m else FASTEST
-    w = min(SHARE * lowest, FASTEST)
+    lowest = arm.frequencies()[0] if m else MAX_FREQUENCY
+    w = min(FREQUENCY_RATIO * lowest, MAX_FREQUENCY)
     terms = arm.terms(np.zeros(n), np.zeros(n))
     stiff = w**2 * np.diag(terms.M)[:n]
-    # At once a joint turns the little that is rigid at it: held over a period, more damping would be unstable.
-    limit = HELD * rate / np.abs(terms.partition()[0]).sum(axis=1)
+    # At first a joint turns only the small inertia that is rigid with it: more damping, held over a period, would be
+    # unstable.
+    limit = MAX_DAMPED * rate / np.abs(terms.partition()[0]).sum(axis=1)
     damp = np.minimum(2.0 * DAMPING / w * stiff, limit)
     torque, reference, states, torques = np.zeros(n), np.zeros(n), [], []
     every = max(1, round(EVERY * rate))
@@ -182,13 +179,13 @@ def _with_noise(arm, strain, counts):
     return replace(arm, gauges=gauges, joints=joints)
 
 
-def listen(arm, core, states, torques, rate, seed=0):
-    """What an observer makes of the samples of a motion.
+def estimates(arm, core, states, torques, rate, seed=0):
+    """Estimates of an observer from the samples of a motion.
 
     Parameters
     ----------
     arm : ArmModel
-        Whose gauges and encoders measure.
+        With the gauges and encoders.
     core : ArmObserver
     states, torques : ndarray
         Of `motion`.
@@ -218,13 +215,13 @@ def listen(arm, core, states, torques, rate, seed=0):
     return np.array(out)
 
 
-def _errors(heard, truth, late, arm):
+def _errors(found, truth, late, arm):
     """Rms errors of the first mode's rate, of all modes' and of the joints', in percent of their own rms."""
     n, m = arm.n_joints, arm.n_modes
     times = np.arange(len(truth)) + late
     kept = (times <= len(truth) - 1) & (np.arange(len(truth)) >= len(truth) // 10)
     wanted = np.stack([np.interp(times[kept], np.arange(len(truth)), x) for x in truth.T], axis=1)
-    wrong = np.square(heard[kept] - wanted).mean(axis=0)
+    wrong = np.square(found[kept] - wanted).mean(axis=0)
     size = np.square(wanted).mean(axis=0)
     joints, modes = slice(n + m, 2 * n + m), slice(2 * n + m, 2 * (n + m))
     first = slice(2 * n + m, 2 * n + m + 1)
@@ -234,21 +231,3 @@ def _errors(heard, truth, late, arm):
 
 def _percent(wrong, size):
     return float(100.0 * np.sqrt(wrong / size)) if size > 0.0 else float("nan")
-
-
-def _word(value):
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _numbers(option, text, low, high):
-    """Numbers from an option's list."""
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        raise FlexarmError(f"{option} {text}: numbers separated by commas are wanted") from None
-    for value in values:
-        if not low <= value <= high:
-            raise FlexarmError(f"{option} {value:g}: from {low:g} to {high:g} are possible")
-    return values

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options and checks that several commands share: the arm's model, joint angles, files to write."""
+"""Options of several commands: the arm and its model, joint angles, lists of numbers, files to write."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,14 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, ModelError
 
 
+def add_arm_arguments(parser, json="print JSON"):
+    """Add the arm, and ``--json`` with this help."""
+    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    parser.add_argument("--json", action="store_true", help=json)
+
+
 def add_model_arguments(parser):
-    """What changes an arm's model, for every sub-command that evaluates one."""
+    """Add the options that change an arm's model."""
     parser.add_argument(
         "--modes", type=int, metavar="N", help="modes per flexible direction of every link"
     )
@@ -35,7 +41,10 @@ def load_arm(options):
     if options.foreshortening or options.finite_slope:
         if arm.model != "chain":
             raise ModelError(
-                f"{arm.name}: model {arm.model} knows neither foreshortening nor finite slope; model chain does"
+                f"of {arm.name} supports neither foreshortening nor finite slope",
+                field="model",
+                value=arm.model,
+                limit="chain",
             )
         arm = replace(
             arm, foreshortening=True, finite_slope=arm.finite_slope or options.finite_slope
@@ -43,26 +52,48 @@ def load_arm(options):
     return arm
 
 
+def numbers(option, text, separator=","):
+    """Read the finite numbers of an option's list."""
+    try:
+        values = [float(word) for word in text.split(separator)]
+    except ValueError:
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        hint = f"give numbers, separated by {separator!r}"
+        raise FlexarmError("is no list of finite numbers", field=option, value=text, hint=hint)
+    return values
+
+
 def angles(text, arm, option):
-    """Joint angles written as ``q1,q2,...``; zero where nothing is given [rad]."""
+    """Joint angles written as ``q1,q2,...``; zero if none are given [rad]."""
     n = len(arm.joints)
     if text is None:
         return np.zeros(n)
-    try:
-        values = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        raise FlexarmError(f"{option} {text}: numbers with commas between are wanted") from None
-    if values.size != n or not np.isfinite(values).all():
+    values = np.array(numbers(option, text))
+    if values.size != n:
         raise FlexarmError(
-            f"{option} {text}: {n} finite angles are wanted, for {', '.join(arm.joint_names)}"
+            "is the wrong number of angles",
+            field=option,
+            value=values.size,
+            limit=n,
+            hint=f"give one for each of {', '.join(arm.joint_names)}",
         )
     return values
 
 
-def check_file(path):
-    """The path, its directory made; a FlexarmError when that can't be."""
-    path = Path(path)
-    if path.suffix not in (".png", ".svg", ".pdf"):
-        raise FlexarmError(f"--plot {path}: a name that ends with .png, .svg or .pdf is wanted")
+def in_range(option, value, low, high):
+    """Return the value of an option, or refuse one outside its range."""
+    if not low <= value <= high:
+        limit = f"{low:g} to {high:g}"
+        raise FlexarmError("is out of range", field=option, value=value, limit=limit)
+    return value
+
+
+def check_file(path, option="--plot"):
+    """Return the path of a figure after making its folder, or refuse it."""
+    path, suffixes = Path(path), (".png", ".svg", ".pdf")
+    if path.suffix not in suffixes:
+        limit = ", ".join(suffixes)
+        raise FlexarmError("has the wrong suffix", field=option, value=str(path), limit=limit)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

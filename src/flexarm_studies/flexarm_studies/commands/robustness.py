@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""``flexarm robustness``: how many lost samples, and how much random delay, a loop bears. No ROS.
+r"""``flexarm robustness``: how many lost samples and how much random delay a loop tolerates.
 
-A motion is carried out with samples lost, each on its own with a probability, and separately with every sample late
-by a time uniform from 0 to a largest delay (`network`): several seeds at each level, observer, controller, limits and
-the driver's timeout included. A run is stable when the loop kept the arm and, beside the same run with no loss and no
-delay,
+A motion is simulated with samples lost independently with a probability, and separately with every sample delayed by
+a time uniform from 0 to a maximum (`network`). There are several seeds at each level; observer, controller, limits
+and the driver's timeout are included. A run is stable if the loop kept the arm and, compared with the same run
+without loss and delay,
 
-- no joint was ever farther from its reference than `TRACKING` times the farthest there, and `ALLOWED` beyond;
-- the bending, :math:`\sqrt{\delta^T K\delta}` with the links' stiffness K, was never more than `BENDING` times the
-  largest there;
-- over the last 0.5 s of the window after the motion the tip was never farther from where it belongs than there, and
-  `SETTLED` of the arm's reach beyond.
+- the largest joint error is at most `TRACKING` times as large, plus `ALLOWED`;
+- the largest bending, :math:`\sqrt{\delta^T K\delta}` with the links' stiffness K, is at most `BENDING` times as large;
+- the largest tip error over the last 0.5 s of the window after the motion is at most `SETTLED` of the arm's reach
+  larger.
 
-Errors are against the reference at that time, not against the older one that a late sample is answered with.
+Errors are relative to the reference at that time, not to the older one that the answer to a late sample used.
 """
 
 import json
@@ -23,19 +22,21 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
 
+from .. import markdown
 from ..loop import scenario as scenarios
 from ..loop.metrics import tracking_metrics
 from ..progress import Progress
+from .options import add_arm_arguments, in_range, numbers
 
-#: Bounds of a stable run; see the module. `ALLOWED` in rad, `SETTLED` as a share of the reach.
+#: Bounds of a stable run; see the module. `ALLOWED` in rad, `SETTLED` as a fraction of the reach.
 TRACKING, ALLOWED, BENDING, SETTLED = 2.0, 0.05, 1.5, 0.005
-#: What is swept: the field of `Scenario`, its name in words, a factor to the command's unit, and that unit.
+#: Swept fields of `Scenario`: name in words, factor to the command's unit, and that unit.
 SWEPT = {
     "loss": ("samples lost", 100.0, "%"),
     "jitter": ("delay uniform from 0 to", 1e3, "ms"),
 }
-#: More levels than this are a mistake in a range.
-MOST_LEVELS = 200
+#: More levels must be a mistake in a range.
+MAX_LEVELS = 200
 COLUMNS = (
     "controller", "disturbance", "level", "unit", "stable", "of",
     "joint error [deg]", "bending [-]", "tip at rest [mm]", "why",
@@ -45,14 +46,14 @@ COLUMNS = (
 def add_arguments(parser):
     """Arguments of ``robustness``."""
     parser.description = (
-        "Carries out a motion with samples lost at random, and separately with random "
-        "delays, at rising levels, and tells where the loop breaks."
+        "Simulates a motion with samples lost at random, and separately with random "
+        "delays, at rising levels, and reports where the loop becomes unstable."
     )
     parser.epilog = (
         "example: flexarm robustness R --controller paper_composite --loss 0:0.1:0.9 --delay 0:4:40"
     )
     add = parser.add_argument
-    add("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add_arm_arguments(parser, "rows as JSON")
     add(
         "--controller",
         action="append",
@@ -61,19 +62,17 @@ def add_arguments(parser):
     )
     add("--trajectory", default="paper", metavar="FILE|SPEC", help="the motion (paper)")
     add("--rate", type=float, default=500.0, help="samples per second (500)")
-    add("--loss", default="0:0.1:0.9", metavar="FROM:STEP:TO", help="share lost (0:0.1:0.9)")
+    add("--loss", default="0:0.1:0.9", metavar="FROM:STEP:TO", help="fraction lost (0:0.1:0.9)")
     add("--delay", default="0:4:40", metavar="FROM:STEP:TO", help="largest delay [ms] (0:4:40)")
     add("--seeds", type=int, default=3, help="runs at each level (3)")
     add("--noise", action="store_true", help="gauges have the arm file's noise")
     add("--window", type=float, default=3.0, help="time after the motion [s] (3)")
     add("--figure", metavar="FILE.png", help="draw it")
-    add("--json", action="store_true", help="rows as JSON")
 
 
 def robustness(options):
-    """Sweep, print a table and where each loop breaks, draw."""
-    if not 1 <= options.seeds <= 1000:
-        raise FlexarmError(f"--seeds {options.seeds}: from 1 to 1000 are possible")
+    """Run ``robustness``."""
+    in_range("--seeds", options.seeds, 1, 1000)
     levels = {
         "loss": levels_of("--loss", options.loss, 1.0),
         "jitter": [1e-3 * ms for ms in levels_of("--delay", options.delay, 1000.0)],
@@ -103,25 +102,23 @@ def robustness(options):
 
 def levels_of(option, text, most):
     """Numbers from ``from:step:to``, or a single one."""
-    try:
-        parts = [float(word) for word in text.split(":")]
-    except ValueError:
-        parts = []
-    if len(parts) == 1:
-        parts = [parts[0], 1.0, parts[0]]
-    if len(parts) != 3 or not np.isfinite(parts).all() or parts[1] <= 0.0:
-        raise FlexarmError(f"{option} {text}: FROM:STEP:TO is wanted, such as 0:0.1:0.9")
-    first, step, last = parts
-    if not 0.0 <= first <= last <= most:
-        raise FlexarmError(f"{option} {text}: from 0 to {most:g}, ascending, is possible")
-    count = int(np.floor((last - first) / step + 1e-9)) + 1
-    if count > MOST_LEVELS:
-        raise FlexarmError(f"{option} {text}: {count} levels; at most {MOST_LEVELS}")
-    return (first + step * np.arange(count)).round(12).tolist()
+    parts = numbers(option, text, ":")
+    first, step, last = parts if len(parts) == 3 else (parts[0], 1.0, parts[0])
+    count = np.floor((last - first) / step + 1e-9) + 1 if step > 0.0 else 0
+    possible = len(parts) in (1, 3) and 0.0 <= first <= last <= most and 1 <= count <= MAX_LEVELS
+    if not possible:
+        raise FlexarmError(
+            "is no possible range",
+            field=option,
+            value=text,
+            limit=f"0 to {most:g}, at most {MAX_LEVELS} levels",
+            hint="give FROM:STEP:TO, such as 0:0.1:0.9",
+        )
+    return (first + step * np.arange(int(count))).round(12).tolist()
 
 
 class Judge:
-    """Tells stable runs from others, beside the undisturbed one.
+    """Decides whether runs are stable, by comparison with the undisturbed run.
 
     Parameters
     ----------
@@ -134,23 +131,21 @@ class Judge:
         # The smallest jitter there is: the same loop, and samples on its clock.
         record, _, loop = scenarios.run_loop(replace(scenario, jitter=1e-9))
         if loop.lost:
-            raise FlexarmError(f"the loop is lost without any loss or delay: {loop.lost}")
+            raise FlexarmError(f"lost the arm without any loss or delay: {loop.lost}", field="loop")
         self._reference = record
-        motion = specs_of(scenario, loop)
+        motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
         self._end = 1e-9 * int(motion.times_ns[-1])
         self._reach = sum(link.length for link in loop.model.arm.links)
         self.undisturbed = self._sizes(record, loop)
 
     def run(self, **disturbance):
-        """One run; what `sweep` tells of each.
-
-        The `disturbance` is of fields of the scenario.
+        """Run the scenario with fields replaced by those of the `disturbance`.
 
         Returns
         -------
         tuple of (float, float, float, str)
-            Largest joint error [rad], largest bending in parts of the undisturbed one [-], the tip at rest [m],
-            and why the run is not stable; empty if it is.
+            Largest joint error [rad], largest bending relative to the undisturbed one [-], the tip's error at rest
+            [m], and why the run is not stable; empty if it is.
         """
         try:
             record, _, loop = scenarios.run_loop(replace(self.scenario, **disturbance))
@@ -158,15 +153,15 @@ class Judge:
             return np.nan, np.nan, np.nan, str(error)
         error, bending, rest = self._sizes(record, loop)
         error0, bending0, rest0 = self.undisturbed
-        share = bending / bending0 if bending0 else 0.0
+        ratio = bending / bending0 if bending0 else 0.0
         why = loop.lost
         if not why and error > TRACKING * error0 + ALLOWED:
             why = f"a joint is {np.degrees(error):.3g} deg off its reference"
-        elif not why and share > BENDING:
-            why = f"bent {share:.3g} times as far as undisturbed"
+        elif not why and ratio > BENDING:
+            why = f"bent {ratio:.3g} times as far as undisturbed"
         elif not why and rest > rest0 + SETTLED * self._reach:
             why = f"the tip is still {1e3 * rest:.3g} mm off"
-        return error, share, rest, why
+        return error, ratio, rest, why
 
     def _sizes(self, record, loop):
         """Largest joint error [rad], bending [J^0.5] and the tip's error at rest [m]."""
@@ -185,13 +180,8 @@ class Judge:
         return float(error), float(np.sqrt(energy.max(initial=0.0))), rest
 
 
-def specs_of(scenario, loop):
-    """The scenario's trajectory for its loop."""
-    return scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
-
-
 def sweep(scenario, what, levels, seeds=3, progress=lambda fraction: None):
-    """Runs at every level of one disturbance.
+    """Run every level of one disturbance.
 
     Parameters
     ----------
@@ -201,29 +191,30 @@ def sweep(scenario, what, levels, seeds=3, progress=lambda fraction: None):
     levels : sequence of float
         [-] or [s]
     seeds : int
-        Runs at each.
+        Runs at each level.
     progress : callable
         Called with the fraction done.
 
     Returns
     -------
     list of dict
-        A row per level: keys `COLUMNS` but the controller, the worst of its runs' numbers, None where a run gave none.
+        A row per level with the worst numbers of its runs, keys `COLUMNS` without the controller; None if a run has no
+        number.
 
     Raises
     ------
     FlexarmError
-        When the loop is lost undisturbed.
+        If the loop loses the arm undisturbed.
     """
     judge, (words, factor, unit), rows = Judge(scenario), SWEPT[what], []
     for i, level in enumerate(levels):
         runs = [judge.run(**{what: level, "seed": scenario.seed + k}) for k in range(seeds)]
-        error, share, rest = (_worst([r[j] for r in runs]) for j in range(3))
+        error, ratio, rest = (_worst([r[j] for r in runs]) for j in range(3))
         reasons = [r[3] for r in runs if r[3]]
         head = (words, round(factor * level, 9), unit, seeds - len(reasons), seeds)
         worst = (
             None if error is None else float(np.degrees(error)),
-            share,
+            ratio,
             None if rest is None else 1e3 * rest,
         )
         rows.append(dict(zip(COLUMNS[1:], (*head, *worst, (reasons or [""])[0]), strict=True)))
@@ -238,15 +229,11 @@ def _worst(values):
 
 def table(rows):
     """Lines of the table, Markdown."""
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|" + " --- |" * len(COLUMNS)]
-    for row in rows:
-        words = [f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()]
-        lines.append("| " + " | ".join("-" if w == "None" else w for w in words) + " |")
-    return lines
+    return markdown.table(COLUMNS, (row.values() for row in rows))
 
 
 def breaks(rows):
-    """Lines that say up to where each loop was stable in all of its runs."""
+    """Lines with the level up to which each loop was stable in all of its runs."""
     lines = []
     for controller, what in dict.fromkeys((r["controller"], r["disturbance"]) for r in rows):
         own = [r for r in rows if (r["controller"], r["disturbance"]) == (controller, what)]
@@ -267,7 +254,7 @@ def breaks(rows):
 
 
 def draw(rows, path, title):
-    """The worst joint error and tip error at rest over both disturbances, crosses where a run is not stable."""
+    """Draw the worst joint error and tip error at rest over both disturbances; crosses are unstable runs."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -276,8 +263,10 @@ def draw(rows, path, title):
     from ..case_study.figures import STYLE
 
     kinds = list(dict.fromkeys((r["disturbance"], r["unit"]) for r in rows))
-    measures = {"joint error [deg]": "largest joint error [deg]", "tip at rest [mm]": None}
-    measures["tip at rest [mm]"] = "tip's error at rest [mm]"
+    measures = {
+        "joint error [deg]": "largest joint error [deg]",
+        "tip at rest [mm]": "tip's error at rest [mm]",
+    }
     with plt.rc_context({**STYLE, "figure.figsize": (8.0, 5.6)}):
         figure, axes = plt.subplots(
             len(measures), len(kinds), sharex="col", sharey="row", squeeze=False

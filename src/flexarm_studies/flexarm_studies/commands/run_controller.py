@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate --controller``: plant, observer and controller in one process, and how well they did. No ROS."""
+"""``flexarm simulate --controller``: plant, observer and controller in one process, with metrics."""
 
 import json
 import math
@@ -59,16 +59,28 @@ def add_arguments(parser):
         metavar="NAME=VALUE",
         help="parameters beyond the file's: slow.type=sliding_mode fast.alpha=4.0",
     )
-    add("--payload-scale", type=float, help="the payload's mass and inertia times this, untold (1)")
-    add("--stiffness-scale", type=float, help="the links' stiffness times this, untold (1)")
-    add("--damping-scale", type=float, help="the links' damping times this, untold (1)")
-    add("--plant-arm", metavar="ARM", help="arm file of the simulated arm, where it is another")
+    add(
+        "--payload-scale",
+        type=float,
+        help="the payload's mass and inertia times this, unknown to the controller (1)",
+    )
+    add(
+        "--stiffness-scale",
+        type=float,
+        help="the links' stiffness times this, unknown to the controller (1)",
+    )
+    add(
+        "--damping-scale",
+        type=float,
+        help="the links' damping times this, unknown to the controller (1)",
+    )
+    add("--plant-arm", metavar="ARM", help="arm file of the simulated arm, if it is another")
     add("--plant-modes", type=int, metavar="N", help="modes per direction of the simulated arm")
     add("--noise", action="store_true", default=None, help="gauges have the arm file's noise")
     add("--seed", type=int, help="of the noise (0)")
     add("--delay", type=float, help="from a measurement until its torque acts [s] (0)")
-    add("--repeat", type=int, metavar="N", help="the motion N times, and back in between (1)")
-    add("--window", type=float, help="time after the motion that the rest is judged over [s] (3)")
+    add("--repeat", type=int, metavar="N", help="do the motion N times, and back in between (1)")
+    add("--window", type=float, help="time after the motion over which rest is judged [s] (3)")
     add(
         "--bag",
         metavar="FOLDER",
@@ -78,7 +90,7 @@ def add_arguments(parser):
 
 
 def check_arguments(options):
-    """Refuse options of the other mode.
+    """Refuse options that do not fit the mode, with or without a controller.
 
     Raises
     ------
@@ -90,14 +102,15 @@ def check_arguments(options):
             for k in (*FIELDS, "set", "bag")
             if k not in SHARED and getattr(options, k) is not None
         ]
-        why = "only with --controller"
+        why = "is possible only with --controller"
     else:
         wrong = [k for k in OPEN_LOOP if getattr(options, k)]
-        why = "not with --controller"
+        why = "is not possible with --controller"
         if options.trajectory is None:
-            raise FlexarmError("--trajectory is missing: a file, or a motion such as paper")
+            hint = "give a file, or a motion such as paper"
+            raise FlexarmError("is missing", field="--trajectory", hint=hint)
     if wrong:
-        raise FlexarmError(f"--{wrong[0].replace('_', '-')}: {why}")
+        raise FlexarmError(why, field=f"--{wrong[0].replace('_', '-')}")
 
 
 def scenario_of(options):
@@ -117,7 +130,7 @@ def scenario_of(options):
 
 
 def run_controller(options, recorder=None):
-    """Run the sub-command, recorded as `scenario.run_loop` has it; exit code 1 when the loop lost the arm."""
+    """Run the sub-command, recorded as in `scenario.run_loop`; exit code 1 if the loop lost the arm."""
     scenario = scenario_of(options)
     record, metrics, loop = scenarios.run_loop(scenario, recorder)
     plant = loop.simulator.plant_model
@@ -141,7 +154,7 @@ def run_controller(options, recorder=None):
 
 
 def warnings(scenario, loop):
-    """What a person should know of a run that was carried out all the same."""
+    """Warnings about a run, which is carried out nevertheless."""
     law, gauges = loop.controller.law, loop.simulator.plant_model.arm.gauges
     yield from law.warnings()
     if loop.unprepared:
@@ -154,7 +167,7 @@ def warnings(scenario, loop):
 
 
 def report(scenario, arm_model, metrics):
-    """Lines with the metrics, for reading."""
+    """Lines with the metrics, for people."""
     values, m = scenario.controller, metrics
     parts = [f"{k} {scenarios.type_of(k, values)}" for k in scenarios.COMPONENTS]
     lines = [
@@ -182,7 +195,7 @@ def report(scenario, arm_model, metrics):
 
 
 def _of_the_tip(scenario, m):
-    """Label and text of what is no joint's."""
+    """Labels and texts of the metrics that do not belong to a joint."""
     digits = lambda value: "-" if value is None else f"{value:.4g}"  # noqa: E731
     yield "tip from the rigid arm's, peak and rms [mm]", _pair(m, "tip_error_mm")
     if "static_sag_mm" in m:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate``: an arm under given torques, or moved as prescribed, to a table. No ROS.
+"""``flexarm simulate``: a table of an arm's motion under given torques, or with prescribed joint angles.
 
 With ``--controller`` the arm is in a closed loop: `run_controller`.
 """
@@ -19,20 +19,19 @@ from flexarm_sim.integrators import METHODS, substeps
 from .. import tables
 from ..progress import Progress
 from . import run_controller
-from .options import add_model_arguments, angles, load_arm
+from .options import add_arm_arguments, add_model_arguments, angles, load_arm
 
-#: A table of more rows than this is a mistake in --rate or --duration.
-MOST_ROWS = 10_000_000
-#: What options are without a controller when they are not given.
+#: More rows must be a mistake in --rate or --duration.
+MAX_ROWS = 10_000_000
+#: Defaults of options without a controller.
 DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
 
 
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
-        "Simulates an arm from rest: under torques over time, with its joints moved as "
-        "prescribed, or in a loop with an observer and a controller, of which it tells how "
-        "well they did."
+        "Simulates an arm from rest: under torques over time, with prescribed joint angles, "
+        "or in a closed loop with an observer and a controller, with metrics of the result."
     )
     parser.epilog = (
         "examples:\n"
@@ -40,7 +39,10 @@ def add_arguments(parser):
         "  flexarm simulate R --controller paper_composite --trajectory paper "
         "--payload-scale 2"
     )
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add_arm_arguments(
+        parser,
+        "columns and rows, or a summary with --out, as JSON; with a controller the metrics",
+    )
     parser.add_argument(
         "--torque",
         metavar="FILE.csv",
@@ -78,11 +80,8 @@ def add_arguments(parser):
         help="integrator (dop853); implicit damps stiff modes",
     )
     add_model_arguments(parser)
-    parser.add_argument("--out", metavar="FILE.csv", help="where to; standard output if not given")
     parser.add_argument(
-        "--json",
-        action="store_true",
-        help="columns and rows, or a summary with --out, as JSON; with a controller the metrics",
+        "--out", metavar="FILE.csv", help="file of the table; standard output if not given"
     )
     run_controller.add_arguments(parser)
 
@@ -100,7 +99,7 @@ def simulate(options, recorder=None):
     arm_model = model.build(arm)
     kinematics = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
     if options.torque and options.prescribed:
-        raise FlexarmError("--torque and --prescribed: give one of them")
+        raise FlexarmError("exclude each other", field="--torque and --prescribed")
     drive = None
     if options.torque:
         drive = tables.Steps(*tables.read(options.torque, "tau", arm.joint_names))
@@ -108,10 +107,16 @@ def simulate(options, recorder=None):
     if options.prescribed:
         if not isinstance(arm_model, Chain):
             raise ModelError(
-                f"{arm.name}: model {arm.model} can't be moved as prescribed; model chain can"
+                f"of {arm.name} supports no --prescribed",
+                field="model",
+                value=arm.model,
+                limit="chain",
             )
         if options.initial:
-            raise FlexarmError("--initial: a prescribed motion starts where its table does")
+            raise FlexarmError(
+                "is not possible: a prescribed motion starts where its table does",
+                field="--initial",
+            )
         table = tables.read(options.prescribed, "q", arm.joint_names)
         motion = tables.Motion(*table, options.prescribed)
     times = _times(options, motion)
@@ -129,8 +134,9 @@ def simulate(options, recorder=None):
     for k, (state, torque) in enumerate(run):
         if not np.isfinite(state).all() or np.abs(state).max() > 1e9:
             raise ModelError(
-                f"{arm.name}: stopped at t = {times[k]:g} s: the state is beyond what this model holds for"
-                " (a shorter --step, or --foreshortening where links spin fast)"
+                f"stopped at t = {times[k]:g} s: the state is beyond the validity of this model",
+                field=arm.name,
+                hint="take a shorter --step, or --foreshortening where links spin fast",
             )
         rows[k] = row(kinematics, times[k], state, torque)
         if times.size > 5000 and k * 50 // times.size > shown:
@@ -146,23 +152,31 @@ def _times(options, motion):
     for name in ("rate", "step"):
         value = getattr(options, name)
         if not (np.isfinite(value) and value > 0.0):
-            raise FlexarmError(f"--{name} {value}: a number greater than 0 is wanted")
+            raise FlexarmError(
+                "is out of range", field=f"--{name}", value=value, limit="finite, above 0"
+            )
     start, end = (0.0, np.inf) if motion is None else (motion.start, motion.end)
     duration = options.duration
     if duration is None:
         duration = min(4.0, end - start)
     if not (np.isfinite(duration) and duration >= 0.0):
-        raise FlexarmError(f"--duration {duration}: a number not below 0 is wanted")
+        limit = "finite, at least 0"
+        raise FlexarmError("is out of range", field="--duration", value=duration, limit=limit)
     if duration > (end - start) * (1.0 + 1e-9) + 1e-9:
         raise FlexarmError(
-            f"--duration {duration:g}: the motion in {options.prescribed} lasts {end - start:g} s"
+            f"s is longer than the motion in {options.prescribed}",
+            field="--duration",
+            value=duration,
+            limit=f"{end - start:g} s",
         )
-    if duration * options.rate > MOST_ROWS:
+    if duration * options.rate > MAX_ROWS:
         raise FlexarmError(
-            f"--duration {duration:g} at --rate {options.rate:g} makes {duration * options.rate:.0f} rows;"
-            f" at most {MOST_ROWS}"
+            f"s at --rate {options.rate:g} makes {duration * options.rate:.0f} rows",
+            field="--duration",
+            value=duration,
+            limit=f"{MAX_ROWS} rows",
         )
-    # Whole rows only; the end itself is one when the rate divides the duration.
+    # Only whole rows; the end is one if the rate divides the duration.
     return np.minimum(
         start + np.arange(int(duration * options.rate + 1e-9) + 1) / options.rate, end
     )
@@ -189,10 +203,12 @@ def _free(arm_model, drive, q, times, options):
 
 
 def _prescribed(chain, motion, times, options):
-    """Yield state and torque at each time, with the joints moved as prescribed."""
+    """Yield state and torque at each time, with prescribed joint angles."""
     n, m = chain.n_joints, chain.n_modes
     if options.method == "implicit":
-        raise FlexarmError("--method implicit: a prescribed motion wants dop853 or rk4")
+        raise FlexarmError(
+            "can't prescribe a motion", field="--method", value="implicit", limit="dop853, rk4"
+        )
     advance = chain.driven_stepper(METHODS[options.method])
     state = np.zeros(2 * (n + m))
     longest = options.step / substeps(chain, options.step, options.method)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm urdf``: the URDF of an arm file, links that bend as chains of short rigid pieces. No ROS."""
+"""``flexarm urdf``: the URDF of an arm file; flexible links are chains of short rigid pieces."""
 
 import json
 from pathlib import Path
@@ -7,21 +7,22 @@ from pathlib import Path
 from flexarm_dynamics.arm.urdf import PieceChain
 from flexarm_dynamics.models import model
 
-from .options import add_model_arguments, load_arm
+from .options import add_arm_arguments, add_model_arguments, load_arm
 
 
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
-        "Writes a URDF; the node shape publishes the joint states that bend it as the arm is bent."
+        "Writes a URDF; the node shape publishes the joint states that bend it like the arm."
     )
     parser.epilog = "example: flexarm urdf two_link --out two_link.urdf"
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add_arm_arguments(parser, "print joints and text as JSON")
     parser.add_argument(
         "--pieces", type=int, default=8, help="rigid pieces of each flexible link (default 8)"
     )
-    parser.add_argument("--out", metavar="FILE", help="write it there instead of printing it")
-    parser.add_argument("--json", action="store_true", help="print joints and text as JSON")
+    parser.add_argument(
+        "--out", metavar="FILE", help="write the URDF to this file instead of printing it"
+    )
     add_model_arguments(parser)
 
 
