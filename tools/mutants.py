@@ -2,7 +2,8 @@
 """Puts one error at a time into a copy of the sources, and runs the tests that must fail: `make mutants`.
 
 Each mutation is one replacement in one file. It is caught when a named test fails; a test run that cannot start, or
-ends otherwise, is an error. ``-k TEXT`` chooses those whose name or file has the text in it.
+ends otherwise, is an error. The named tests must pass in a copy without mutations; they are run there first.
+``-k TEXT`` chooses those whose name or file has the text in it.
 """
 
 import argparse
@@ -294,8 +295,8 @@ LAWS = [
         (
             "corrected",
             "the error's own motion: sign",
-            "        motion[1] -= later[n:]\n",
-            "        motion[1] += later[n:]\n",
+            "kp * later[:n] + kv * later[n:]",
+            "kp * later[:n] - kv * later[n:]",
         ),
         (
             "quasi_steady",
@@ -341,8 +342,8 @@ LAWS = [
         ("true_rates", "a rate", "self.rate[:] = sample.rate", "self.rate[:] = 0.0"),
         (
             "kalman",
-            "covariance: half of Joseph's form",
-            "        P -= (P[:, :p] - gain.T @ R) @ gain\n",
+            "noise of the process: missing",
+            "        P += step.Q\n",
             "",
             TESTS + "test_kalman.py",
         ),
@@ -499,7 +500,7 @@ def places(mutant, root=ROOT):
     return (root / "src" / mutant.file).read_text(encoding="utf-8").count(mutant.old)
 
 
-def run(mutant):
+def run(mutant, mutated=True):
     """Run the tests of one mutant in a copy: ``caught``, ``SURVIVED``, or what went wrong."""
     if places(mutant) != 1:
         return f"ERROR: its text occurs {places(mutant)} times"
@@ -513,24 +514,30 @@ def run(mutant):
                 shutil.copy(source, copy / name)
         file = copy / "src" / mutant.file
         text = file.read_text(encoding="utf-8")
-        file.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
-        packages = [str(path.parent) for path in (copy / "src").glob("*/setup.py")]
-        environment = dict(os.environ, OPENBLAS_NUM_THREADS="1")
-        environment["PYTHONPATH"] = os.pathsep.join([*packages, os.environ["PYTHONPATH"]])
-        if "/kernels/" in mutant.file:  # compiled anew, and never run again
-            environment |= {"FLEXARM_CACHE": str(Path(folder, "cache")), "NUMBA_OPT": "1"}
-        words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
-        words += [f"src/{w}" if w.startswith("flexarm_") else w for w in mutant.tests.split()]
+        if mutated:
+            file.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
         try:
-            done = subprocess.run(
-                words, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT
-            )
+            done = run_tests(mutant, copy, Path(folder, "cache") if mutated else None)
         except subprocess.TimeoutExpired:
             return f"ERROR: no end after {TIMEOUT:g} s"
     if done.returncode in (0, 1):
         return "caught" if done.returncode else "SURVIVED"
     tail = "\n".join((done.stdout + done.stderr).splitlines()[-10:])
     return f"ERROR: pytest ended with {done.returncode}\n{tail}"
+
+
+def run_tests(mutant, copy, cache):
+    """Run the tests of a mutant on a copy of the sources; `cache` is for what its kernels are compiled to."""
+    packages = [str(path.parent) for path in (copy / "src").glob("*/setup.py")]
+    environment = dict(os.environ, OPENBLAS_NUM_THREADS="1")
+    environment["PYTHONPATH"] = os.pathsep.join([*packages, os.environ["PYTHONPATH"]])
+    if cache is not None and "/kernels/" in mutant.file:  # compiled anew, and never run again
+        environment |= {"FLEXARM_CACHE": str(cache), "NUMBA_OPT": "1"}
+    words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
+    words += [f"src/{w}" if w.startswith("flexarm_") else w for w in mutant.tests.split()]
+    return subprocess.run(
+        words, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT
+    )
 
 
 def main():
@@ -541,6 +548,15 @@ def main():
     options = parser.parse_args()
     chosen = [m for m in MUTANTS if options.k in f"{m.file} {m.name}"]
     with ThreadPoolExecutor(options.processes) as executor:
+        sound = {m.tests: m for m in chosen}  # one of each set of tests
+        for mutant, result in zip(
+            sound.values(),
+            executor.map(lambda m: run(m, mutated=False), sound.values()),
+            strict=True,
+        ):
+            if result != "SURVIVED":
+                print(f"these tests fail without a mutation: {mutant.tests}\n{result}")
+                return 1
         results = list(executor.map(lambda m: (m, report(m, run(m))), chosen))
     caught = sum(result == "caught" for _, result in results)
     print(f"{caught} of {len(results)} mutants are caught")
