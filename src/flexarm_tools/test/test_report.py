@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flexarm report`: its numbers against the record itself, its page, and bags of every sad kind."""
+"""`flexarm report`: its numbers against the record itself, its page, and broken bags."""
 
 import json
 import re
@@ -299,9 +299,9 @@ def test_the_numbers_of_the_page_as_json(recorded, runs, tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["report", *paths, "--out", str(tmp_path / "both.html"), "--json"])
     assert end.value.code == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (tmp_path / "both.html").is_file() and said["report"] == str(tmp_path / "both.html")
-    for name, numbers in said["runs"].items():
+    printed = json.loads(capsys.readouterr().out)
+    assert (tmp_path / "both.html").is_file() and printed["report"] == str(tmp_path / "both.html")
+    for name, numbers in printed["runs"].items():
         assert numbers["residual_m"] == pytest.approx(analysis.summary(runs[name])["residual_m"])
 
 
@@ -348,7 +348,7 @@ def test_names_from_a_bag_are_text_and_no_markup(tmp_path):
 def test_a_large_figure_becomes_a_picture_and_a_large_page_is_refused(runs, monkeypatch):
     run = runs["slow"]
     paper = figures._Paper([run], [analysis.motions(run)], "", False)
-    monkeypatch.setattr(figures, "LARGEST_SVG", 1000)
+    monkeypatch.setattr(figures, "MAX_SVG", 1000)
     made = paper.tracking()
     checked(made.image)
     assert made.image.startswith('<img alt="Tracking" src="data:image/png;base64,')
@@ -399,7 +399,7 @@ def read(path, **options):
     return command.read([path], **options)[0]
 
 
-def test_an_arm_state_alone_is_told_of(tmp_path):
+def test_an_arm_state_alone_makes_a_report(tmp_path):
     path = _made_up(tmp_path / "alone", 400)
     made = command.make([path], tmp_path / "alone.html")
     text = made.read_text(encoding="utf-8")
@@ -444,7 +444,7 @@ def test_numbers_that_are_none_leave_holes(tmp_path):
     path = _made_up(tmp_path / "nan", 200, change=sick)
     run = read(path)
     assert np.isnan(run.position(0)).sum() == 10
-    # What is drawn and told leaves them out.
+    # Figures and numbers leave them out.
     assert np.isfinite(run.deflections()).sum() == 2 * 190
     assert analysis.summary(run)["peak_deflection_m"]["link1 y"] > 0.0
     assert animation.data([run])["frames"] > 1
@@ -482,11 +482,11 @@ def test_a_session_that_begins_anew_goes_on_after_the_one_before(tmp_path):
     run = read(_made_up(tmp_path / "again", 100, change=again))
     assert run.sessions == 2 and run.timeline.lost == 0 and run.time.size == 100
     np.testing.assert_allclose(np.diff(run.time), PERIOD * 1e-9, atol=1e-12)
-    assert any("began 2 times" in note for note in run.notes)
+    assert any("started 2 times" in note for note in run.notes)
 
 
 @pytest.mark.parametrize("by", [3600.0, -0.7])
-def test_a_clock_that_jumps_is_told_and_not_believed(tmp_path, by):
+def test_a_jump_of_the_clock_is_noted_and_left_out(tmp_path, by):
     def jump(k, message):
         if k >= 60:
             stamp = 10**10 + k * PERIOD + round(by * 1e9)
@@ -630,7 +630,7 @@ def test_holes_are_bridged_when_they_are_short():
     assert np.isnan(got[[5, 6, 7, 9]]).all() and got[8] == 7.0
 
 
-def test_a_fault_is_told_with_its_reason(tmp_path, recorded):
+def test_a_fault_is_shown_with_its_reason(tmp_path, recorded):
     path, _, _ = recorded["slow"]
     faulty = tmp_path / "faulty"
     with BagWriter(faulty, "R") as out:
@@ -652,8 +652,8 @@ def test_a_fault_is_told_with_its_reason(tmp_path, recorded):
     assert got["faults"] == 1 and "tracking error <of joint1>" in got["first_fault"]
     assert got["compute_time_s"] == pytest.approx([1.5e-4, 2e-4, 2e-4], rel=0.34)
     assert "One fault, the first at" in page.short([run], [got])[0]
-    told = [(state, why) for _, _, state, why in page._events([run])]
-    assert ("FAULT", "tracking error <of joint1>") in told
+    events = [(state, why) for _, _, state, why in page._events([run])]
+    assert ("FAULT", "tracking error <of joint1>") in events
     timing = figures._Paper([run], [analysis.motions(run)], "", False).timing()
     assert "<svg" in timing.image and len(timing.times) == 1
 
@@ -784,9 +784,9 @@ def test_a_recording_ends_with_ctrl_c_and_is_a_bag_of_the_nodes_arm(tmp_path, mo
     assert taken.counts["arm_state"] == 10 and taken.arm == "R"
     run = read(tmp_path / "bag")
     assert run.time.size == 10 and run.arm.name == "R" and run.contents.namespace == "/left"
-    said = capsys.readouterr().out
-    assert "10 arm_state" in said and "nothing came on arm_state_estimate" in said
-    assert f"flexarm report {tmp_path / 'bag'}\n" in said
+    printed = capsys.readouterr().out
+    assert "10 arm_state" in printed and "nothing came on arm_state_estimate" in printed
+    assert f"flexarm report {tmp_path / 'bag'}\n" in printed
 
 
 def test_what_can_not_be_recorded_is_refused(tmp_path):
@@ -796,8 +796,8 @@ def test_what_can_not_be_recorded_is_refused(tmp_path):
     options = SimpleNamespace(out=str(tmp_path / "x"), duration=-1.0, arm=None, namespace="")
     with pytest.raises(FlexarmError, match=r"--duration"):
         recording.record(options)
-    options = SimpleNamespace(out=str(tmp_path / "x"), duration=None, arm="nobody", namespace="")
-    with pytest.raises(FlexarmError, match=r"nobody"):
+    options = SimpleNamespace(out=str(tmp_path / "x"), duration=None, arm="none", namespace="")
+    with pytest.raises(FlexarmError, match=r"none"):
         recording.record(options)
     assert not (tmp_path / "x").exists()
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The moving arm as numbers for the page: straight links, how far they bend away, and the reference.
+"""The animation's numbers: straight links, their bending, and the reference.
 
 A point of a link's axis is p_i + R_i (x, sum phi_y delta_y, sum phi_z delta_z), with the link's base frame (R_i, p_i)
-of the bent arm. The page draws straight + factor (bent - straight): a factor of one is the arm as it is, a larger one
-exaggerates what bending alone does, to first order.
+of the bent arm. The page draws straight + factor (bent - straight). A factor of one shows the arm as it is, a larger
+one exaggerates the bending, to first order.
 """
 
 import base64
@@ -15,13 +15,13 @@ from flexarm_dynamics.models.chain import Chain
 
 from .analysis import motions
 
-#: Frames per second of the run, and at most.
-FRAMES_PER_SECOND, MOST_FRAMES = 50.0, 600
-#: What is shown: from before the first motion until after it [s].
-BEFORE, AFTER, LONGEST = 0.2, 3.0, 12.0
+#: Frames per second of the run, and their largest number.
+FRAMES_PER_SECOND, MAX_FRAMES = 50.0, 600
+#: Time shown before and after the first motion, and at most [s].
+BEFORE, AFTER, MAX_SHOWN = 0.2, 3.0, 12.0
 #: Points along a link.
 POINTS = 9
-#: The greatest deflection is drawn as this share of the arm's reach.
+#: The largest deflection is drawn as this fraction of the arm's reach.
 SHOWN = 0.12
 
 
@@ -78,7 +78,7 @@ class Shape:
 
 
 def _across(vector, axis, others):
-    """The unit vector across an axis that is nearest to the first of some vectors that is not along it."""
+    """The unit vector normal to an axis that is nearest to `vector`, or to the first of `others` not along the axis."""
     for candidate in (vector, *map(np.array, others)):
         rest = candidate - (candidate @ axis) * axis
         if np.linalg.norm(rest) > 1e-6:
@@ -95,11 +95,11 @@ class Film:
     straight : ndarray, shape (frames, links, 2, 3)
         Base and tip of each straight link at the measured joint angles [m].
     bent : ndarray, shape (frames, links, POINTS, 3)
-        How far the points of the bent arm are from those of the straight one [m].
+        Distance of the bent arm's points from those of the straight arm [m].
     reference : ndarray, shape (frames, links, 2, 3) or None
-        As `straight` at the reference angles; NaN where there is none.
+        As `straight`, at the reference angles; NaN where there is none.
     state : list of int
-        The supervisor's, of each frame.
+        The supervisor's state in each frame.
     """
 
     straight: np.ndarray
@@ -109,7 +109,7 @@ class Film:
 
 
 def window(runs):
-    """From when to when the arms are shown [s]: the first motion and the rest after it, else the liveliest."""
+    """Time span of the animation [s]: the first motion and the rest after it, or around the fastest sample."""
     first = [(run, motions(run)) for run in runs]
     moving = [(r.time[m[0].start], r.time[m[0].end - 1]) for r, m in first if m]
     if moving:
@@ -119,14 +119,14 @@ def window(runs):
         run = runs[0]
         speed = sum(np.abs(np.diff(np.nan_to_num(q))) for q in run.positions().T)
         middle = run.time[int(np.argmax(speed))] if speed.size else run.time[0]
-        start, end = middle - 2.0, middle + LONGEST
+        start, end = middle - 2.0, middle + MAX_SHOWN
     start = max(start, min(run.time[0] for run in runs))
-    end = min(end, start + LONGEST, max(run.time[-1] for run in runs))
+    end = min(end, start + MAX_SHOWN, max(run.time[-1] for run in runs))
     return float(round(start, 6)) + 0.0, float(end)
 
 
 def film(run, times):
-    """Frames of a run at given times; before and after it, its first and last sample stand."""
+    """Frames of a run at given times; before and after the run, those of its first and last sample."""
     rows = np.clip(np.searchsorted(run.time, times, "right") - 1, 0, run.time.size - 1)
     shape = Shape(run.arm)
     first, last = int(rows.min()), int(rows.max()) + 1
@@ -149,24 +149,22 @@ def film(run, times):
 
 
 def _held(values):
-    """A table whose NaN are what was last known, 0 before, shape (k, m)."""
+    """A table in which each NaN is replaced by the last known value, 0 before the first one, shape (k, m)."""
     known = np.isfinite(values)
     last = np.maximum.accumulate(np.where(known, np.arange(len(values))[:, None], 0), axis=0)
     return np.nan_to_num(np.take_along_axis(values, last, axis=0))
 
 
 def data(runs):
-    """What the page's script draws: a mapping for JSON; None where no arm is known.
+    """The animation of all `runs` for the page's script, ready for JSON; None where no arm is known.
 
-    Numbers are whole multiples of a `unit`, two bytes each, little endian, in base 64; -32768 is none.
-
-    The `runs` are drawn side by side.
+    Numbers are integer multiples of a `unit`, two bytes each, little endian, in base 64; -32768 stands for none.
     """
     runs = [run for run in runs if run.arm is not None and run.time.size > 1]
     if not runs:
         return None
     start, end = window(runs)
-    count = int(min(MOST_FRAMES, max(2, round((end - start) * FRAMES_PER_SECOND) + 1)))
+    count = int(min(MAX_FRAMES, max(2, round((end - start) * FRAMES_PER_SECOND) + 1)))
     times = np.linspace(start, end, count)
     films = [film(run, times) for run in runs]
     shape = Shape(runs[0].arm)
@@ -175,7 +173,7 @@ def data(runs):
     factor = _round(SHOWN * reach / most) if most > 1e-9 else 1.0
     out = {"start": start, "end": end, "frames": count, "points": POINTS, "factor": factor}
     out |= {"view": shape.view().tolist(), "most": most, "runs": []}
-    # What is seen before anything is played: the frame in which the arms bend most.
+    # Shown before the animation plays: the frame in which the arms bend most.
     bending = sum(np.abs(f.bent).max(axis=(1, 2, 3)) for f in films)
     out["still"] = float(times[int(np.argmax(bending))])
     for run, f in zip(runs, films, strict=True):
@@ -199,7 +197,7 @@ def data(runs):
 
 
 def _round(value):
-    """The next of 1, 2, 5, 10, … below, not less than 1."""
+    """The largest of 1, 2, 5, 10, … that is not above the value; at least 1."""
     if value <= 1.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))

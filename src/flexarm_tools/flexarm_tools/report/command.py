@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm report``: what bags show, on one page of HTML."""
+"""``flexarm report``: recorded runs on one page of HTML."""
 
 import json
 import time

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report's figures, as SVG to be put into a page; a figure that would grow too large becomes a PNG.
+"""The report's figures, as SVG inside the page; a figure that is too large becomes a PNG.
 
-One axis of time for all of them, one colour for each run. Series are thinned to the least and greatest of each bin,
-so that no peak is lost.
+All have the same time axis, and each run has one colour. Series are thinned to the smallest and largest value of each
+bin, so that no peak is lost.
 """
 
 import base64
@@ -32,14 +32,14 @@ STYLE = PAPER_STYLE | {
     "axes.titlelocation": "left",
 }
 COLOURS = (COMPOSITE, SLOW, "#2e7d4f", "#8a5fa8", "#b8860b", "#4f8f9f", "#a0456e", "#6b6b6b")
-#: Of the supervisor's states, in their order.
+#: Colours of the supervisor's states, in their order.
 STATE_COLOURS = ("#d0d0d0", "#9cc3e0", "#2e7d4f", "#8fcf9f", "#e0a030", "#c62828")
 UNKNOWN = "#f4f4f4"
 WIDTH = 10.5
-#: Bins of a thinned series in an axis of the whole width; a larger figure than this becomes a PNG [bytes].
-BINS, LARGEST_SVG = 900, 350_000
-#: More series than this are not drawn: modes, gauges.
-MOST_PANELS = 12
+#: Bins of a thinned series across the whole width; largest SVG, beyond which a figure becomes a PNG [bytes].
+BINS, MAX_SVG = 900, 350_000
+#: Largest number of panels with modes or gauges.
+MAX_PANELS = 12
 DEGREES = 180.0 / np.pi
 
 
@@ -53,7 +53,7 @@ class Figure:
     image : str
         HTML.
     times : list of (float, float, float, float, float, float)
-        Axes of time: left, right, bottom and top as shares of the figure, and their limits [s].
+        Time axes: left, right, bottom and top as fractions of the figure, and their limits [s].
     """
 
     name: str
@@ -64,7 +64,7 @@ class Figure:
 
 
 def plain(text):
-    """A name as matplotlib is to show it: a dollar is no formula, an underscore in front hides nothing."""
+    """A name escaped for matplotlib: a dollar starts no formula, and a leading underscore hides nothing."""
     text = text.replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -75,7 +75,7 @@ def colour(i):
 
 
 def draw(runs, moves, spectra, label, png=False):
-    """All figures that the runs have something for.
+    """All figures for which the runs have data.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ def draw(runs, moves, spectra, label, png=False):
     moves : list of list of Motion
     spectra : list of (Spectrum or None)
     label : str
-        What is counted as time zero.
+        What time zero is, in words.
     png : bool
-        Whether all become PNG.
+        Draw all figures as PNG.
 
     Returns
     -------
@@ -130,7 +130,7 @@ class _Paper:
         return True
 
     def _times(self, axes):
-        """Finish axes of time."""
+        """Finish time axes."""
         for row in axes:
             for ax in row:
                 ax.set_xlim(*self.limits)
@@ -162,9 +162,9 @@ class _Paper:
 
     def _finish(self, figure, name, title, caption, times=None):
         image = "" if self.png else _svg(figure, name)
-        if self.png or len(image) > LARGEST_SVG:
+        if self.png or len(image) > MAX_SVG:
             image = _png(figure, title)
-        places = []  # where saving has laid them out
+        places = []  # known only after saving, which does the layout
         for ax in [] if times is None else np.asarray(times).ravel():
             box = ax.get_position()
             places.append((box.x0, box.x1, box.y0, box.y1, *ax.get_xlim()))
@@ -204,8 +204,8 @@ class _Paper:
         figure.legend(handles=handles, loc="outside upper left", ncols=7)
         self._times(axes)
         caption = (
-            "What the controller's supervisor was doing. INACTIVE and FAULT send no torque; a fault stays until it is"
-            " recovered from. Reasons are in the table below. A black line: the source of states began anew."
+            "State of the controller's supervisor. INACTIVE and FAULT send no torque; a fault stays until ~/recover is"
+            " called. Reasons are in the table below. A black line: the source of states restarted."
         )
         return self._finish(figure, "supervisor", "Supervisor", caption, axes)
 
@@ -238,8 +238,8 @@ class _Paper:
         self._legend(figure, entries)
         self._times(axes)
         caption = "Joint angles" + (
-            ": reference and measurement on the left, reference less measurement on the right. Errors count from the"
-            " first torque on; the summary's peak and rms are of motions and the holding of their ends."
+            ": reference and measurement on the left, reference less measurement on the right. The error is"
+            " drawn from the first torque on; the summary's peak and rms are over the motions and the rests after them."
             if errors
             else " as measured; without controller/state there is no reference in the bag."
         )
@@ -250,7 +250,7 @@ class _Paper:
         if not runs:
             return None
         names = max((r.mode_names for r in runs), key=len)
-        shown = names[:MOST_PANELS]
+        shown = names[:MAX_PANELS]
         columns = 2 if len(shown) > 1 else 1
         rows = -(-len(shown) // columns)
         figure, axes = self._grid(rows, columns, 1.6, sharex=True)
@@ -281,8 +281,8 @@ class _Paper:
         self._times(axes)
         sources = ", ".join(dict.fromkeys(_source(r) for r in runs))
         caption = (
-            f"How far each mode is bent: {sources}. Dashed: the quasi-steady amplitude, which the arm would have if it"
-            " only followed its slow motion; what swings about it is vibration, and the fast control's to damp."
+            f"Amplitude of each mode: {sources}. Dashed: the quasi-steady amplitude, which the arm would have if it"
+            " only followed its slow motion. The oscillation about it is vibration, which the fast control damps."
         )
         if len(names) > len(shown):
             caption += f" The first {len(shown)} of {len(names)} modes."
@@ -296,7 +296,7 @@ class _Paper:
         ]
         if not there:
             return None
-        names = max((s.names for _, _, s in there), key=len)[:MOST_PANELS]
+        names = max((s.names for _, _, s in there), key=len)[:MAX_PANELS]
         columns = 2 if len(names) > 1 else 1
         figure, axes = self._grid(-(-len(names) // columns), columns, 2.3)
         lines = [(i, r, analysis.predicted(r, s.configuration)) for i, r, s in there]
@@ -324,7 +324,7 @@ class _Paper:
         return self._finish(figure, "spectra", "Vibration spectra", caption)
 
     def _predictions(self, ax, lines, low, top):
-        """Mark the frequencies that the model predicts; entries for the legend."""
+        """Draw the frequencies that the model predicts; returns entries for the legend."""
         entries, drawn = [], set()
         for _, _, cases in lines:
             for (case, values), dash in zip(cases.items(), ("-", ":"), strict=False):
@@ -346,7 +346,7 @@ class _Paper:
         after = any(m for m in self.moves)
         where = "while the arm rested after its motions" if after else "over the whole record"
         return (
-            f"How strongly deflections {what} vibrate at which frequency, {where} ({seconds}; Welch's method). Vertical"
+            f"How strongly deflections {what} vibrate at each frequency, {where} ({seconds}; Welch's method). Vertical"
             " lines: natural frequencies of the arm file's model at the mean configuration, joints locked and joints"
             " free. A held joint is neither: peaks lie near these lines, and a damped mode has none."
         )
@@ -385,11 +385,11 @@ class _Paper:
             if split
             else "."
         )
-        caption += " Where a limit is near, it is drawn; else it stands in the summary."
+        caption += " Limits are drawn where they are near; all are in the summary."
         return self._finish(figure, "torques", "Torques", caption, axes)
 
     def _limits(self, ax, j):
-        """Draw the limits that are within sight."""
+        """Draw the torque limits that are near the curves; returns entries for the legend."""
         low, high = ax.get_ylim()
         entries = []
         for run in self.runs:
@@ -408,7 +408,7 @@ class _Paper:
         if not runs:
             return None
         names = max((r.gauge_names for r in runs), key=len)
-        shown = names[:MOST_PANELS]
+        shown = names[:MAX_PANELS]
         columns = 2 if len(shown) > 1 else 1
         figure, axes = self._grid(-(-len(shown) // columns), columns, 1.55, sharex=True)
         bad = 0
@@ -428,16 +428,16 @@ class _Paper:
         self._legend(figure, self._entries())
         self._times(axes)
         watched = any(r.has("observer/state", "gauge_health") for r in runs)
-        health = "Where the observer did not trust a gauge, the background is red."
+        health = "The background is red where the observer did not trust a gauge."
         if not watched:
-            health = "Nothing in the bag tells of the gauges' health."
+            health = "The bag holds no data on the gauges' health."
         elif not bad:
-            health = "The observer trusted every gauge all the time."
-        caption = f"What the strain gauges read, in millionths. {health}"
+            health = "The observer trusted all gauges all the time."
+        caption = f"Readings of the strain gauges, in millionths. {health}"
         return self._finish(figure, "strains", "Strain gauges", caption, axes)
 
     def _health(self, ax, run, k, face):
-        """Mark where a gauge was not good; how often that was."""
+        """Mark where a gauge was not good; returns how often."""
         health = run.column("observer/state", "gauge_health", k)
         if health is None:
             return 0
@@ -468,7 +468,7 @@ class _Paper:
         axes[0, 1].set_xscale("log")
         axes[0, 1].set_yscale("log")
         axes[0, 1].set_xlabel("compute time [ms]")
-        axes[0, 1].set_ylabel("share of samples above [-]")
+        axes[0, 1].set_ylabel("fraction of samples above [-]")
         periods = {1e3 * r.period for r in self.runs if r.period > 0.0}
         for period in periods if len(periods) == 1 else ():
             axes[0, 1].axvline(period, color="#c62828", linestyle="-.", linewidth=0.9)
@@ -476,20 +476,20 @@ class _Paper:
         self._legend(figure, self._entries())
         self._times(axes[:, :1])
         caption = (
-            "Time from a state's arrival in the controller to the torque's departure, of every sample, and how large a"
-            " share took longer."
+            "Time from a state's arrival in the controller to the torque's departure, for every sample. On the right:"
+            " the fraction of samples that took longer."
         )
         return self._finish(figure, "timing", "Compute time", caption, axes[:, :1])
 
 
 def _spans(run, state, limits):
-    """(start, width) of the stretches in a state, none thinner than can be seen [s]."""
+    """(start, width) of the stretches in a state, each wide enough to be seen [s]."""
     least = (limits[1] - limits[0]) / 2000.0
     out = []
     for a, b in zip(*stretches(run.state == state), strict=True):
         start, end = run.time[a], run.time[min(b, run.time.size - 1)]
         if out and start - sum(out[-1]) < least and end - sum(out[-1]) < least:
-            continue  # within what the last one already covers
+            continue  # the last one covers it
         out.append((float(start), float(max(end - start, least))))
     return out
 
@@ -507,7 +507,7 @@ def _darker(name):
 
 
 def _svg(figure, name):
-    """The figure as SVG inside a page: without a head, without references to anywhere."""
+    """The figure as SVG for a page: without a header, without references to other files."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()
@@ -517,7 +517,7 @@ def _svg(figure, name):
     text = text.replace("xlink:href", "href")
     used = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
     text = re.sub(r' id="([^"]*)"', lambda m: m.group(0) if m.group(1) in used else "", text)
-    for each in used:  # every figure has ids of its own
+    for each in used:  # ids must differ between figures
         text = text.replace(f'id="{each}"', f'id="{name}-{each}"')
         text = text.replace(f"#{each})", f"#{name}-{each})").replace(
             f'"#{each}"', f'"#{name}-{each}"'

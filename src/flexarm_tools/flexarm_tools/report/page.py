@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the report's page: sentences and tables from the numbers, with the figures and the animation."""
+"""Writes the report's page: sentences and tables from the numbers, figures and animation."""
 
 import json
 import math
@@ -76,7 +76,7 @@ def write(runs, opening=""):
     """
     if len(runs) > MAX_RUNS:
         raise FlexarmError(
-            "can't be told apart on a page",
+            "are too many to distinguish on a page",
             field="runs",
             value=len(runs),
             limit=f"at most {MAX_RUNS}",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One recorded run: the samples of a bag's topics on one axis of time, a column at a time."""
+"""One recorded run: the samples of a bag's topics on one time axis, read column by column."""
 
 from functools import cached_property
 
@@ -15,27 +15,27 @@ from . import timeline
 STATES = ("INACTIVE", "READY", "TRACKING", "HOLDING", "STOPPING", "FAULT")
 INACTIVE, READY, TRACKING, HOLDING, STOPPING, FAULT = range(6)
 ALL = slice(None)
-#: A sample without an answer is in the state of the last one that has one, for so long [s].
+#: A sample without an answer takes over the last answered sample's state, if that is not older than this [s].
 HOLD = 0.5
-#: Over so many samples that lack an amplitude it is taken to have changed evenly.
+#: Gaps in the amplitudes of up to this many samples are interpolated.
 BRIDGED = 5
 ENABLED = 1  # `JointTorque.ENABLED`
 
 
 class Run:
-    """What was recorded of one arm.
+    """The recording of one arm.
 
     Parameters
     ----------
     contents : Contents
         Of `bag.read`.
     label : str
-        What it is called on the page.
+        Its name on the page.
 
     Attributes
     ----------
     time : ndarray, shape (k,)
-        Of each sample [s]; see `start_at`.
+        Time of each sample [s]; see `start_at`.
     notes : list of str
     model : ArmModel or None
     """
@@ -49,74 +49,74 @@ class Run:
         table = contents.tables[self.base]
         self.timeline = timeline.arrange(table.stamp, table.session, table.sequence)
         self.time, self._rows = self.timeline.time, {}
-        self._tell()
+        self._note()
 
-    def _tell(self):
-        """Notes on what is missing."""
+    def _note(self):
+        """Note what is missing."""
         missing = [t for t in ("arm_state", "joint_torque", "controller/state") if not self.has(t)]
         for topic in missing:
             without = {
-                "arm_state": "what was measured is taken from arm_state_estimate",
-                "joint_torque": "whether torque was enabled is not known",
+                "arm_state": "measurements are taken from arm_state_estimate",
+                "joint_torque": "it is unknown when torque was enabled",
                 "controller/state": "no reference, no tracking error, no supervisor, no slow and fast torque",
             }
             self.notes.append(f"{topic} is not in the bag: {without[topic]}")
         if self.arm is None:
             self.notes.append(
-                "the bag does not say which arm this is: give --arm for limits, predicted frequencies, deflections"
-                " in mm and the animation"
+                "the bag does not name its arm: give --arm for limits, predicted frequencies, deflections in mm and the"
+                " animation"
             )
         for at, size in self.timeline.jumps[:5]:
             self.notes.append(
                 f"the stamps jump by {size:+.4g} s at {self.time[at]:.3f} s while the sequence goes on"
             )
         if len(self.timeline.jumps) > 5:
-            self.notes.append(f"… and {len(self.timeline.jumps) - 5} times more")
+            self.notes.append(f"… and {len(self.timeline.jumps) - 5} more times")
         if self.sessions > 1:
             self.notes.append(
-                f"the source began {self.sessions} times: its sessions are drawn one right after the other"
+                f"the source started {self.sessions} times: its sessions are drawn one after the other, without gaps"
             )
 
-    # What there is -----------------------------------------------------------------------------
+    # Contents ----------------------------------------------------------------------------------
 
     @property
     def joint_names(self):
-        """Of the arm file, in its order."""
+        """In the order of the arm file."""
         return self.contents.names["joint_names"]
 
     @property
     def gauge_names(self):
-        """Of the arm file, in its order."""
+        """In the order of the arm file."""
         return self.contents.names["gauge_names"]
 
     @property
     def mode_names(self):
-        """Of the arm file, in its order."""
+        """In the order of the arm file."""
         return self.contents.names["mode_names"]
 
     @property
     def sessions(self):
-        """How often the source began."""
+        """How often the source started."""
         return int(self.timeline.epoch.max()) + 1
 
     @property
     def period(self):
-        """Between two samples [s]; NaN for a single one."""
+        """Time between two samples [s]; NaN for a single sample."""
         return self.timeline.period
 
     def has(self, topic, field=None):
-        """Whether the bag has a topic, and some number in a field of it."""
+        """Whether the bag has a topic, and in it some number in a field."""
         table = self.contents.tables.get(topic)
         return table is not None and (field is None or field in table.known)
 
     def start_at(self, index):
-        """Have time zero at a sample."""
+        """Put time zero at a sample."""
         self.time = self.timeline.time - self.timeline.time[index]
 
     # Columns -----------------------------------------------------------------------------------
 
     def column(self, topic, field, j=None, part=ALL):
-        """One number of each sample, NaN where the topic has none for it, shape (k,); None without the field.
+        """A field's value in each sample, shape (k,), NaN where the topic has none; None without the field.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class Run:
         j : int, optional
             Which joint, gauge or mode.
         part : slice, optional
-            Of the samples.
+            Samples to take; all by default.
         """
         if not self.has(topic, field):
             return None
@@ -136,7 +136,7 @@ class Run:
         return out
 
     def _rows_of(self, topic):
-        """Row of each sample in a topic's table, -1 where there is none."""
+        """Row of each sample in a topic's table, -1 for none."""
         if topic == self.base:
             return self.timeline.rows
         if topic not in self._rows:
@@ -148,9 +148,9 @@ class Run:
 
     @cached_property
     def state(self):
-        """The supervisor's state of each sample, -1 where it is not known, shape (k,) int8.
+        """The supervisor's state in each sample, -1 where unknown, shape (k,) int8.
 
-        A sample that got no answer is in the state of the one before, for `HOLD` at most.
+        A sample without an answer takes over the state before, for `HOLD` at most.
         """
         state = self.column("controller/state", "supervisor_state")
         if state is None:
@@ -160,7 +160,7 @@ class Run:
 
     @cached_property
     def reason(self):
-        """Which of `contents.reasons` stands with each sample, -1 for none, shape (k,)."""
+        """Index into `contents.reasons` for each sample, -1 for none, shape (k,)."""
         table = self.contents.tables.get("controller/state")
         if table is None:
             return np.full(self.time.size, -1)
@@ -206,7 +206,7 @@ class Run:
 
     @cached_property
     def amplitude_source(self):
-        """Where the modal amplitudes come from: a topic, ``strain``, or nothing."""
+        """Source of the modal amplitudes: a topic, ``strain``, or an empty string."""
         for topic in ("arm_state_estimate", "arm_state"):
             if self.has(topic, "modal_amplitude"):
                 return topic
@@ -214,7 +214,7 @@ class Run:
 
     @cached_property
     def _strain_map(self):
-        """What the arm file makes of the strains; None where it makes nothing."""
+        """The arm file's map from strains to amplitudes; None without one."""
         if self.model is None or not self.arm.gauges or not self.has(self.base, "strain"):
             return None
         try:
@@ -224,7 +224,7 @@ class Run:
             return None
 
     def amplitude(self, j, part=ALL):
-        """Amplitude of a mode, the observer's where there is one [m, rad]; None where nothing tells."""
+        """Amplitude of a mode, from the observer if possible [m, rad]; None without a source."""
         if not self.amplitude_source:
             return None
         if self.amplitude_source == "strain":
@@ -232,7 +232,7 @@ class Run:
         return self.column(self.amplitude_source, "modal_amplitude", j, part)
 
     def _mapped(self, part):
-        """Amplitudes of the strains, shape (part, modes)."""
+        """Amplitudes mapped from the strains, shape (part, modes)."""
         strain_map, count = self._strain_map, len(self.gauge_names)
         strain = [self.column(self.base, "strain", g, part) for g in range(count)]
         mapped = (np.column_stack(strain) - strain_map.bias) @ strain_map.inverse.T
@@ -242,19 +242,19 @@ class Run:
         return out
 
     def deflections(self, part=ALL):
-        """Amplitudes of all modes, shape (part, m): 0 for a mode of which nothing tells, NaN where a sample lacks it.
+        """Amplitudes of all modes, shape (part, m): 0 for a mode without a source, NaN where a sample lacks it.
 
-        Over at most `BRIDGED` samples that lack it, a line is drawn.
+        Gaps of at most `BRIDGED` samples are interpolated.
         """
         size, count = self.time[part].size, len(self.mode_names)
         out = np.zeros((size, count))
-        for j in np.flatnonzero(self._told):
+        for j in np.flatnonzero(self._known_modes):
             out[:, j] = bridged(self.amplitude(j, part), BRIDGED)
         return out
 
     @cached_property
-    def _told(self):
-        """Of which modes something tells, shape (m,) bool."""
+    def _known_modes(self):
+        """Modes that have a source, shape (m,) bool."""
         if not self.amplitude_source:
             return np.zeros(len(self.mode_names), bool)
         if self.amplitude_source == "strain":
@@ -266,7 +266,7 @@ class Run:
     def bent_known(self):
         """Samples whose deflections are known, shape (k,) bool."""
         known = np.ones(self.time.size, bool)
-        for j in np.flatnonzero(self._told):
+        for j in np.flatnonzero(self._known_modes):
             known &= np.isfinite(bridged(self.amplitude(j), BRIDGED))
         return known
 
@@ -282,7 +282,7 @@ class Run:
 
 
 def bridged(values, most):
-    """A series with lines drawn over holes of at most so many samples, shape (k,)."""
+    """A series in which gaps of at most `most` samples are interpolated linearly, shape (k,)."""
     holes = np.isnan(values)
     if not holes.any() or holes.all():
         return values

@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puts samples in order and on one axis of time; joins topics; thins series for drawing. Plain arrays.
+"""Puts samples in order on one time axis; joins topics; thins series for drawing. Plain arrays.
 
-A sample is known by session, sequence and stamp, which every answer to it copies. The sequence counts, so that it
-tells what was lost; the stamp tells the time. Where the two contradict each other, the clock has jumped, and the
-sequence is believed. A session that begins anew goes on right after the one before.
+Session, sequence and stamp identify a sample; every answer to it copies them. The sequence counts samples and so shows
+losses; the stamp is the time. Where the two contradict each other, the clock has jumped, and the sequence is taken as
+correct. A new session follows the one before without a gap.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-#: Stamps may be off the sequence's by so much before the clock is said to have jumped [s], [periods].
+#: The clock has jumped where stamp and sequence differ by more than either of these [s], [periods].
 JUMP_SECONDS, JUMP_PERIODS = 0.5, 100
-#: A sequence that falls back by more than this begins anew.
+#: A sequence that falls back by more than this has restarted.
 LATE = 1000
-#: Sessions that take turns more often than this are two sources.
-MOST_SESSIONS = 50
+#: Sessions that alternate more often than this come from two sources at once.
+MAX_CHANGES = 50
 _ODD = np.uint64(0x9E3779B97F4A7C15)
 
 
 def keys(stamp, session, sequence):
-    """A number for each sample, equal for what belongs to the same one, shape (k,) uint64."""
+    """A key for each sample, equal in all topics for the same sample, shape (k,) uint64."""
     key = np.asarray(stamp).astype(np.uint64)
     key = key * _ODD + np.asarray(session).astype(np.uint64)
     return key * _ODD + np.asarray(sequence).astype(np.uint64)
@@ -33,21 +33,21 @@ class Timeline:
     Attributes
     ----------
     rows : ndarray of int, shape (k,)
-        Rows of the table, each sample once, in order.
+        Rows of the table in order, each sample once.
     time : ndarray, shape (k,)
-        From the first one [s].
+        Since the first one [s].
     epoch : ndarray of int, shape (k,)
-        Counts starts of the source.
+        Number of restarts of the source before the sample.
     index : ndarray of int, shape (k,)
-        Samples since the epoch's first, those that were lost counted.
+        Samples since the epoch's first, lost ones included.
     period : float
-        Between two samples [s]; NaN for a single one.
+        Time between two samples [s]; NaN for a single one.
     lost : int
-        Samples that are missing.
+        Missing samples.
     repeated : int
-        Messages that told the same once more.
+        Messages that repeat a sample.
     jumps : list of (int, float)
-        Where the clock jumped: sample, and by how much [s].
+        Jumps of the clock: sample, and size [s].
     """
 
     rows: np.ndarray
@@ -61,7 +61,7 @@ class Timeline:
 
     @property
     def joined(self):
-        """Whether each sample but the first directly follows the one before, shape (k - 1,) bool."""
+        """Whether each sample after the first directly follows the one before, shape (k - 1,) bool."""
         return (np.diff(self.epoch) == 0) & (np.diff(self.index) == 1)
 
 
@@ -88,7 +88,7 @@ def arrange(stamp, session, sequence):
     expected = counts * safe
     off = np.abs(steps - expected) > np.maximum(JUMP_SECONDS, JUMP_PERIODS * safe)
     jumped = same & (off | (steps <= 0.0))
-    # A source that was silent and counted on is a gap, not a jump.
+    # Where a silent source went on counting there is a gap, not a jump.
     jumps = [(int(i) + 1, float(steps[i] - expected[i])) for i in np.flatnonzero(jumped)]
     steps = np.where(same & ~jumped, steps, expected)
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
@@ -101,12 +101,12 @@ def arrange(stamp, session, sequence):
 
 
 def _epochs(stamp, session, sequence):
-    """Which start of the source each sample belongs to, by order of arrival, shape (k,)."""
+    """Number of the source's restart that each sample belongs to, by order of arrival, shape (k,)."""
     if not len(stamp):
         return np.zeros(0, int)
     changed = np.diff(session) != 0
     different, number = np.unique(session, return_inverse=True)
-    if changed.sum() > MOST_SESSIONS and len(different) < 0.1 * changed.sum():
+    if changed.sum() > MAX_CHANGES and len(different) < 0.1 * changed.sum():
         return number.reshape(-1)  # two sources at once: one after the other
     back, later = np.diff(sequence), np.diff(stamp) > 0
     again = changed | ((back < 0) & later) | (back < -LATE)
@@ -131,9 +131,9 @@ def stretches(mask):
 
 
 def thinned(time, values, bins):
-    """The least and the greatest of each bin, in the order in which they came; gaps stay gaps.
+    """The smallest and the largest value of each bin, in their order in time; gaps stay gaps.
 
-    What is drawn through them covers all that the series covers: no peak is lost.
+    A line through them covers the same range as the series: no peak is lost.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def thinned(time, values, bins):
     starts = np.arange(len(whole)) * width
     pair = np.sort(np.column_stack([low, high]), axis=1) + starts[:, None]
     out_t, out_v = time[pair], values[pair]
-    # A bin with a hole in it ends with a break, and one that is empty is one.
+    # A bin with a gap in it ends with a break; an empty bin is a break.
     out_t = np.column_stack([out_t, out_t[:, 1]])
     out_v = np.column_stack([out_v, np.where(holes | empty, np.nan, out_v[:, 1])])
     keep = np.column_stack([~empty, ~empty & (low != high), holes | empty])
@@ -168,7 +168,7 @@ def thinned(time, values, bins):
 
 
 def broken(time, values, limit):
-    """A series with a NaN put in wherever two samples are farther apart than `limit` [s]."""
+    """A series with a NaN inserted wherever two samples are farther apart than `limit` [s]."""
     gaps = np.flatnonzero(np.diff(time) > limit)
     if not gaps.size:
         return time, values
