@@ -256,21 +256,8 @@ class CompositeStateWriter:
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
         msg.supervisor_state = int(controller.state)
-        reference, law = controller.reference, controller.answered_by
-        a["reference_position"][:] = reference.position
-        a["reference_velocity"][:] = reference.velocity
-        a["reference_acceleration"][:] = reference.acceleration
-        a["torque"][:] = controller.torque
-        for name, values in (
-            ("position_error", controller.position_error),
-            ("velocity_error", controller.velocity_error),
-            ("slow_torque", law.slow_torque),
-            ("fast_torque", law.fast_torque),
-            ("quasi_steady_amplitude", law.quasi_steady),
-            ("fast_deviation", law.deviation),
-        ):
-            # Without a torque for this sample they are those of an earlier one.
-            a[name][:] = values if controller.enabled else 0.0
+        for name, values in controller.view().items():
+            a[name][:] = values
         msg.saturated = controller.saturated
         msg.rejected_reason = controller.reason
         msg.accepted_trajectory_id = controller.trajectory_id

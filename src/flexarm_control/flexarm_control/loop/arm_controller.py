@@ -132,6 +132,33 @@ class ArmController:
         """Why there is no torque, why the arm was stopped, or why the last trajectory was refused; else empty."""
         return self.supervisor.reason or self._trajectory_reason
 
+    def view(self):
+        """What there is to see of the last sample, by the field names of `CompositeState`.
+
+        Returns
+        -------
+        dict of str to ndarray
+            Reference and torque; errors, parts of the torque and deflections are 0.0 where no torque was computed.
+        """
+        reference, law = self.reference, self.answered_by
+        computed = {
+            "position_error": self.position_error,
+            "velocity_error": self.velocity_error,
+            "slow_torque": law.slow_torque,
+            "fast_torque": law.fast_torque,
+            "quasi_steady_amplitude": law.quasi_steady,
+            "fast_deviation": law.deviation,
+        }
+        if not self.enabled:  # they are those of an earlier sample
+            computed = dict.fromkeys(computed, 0.0)
+        return {
+            "reference_position": reference.position,
+            "reference_velocity": reference.velocity,
+            "reference_acceleration": reference.acceleration,
+            "torque": self.torque,
+            **computed,
+        }
+
     def refuse(self, reason):
         """Note a trajectory that was refused before it could be offered."""
         self._trajectory_reason = reason
