@@ -16,7 +16,7 @@ from flexarm_sim import simulator
 from flexarm_tools.check_driver import listening, moving
 from flexarm_tools.check_driver.command import merged, report
 from flexarm_tools.check_driver.listening import Tolerances
-from flexarm_tools.check_driver.samples import Finding, Heard, Samples, Verdict, samples
+from flexarm_tools.check_driver.samples import Finding, Received, Samples, Verdict, samples
 
 RATE = 200.0  # [Hz]
 NOW = 1_700_000_000_000_000_000  # [ns] what the clock shows at the first sample
@@ -169,7 +169,7 @@ def test_a_push_during_which_the_safe_action_came_is_replayed_with_it():
     assert "moves 1 times as far as its model" in b.findings()["response"].text
 
 
-def test_a_push_that_nobody_saw_is_not_judged(bench):
+def test_a_push_whose_samples_were_lost_is_not_judged(bench):
     def lose(samples, first, last):
         kept = np.r_[0:first, last : samples.size]
         arrays = {k: v[kept] for k, v in vars(samples).items() if v is not None}
@@ -187,7 +187,7 @@ def test_an_arm_under_its_weight_is_pushed_from_rest():
     found = b.findings()
     assert "FAIL" not in verdicts(found).values(), found
     assert verdicts(found)["response"] == "PASS"
-    # Gauges across the push are not judged: what they see of it is little.
+    # Gauges across the push are not judged: it hardly bends them.
     assert "upper_root_z 1.00" in found["strain response"].text
     assert "upper_root_y" not in found["strain response"].text
 
@@ -224,7 +224,8 @@ def test_wrong_sign(bench):
     failed = bench.broken(change)
     assert set(failed) == {"response"}
     assert (
-        "wrong sign: turn the sign of the position's or of the torque's scale" in failed["response"]
+        "wrong sign: reverse the sign of the position's or of the torque's scale"
+        in failed["response"]
     )
 
 
@@ -260,7 +261,7 @@ def test_old_stamps(bench):
     failed = bench.broken(lambda s: replace(s, stamp=s.stamp - 200_000_000))
     assert set(failed) == {"stamps"}
     assert failed["stamps"] == (
-        "stamps are at least 0.201 s old when they arrive, at most 0.05 s is wanted: stamp at the"
+        "stamps are at least 0.201 s old when they arrive, allowed are 0.05 s: stamp at the"
         " measurement and publish at once"
     )
 
@@ -272,7 +273,7 @@ def test_frozen_strain(bench):
     failed = bench.broken(change)
     assert set(failed) == {"frozen strain"}
     assert (
-        "strain of root, middle did not change by a bit while the arm moved"
+        "strain of root, middle did not change at all while the arm moved"
         in failed["frozen strain"]
     )
 
@@ -288,7 +289,7 @@ def test_one_frozen_gauge_of_several(lab):
 
 @pytest.mark.parametrize("reports", [True, False])
 def test_torque_ignored(bench, reports):
-    """One that tells what it was sent and does nothing, and one that is honest."""
+    """A driver that reports the torque sent but does not apply it, and one that reports zero."""
 
     def change(s):
         torque = bench.sent if s is bench.moved else s.torque
@@ -337,7 +338,7 @@ def changed(field, function):
         (changed("stamp", lambda t: t + 10**8), "stamps", "in the future"),
         (changed("stamp", lambda t: 0 * t), "stamps", "100% of the stamps do not rise"),
         (changed("stamp", lambda t: t // 1000), "stamps", "0.001 s per second"),
-        (changed("stamp", lambda t: t - (t - t[0]) // 5), "rate", "250.0 samples per second, 200"),
+        (changed("stamp", lambda t: t - (t - t[0]) // 5), "rate", "250.0 samples per second, expected are 200"),
     ],
 )
 def test_other_faults_are_named(bench, change, check, text):
@@ -354,14 +355,14 @@ def test_a_scale_that_is_wrong_is_not_one_of_the_tolerated(bench):
         assert ("response" in failed) == fails, factor
 
 
-def test_joints_that_are_exchanged_are_told_apart(two_link):
+def test_joints_that_are_exchanged_are_distinguished(two_link):
     def change(s):
         return replace(s, position=s.position[:, ::-1], velocity=s.velocity[:, ::-1])
 
     assert "joint joint1 moves as joint2 should" in two_link.broken(change)["joint order"]
 
 
-def test_gauges_of_two_links_that_are_exchanged_are_told_apart(two_link):
+def test_gauges_of_two_links_that_are_exchanged_are_distinguished(two_link):
     def change(s):
         return replace(s, strain=s.strain[:, [2, 1, 0, 3]], amplitude=None)
 
@@ -369,7 +370,7 @@ def test_gauges_of_two_links_that_are_exchanged_are_told_apart(two_link):
     assert "gauge link1_root moves as link2_root should" in text
 
 
-def test_a_bridge_out_of_balance_is_worth_a_word_at_the_end_of_its_range_a_failure(bench):
+def test_a_bridge_out_of_balance_is_a_warning_and_at_the_end_of_its_range_a_failure(bench):
     found = bench.findings(changed("strain", lambda e: e + 150e-6))
     assert verdicts(found)["strain at rest"] == "WARN"
     assert "call observer/calibrate_gauges" in found["strain at rest"].text
@@ -385,14 +386,14 @@ def test_without_motion_what_needs_it_is_skipped(bench):
     assert skipped == {"velocity", "frozen strain"}
 
 
-def test_a_few_stamps_in_the_future_are_worth_a_word(bench):
+def test_a_few_stamps_in_the_future_are_a_warning(bench):
     stamp = bench.rest.stamp.copy()
     stamp[:20] += 4_000_000
     finding = listening.check_stamps(replace(bench.rest, stamp=stamp), Tolerances())
     assert finding.verdict == Verdict.WARN and "up to 0.003 s in the future" in finding.text
 
 
-def test_stamps_that_jump_about_are_told_from_a_grid(bench):
+def test_stamps_that_deviate_from_their_grid_fail(bench):
     jitter = np.random.default_rng(0).uniform(-0.004, 0.004, bench.rest.size)
     finding = listening.check_jitter(
         replace(bench.rest, stamp=bench.rest.stamp + (1e9 * jitter).astype(int)), Tolerances()
@@ -488,7 +489,7 @@ def test_another_order_is_read_by_name_and_warned_of(bench):
     turned = message(gauge_names=["middle", "root"], strain=[2e-6, 1e-6])
     names, lengths = listening.check_layout(bench.arm, [turned])
     assert (names.verdict, lengths.verdict) == (Verdict.WARN, Verdict.PASS)
-    read = samples(bench.arm, [Heard(turned, 0.5, 42)])
+    read = samples(bench.arm, [Received(turned, 0.5, 42)])
     np.testing.assert_array_equal(read.strain, [[1e-6, 2e-6]])
     assert (read.stamp[0], read.session[0], read.sequence[0]) == (3_000_000_007, 5, 9)
     assert read.velocity is None and read.amplitude is None

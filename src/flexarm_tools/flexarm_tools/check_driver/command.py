@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm check_driver``: listens to a running driver, pushes its arm where that is allowed, says what is wrong."""
+"""``flexarm check_driver``: tests a running driver, by listening and, if allowed, by pushing its arm."""
 
 import argparse
 import json
@@ -14,21 +14,21 @@ from flexarm_dynamics.models import model
 
 from . import moving
 from .listening import Tolerances, check_layout, check_listening
-from .samples import Finding, Heard, Verdict, samples
+from .samples import Finding, Received, Verdict, samples
 
-#: A jolt forth and back lasts twice this, and so long something is sent that must not be applied [s].
+#: Half the duration of a jolt forth and back; how long torques that must not be applied are sent [s].
 JOLT, REFUSED = 0.15, 0.15
-#: A push is tried so often, where too many samples were lost to judge it.
+#: Attempts at a push, when too many samples were lost to judge it.
 TRIES = 3
-#: Wall time that a phase may take, beside its own [s] and as a factor.
+#: Wall time that a phase may take beyond its own: in addition [s], and as a factor.
 PATIENCE, SLOW = 2.0, 5.0
 
 
 def add_arguments(parser):
     """Declare the command's options."""
     parser.description = (
-        "Listens to a running driver (or simulator) and judges what it sends; with "
-        "--allow-motion pushes each joint a little and compares with the model of the arm "
+        "Tests a running driver (or simulator): checks what it publishes; with --allow-motion "
+        "also pushes each joint a little and compares its motion with the model of the arm "
         "file. Exit code 1 when a check fails."
     )
     parser.epilog = "example: flexarm check_driver R --rate 200 --allow-motion"
@@ -38,14 +38,14 @@ def add_arguments(parser):
     )
     parser.add_argument("--angle", type=_positive, default=0.05, help="how far to push [rad]")
     parser.add_argument("--duration", type=_positive, default=2.0, help="time to listen [s]")
-    parser.add_argument("--rate", type=_positive, help="samples per second it ought to have [Hz]")
+    parser.add_argument("--rate", type=_positive, help="expected samples per second [Hz]")
     defaults = Tolerances()
     for name, unit, text in (
         ("rate_error", "", "relative error of the rate"),
         ("jitter", "periods", "deviation of stamps from their grid"),
         ("age", "s", "age of a stamp when it arrives"),
-        ("gain", "", "relative error of the arm's response beside its model"),
-        ("torque_timeout", "s", "when the safe action is due"),
+        ("gain", "", "relative error of the arm's response against its model"),
+        ("torque_timeout", "s", "time within which the safe action must follow"),
     ):
         default = getattr(defaults, name)
         words = f"{text}{f' [{unit}]' if unit else ''} (default {default:g})"
@@ -53,19 +53,21 @@ def add_arguments(parser):
             "--" + name.replace("_", "-"), type=_positive, default=default, help=words
         )
     parser.add_argument("--namespace", default="", help="namespace of the driver's topics")
-    parser.add_argument("--timeout", type=_positive, default=10.0, help="wait for a state [s]")
+    parser.add_argument(
+        "--timeout", type=_positive, default=10.0, help="longest wait for a state [s]"
+    )
     parser.add_argument("--json", action="store_true", help="findings as JSON")
 
 
 def _positive(text):
     value = float(text)
     if not (value > 0.0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text}: a finite number above 0 is wanted")
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number above 0")
     return value
 
 
 class Conversation:
-    """Hears a driver's states and answers them.
+    """Receives a driver's states and answers them.
 
     Parameters
     ----------
@@ -73,7 +75,7 @@ class Conversation:
     namespace : str
     """
 
-    #: Torques of this program; not a controller's, which are drawn.
+    #: Id of this program; those of controllers are random.
     CONTROLLER_ID = 0xC4EC
 
     def __init__(self, arm, namespace=""):
@@ -85,22 +87,22 @@ class Conversation:
         # Woken by each state, which is answered at once.
         self.session = Session("check_driver", namespace=namespace, period=0.05)
         self.node = self.session.node
-        self.heard, self._answer = [], None
+        self.received, self._answer = [], None
         self._publisher = self.session.publisher(JointTorque, "joint_torque", profile=qos.LINE)
         self.node.create_subscription(ArmState, "arm_state", self._on_state, qos.LINE)
 
     def _on_state(self, message):
         now = self.node.get_clock().now().nanoseconds
-        self.heard.append(Heard(message, time.monotonic(), now))
+        self.received.append(Received(message, time.monotonic(), now))
         if self._answer is not None:
             self._answer(message)
 
     def listen(self, seconds, answer=None):
-        """States of so many seconds of the driver's time; `answer` is called with time and message.
+        """Return the states of `seconds` of the driver's time; call `answer` with the time and message of each.
 
-        Wall time ends it where the stamps stand still.
+        When the stamps stand still, wall time ends it.
         """
-        start, first = len(self.heard), None
+        start, first = len(self.received), None
         reached = 0.0
 
         def on_state(message):
@@ -114,7 +116,7 @@ class Conversation:
         self._answer = on_state
         self.session.serve(PATIENCE + SLOW * seconds, lambda: reached >= seconds)
         self._answer = None
-        return self.heard[start:]
+        return self.received[start:]
 
     def send(self, message, torque, **changes):
         """Answer a state with torque (n,) [N m]; `changes` replace fields."""
@@ -130,15 +132,15 @@ class Conversation:
         self._publisher.publish(self._kind(**{**fields, **changes}))
 
     def disable(self, message):
-        """Let go of the arm."""
+        """Send DISABLED, so that the arm takes its safe action."""
         self.send(message, np.zeros(len(self._arm.joints)), mode=self._kind.DISABLED)
 
     def alone(self):
-        """Whether nobody else sends torque."""
+        """Whether this program is the only one that publishes torque."""
         return self.node.count_publishers(self._publisher.topic_name) == 1
 
     def driver_listens(self):
-        """Whether somebody reads the torque."""
+        """Whether a driver subscribes to the torque."""
         return self._publisher.get_subscription_count() > 0
 
     def close(self):
@@ -146,8 +148,14 @@ class Conversation:
         self.session.close()
 
 
+def not_alone():
+    """The error when a controller runs while the arm is to be pushed."""
+    hint = "stop it before the arm is pushed"
+    return FlexarmError("a controller sends it", field="joint_torque", hint=hint)
+
+
 class Examination:
-    """The whole of it: listen, push each joint, stop.
+    """All checks: listen, push each joint, stop.
 
     Parameters
     ----------
@@ -162,39 +170,35 @@ class Examination:
         self.findings = []
 
     def listen(self, seconds):
-        """Listen only; whether the samples can be read at all."""
-        heard = self.line.listen(seconds)
-        if len(heard) < 5:
-            text = (
-                f"{len(heard)} states in {seconds:g} s and more: publish arm_state at a steady rate"
-            )
+        """Check the samples without moving; return whether they can be read at all."""
+        received = self.line.listen(seconds)
+        if len(received) < 5:
+            text = f"{len(received)} states in at least {seconds:g} s: publish arm_state at a steady rate"
             self.findings.append(Finding("rate", Verdict.FAIL, text))
             return False
-        layout = check_layout(self.arm, [h.message for h in heard])
+        layout = check_layout(self.arm, [h.message for h in received])
         self.findings += layout
         if any(f.verdict == Verdict.FAIL for f in layout):
             return False
-        self.samples = samples(self.arm, heard)
+        self.samples = samples(self.arm, received)
         self.findings += check_listening(self.model, self.samples, self.tolerances)
         return True
 
     def move(self, angle):
-        """Push every joint; then see what the driver does without torque and with wrong ones.
-
-        `angle` is about how far a push leads [rad].
+        """Push every joint by about `angle` [rad]; then check the driver without torque and with wrong torques.
 
         Raises
         ------
         FlexarmError
-            When somebody else sends torque.
+            When another controller sends torque.
         """
         if np.ptp(self.samples.position, axis=0).max() > 0.1 * angle:
-            text = "the arm moves before it is pushed: bring it to rest where its brakes hold it, try again"
+            text = "the arm moves before it is pushed: bring it to rest where its brakes hold it, and try again"
             self.findings.append(Finding("response", Verdict.FAIL, text))
             return
-        # Now, and not at the start: others have to be discovered first.
+        # Not at the start: other publishers have to be discovered first.
         if not self.line.alone():
-            raise FlexarmError("a controller sends joint_torque: stop it before the arm is pushed")
+            raise not_alone()
         for joint in range(len(self.arm.joints)):
             if joint:
                 self._rest()
@@ -215,7 +219,7 @@ class Examination:
         return push
 
     def _pushed(self, joint, angle):
-        """Push a joint once: the push, the samples of it, and the torque sent."""
+        """Push a joint once; return the push, its samples and the torque sent."""
         position = np.array(self._samples(self.line.listen(0.05)).position[-1])
         push = moving.plan(self.model, position, joint, angle)
         sequences, torques = [], []
@@ -226,13 +230,13 @@ class Examination:
             sequences.append(message.sequence)
             torques.append(torque)
 
-        heard = self.line.listen(push.duration, answer)
-        found = self._samples(heard)
-        self.line.disable(heard[-1].message)
+        received = self.line.listen(push.duration, answer)
+        found = self._samples(received)
+        self.line.disable(received[-1].message)
         return push, found, moving.sent_torque(found, sequences, torques)
 
     def _stop(self, push):
-        """Break off a jolt, then send what is to be refused."""
+        """Stop the torque in the middle of a jolt; then send torques that must be refused."""
         last = []
 
         def answer(at, message):
@@ -240,10 +244,10 @@ class Examination:
             self.line.send(message, torque)
             last[:] = message.sequence, torque
 
-        heard = self.line.listen(2.0 * JOLT, answer)
-        heard += self.line.listen(5.0 * self.tolerances.torque_timeout + 0.2)
+        received = self.line.listen(2.0 * JOLT, answer)
+        received += self.line.listen(5.0 * self.tolerances.torque_timeout + 0.2)
         self.findings.append(
-            moving.check_stop(self._samples(heard), *last, push.joint, self.tolerances)
+            moving.check_stop(self._samples(received), *last, push.joint, self.tolerances)
         )
         back = math.ceil(4.0 * self.tolerances.torque_timeout / max(self.samples.period, 1e-4))
         for kind, changes in {
@@ -252,28 +256,28 @@ class Examination:
             "old sequence": lambda m: {"sequence": (m.sequence - back) % 2**32},
         }.items():
             torque = push.jolt(0.0, JOLT)
-            heard = self.line.listen(
+            received = self.line.listen(
                 REFUSED, lambda _, m, c=changes, u=torque: self.line.send(m, u, **c(m))
             )
-            found = self._samples(heard)
+            found = self._samples(received)
             self.findings.append(moving.check_refused(kind, found, torque, push.joint))
-        self.line.disable(heard[-1].message)
+        self.line.disable(received[-1].message)
 
     def _rest(self):
-        """Under the safe action, until the bending has died away or a while has passed."""
+        """Wait under the safe action until the bending has decayed, at most 3 s."""
         for _ in range(10):
             last = self._samples(self.line.listen(0.3))
             if np.ptp(last.position, axis=0).max() < 1e-4:
                 return
 
-    def _samples(self, heard):
-        if not heard:
-            raise FlexarmError("the driver has stopped publishing arm_state")
-        return samples(self.arm, heard)
+    def _samples(self, received):
+        if not received:
+            raise FlexarmError("is no longer published by the driver", field="arm_state")
+        return samples(self.arm, received)
 
 
 def merged(findings):
-    """One finding for each check: the worst, in the order of their first."""
+    """The worst finding of each check, in the order in which the checks first came."""
     rank = [Verdict.SKIPPED, Verdict.PASS, Verdict.WARN, Verdict.FAIL]
     out = {}
     for f in findings:
@@ -283,12 +287,12 @@ def merged(findings):
 
 
 def check_driver(options):
-    """Run the checks, print them; exit code 1 when one fails.
+    """Run the checks and print them; return the exit code, 1 when one fails.
 
     Raises
     ------
     FlexarmError
-        When there is no driver, or a controller runs where motion is asked for.
+        When there is no driver, or when the arm is to be pushed while a controller runs.
     """
     arm_model = model.build(arm_file.load(options.arm))
     names = Tolerances.__dataclass_fields__
@@ -297,33 +301,31 @@ def check_driver(options):
     try:
         line.session.wait_for(
             "arm_state",
-            lambda: line.heard,
+            lambda: line.received,
             options.timeout,
             "start the driver, on this ROS_DOMAIN_ID",
         )
         if options.allow_motion:
             line.session.wait_for(
-                "a reader of joint_torque",
+                "a subscriber of joint_torque",
                 line.driver_listens,
                 options.timeout,
                 "the driver has to subscribe to it",
             )
             if not line.alone():
-                raise FlexarmError(
-                    "a controller sends joint_torque: stop it before the arm is pushed"
-                )
+                raise not_alone()
         examination = Examination(arm_model, line, tolerances)
         if examination.listen(options.duration) and options.allow_motion:
             examination.move(options.angle)
     finally:
-        if options.allow_motion and line.heard:
-            line.disable(line.heard[-1].message)
+        if options.allow_motion and line.received:
+            line.disable(line.received[-1].message)
         line.close()
     return report(merged(examination.findings), options.json)
 
 
 def report(findings, as_json=False):
-    """Print findings; the exit code."""
+    """Print findings and return the exit code."""
     failed = sum(f.verdict == Verdict.FAIL for f in findings)
     if as_json:
         print(json.dumps([{**f._asdict(), "verdict": f.verdict.value} for f in findings], indent=1))

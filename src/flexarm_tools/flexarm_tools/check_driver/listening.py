@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be said of a driver by listening: names, numbers, time, counts, strain of an arm at rest.
+"""Checks of a driver by listening: names, numbers, time, counts, strain of an arm at rest.
 
-Every check takes `Samples` and gives one `Finding`; none waits, moves or knows ROS. Medians and least values
-are judged, so that a machine that has no time for its reader does not make a driver fail.
+Every check takes `Samples` and returns one `Finding`; none waits, moves the arm or needs ROS. They judge medians and
+minima, so that a driver does not fail because this machine was too busy to read it.
 """
 
 from dataclasses import dataclass
@@ -16,30 +16,30 @@ from .samples import Finding, Verdict
 
 PASS, WARN, FAIL, SKIPPED = Verdict.PASS, Verdict.WARN, Verdict.FAIL, Verdict.SKIPPED
 
-#: Names, and the arrays that they name.
+#: Fields of names, and the arrays that they name.
 FIELDS = {
     "joint_names": ("joint_position", "joint_velocity", "joint_torque"),
     "gauge_names": ("strain",),
     "mode_names": ("modal_amplitude", "modal_rate"),
 }
-#: Stamps further from this machine's clock than this are of a clock of their own [s].
+#: Stamps further from this machine's clock than this belong to a separate clock [s].
 SAME_CLOCK = 3600.0
-#: An arm whose joints move less than this is at rest, one whose joints move more is in motion [rad].
+#: An arm is at rest when its joints move less than the first, and in motion when more than the second [rad].
 REST, MOTION = 2e-3, 5e-3
-#: An angle without limits is likelier to be in degrees or counts beyond this [rad].
+#: Beyond this, an angle without limits is probably in degrees or counts [rad].
 FAR = 4.0 * np.pi
-#: No gauge of metal reads such a strain [-].
+#: No metal gauge reads a larger strain [-].
 MICROSTRAIN = 0.05
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What is let pass.
+    """Limits of what passes.
 
     Attributes
     ----------
     rate : float or None
-        Samples per second that the driver is to have; None: whatever it has [Hz].
+        Expected samples per second [Hz]; None: any.
     rate_error : float
         Relative error of the rate [-].
     jitter : float
@@ -47,9 +47,9 @@ class Tolerances:
     age : float
         Age of a stamp when it arrives [s].
     gain : float
-        Relative error of what the arm does, beside its model [-].
+        Relative error of the arm's motion against its model [-].
     torque_timeout : float
-        Within this the driver is to take the safe action when torque stops [s].
+        Time within which the driver must take the safe action when torque stops [s].
     """
 
     rate: float | None = None
@@ -64,7 +64,7 @@ class Tolerances:
 
 
 def check_layout(arm, messages):
-    """Names against the arm file's, lengths against the names, shape by shape that occurred.
+    """Compare names with the arm file's, and lengths with the names, for each shape that occurred.
 
     Parameters
     ----------
@@ -100,20 +100,20 @@ def check_layout(arm, messages):
     if wrong:
         first = Finding("names", FAIL, f"{wrong[0]}: send the names of the arm file")
     elif order:
-        text = f"{order[0]} are in another order than the arm file's: they are sorted by name, at a cost"
+        text = f"{order[0]} are not in the arm file's order: sorting them by name costs time"
         first = Finding("names", WARN, text)
     else:
         first = Finding(
             "names", PASS, "joint, gauge and mode names are the arm file's, in its order"
         )
     if lengths:
-        text = f"{lengths[0]}: send one value per name, or an empty array for what is not known"
+        text = f"{lengths[0]}: send one value per name, or an empty array for what is unknown"
         return [first, Finding("lengths", FAIL, text)]
     return [first, Finding("lengths", PASS, "every array has one value per name, or none")]
 
 
 def _missing(arm, messages):
-    """What must not be empty and is."""
+    """Arrays that must not be empty, but are."""
     out = []
     if any(not len(m.joint_position) for m in messages):
         out.append(f"joint_position has 0 values for {len(arm.joints)} joint_names")
@@ -123,7 +123,7 @@ def _missing(arm, messages):
 
 
 def check_finite(arm, samples):
-    """Positions, velocities, strains and amplitudes that are no numbers."""
+    """All positions, velocities, strains and amplitudes are finite."""
     for what, values, names in (
         ("joint_position", samples.position, arm.joint_names),
         ("joint_velocity", samples.velocity, arm.joint_names),
@@ -135,7 +135,7 @@ def check_finite(arm, samples):
         count = (~np.isfinite(values)).sum(axis=0)
         i = int(np.argmax(count))
         text = (
-            f"{what} of {names[i]} is not finite in {count[i]} of {samples.size} samples: mend the"
+            f"{what} of {names[i]} is not finite in {count[i]} of {samples.size} samples: fix the"
             " sensor or its conversion"
         )
         return Finding("finite", FAIL, text)
@@ -146,17 +146,17 @@ def check_finite(arm, samples):
 
 
 def check_sequence(samples):
-    """One more with each sample; what is missing was lost on the way."""
+    """The sequence rises by one with each sample; gaps are samples lost on the way."""
     steps = np.diff(samples.sequence) % 2**32
     steps = steps[np.diff(samples.session) == 0]
     if not steps.size:
         return Finding("sequence", SKIPPED, "fewer than two samples of a session")
     middle = float(np.median(steps))
     if middle == 0:
-        text = "the sequence stands still: count each sample, and resume a source that is paused"
+        text = "the sequence stands still: count each sample; if the source is paused, resume it"
         return Finding("sequence", FAIL, text)
     if (steps >= 2**31).any() or middle != 1:
-        text = f"the sequence goes in steps of {middle:.0f}, or back: add 1 with each sample"
+        text = f"the sequence goes in steps of {middle:.0f}, or backwards: add 1 with each sample"
         return Finding("sequence", FAIL, text)
     lost = int((steps - 1).sum()) / int(steps.sum())
     text = "the sequence counts the samples"
@@ -169,10 +169,10 @@ def check_sequence(samples):
 
 
 def check_session(samples):
-    """One session while the driver runs."""
+    """There is one session while the driver runs."""
     sessions = np.unique(samples.session)
     if sessions.size > 1:
-        text = f"{sessions.size} sessions in one run: draw a session at the start, keep it until a restart"
+        text = f"{sessions.size} sessions in one run: draw a session at the start, and keep it until a restart"
         return Finding("session", FAIL, text)
     if sessions[0] < 2:
         text = f"the session is {sessions[0]}: draw one at each start, so that a restart is noticed"
@@ -181,32 +181,30 @@ def check_session(samples):
 
 
 def check_stamps(samples, tolerances):
-    """Stamps rise, and are of now."""
+    """Stamps rise and are recent."""
     steps = np.diff(samples.stamp)[np.diff(samples.sequence) != 0]
     if steps.size and (steps <= 0).any():
-        share = float((steps <= 0).mean())
-        text = (
-            f"{share:.0%} of the stamps do not rise: stamp each sample with its time of measurement"
-        )
+        fraction = float((steps <= 0).mean())
+        text = f"{fraction:.0%} of the stamps do not rise: stamp each sample with its time of measurement"
         return Finding("stamps", FAIL, text)
     age = 1e-9 * (samples.clock - samples.stamp)
     if abs(np.median(age)) > SAME_CLOCK:
         return _check_own_clock(samples)
     least = float(age.min())
     if least < -1e-3:
-        text = f"stamps are up to {-least:.3g} s in the future: take the time of measurement, on this clock"
-        # A few are a clock that is still being compared with this one.
+        text = f"stamps are up to {-least:.3g} s in the future: use the time of measurement, on this clock"
+        # A few come while the device's clock is still being compared with this one.
         return Finding("stamps", FAIL if np.median(age) < -1e-3 else WARN, text)
-    # The least: what a busy machine adds to the age is not the driver's.
+    # The minimum: the driver is not blamed for what a busy machine adds.
     if least > tolerances.age:
         text = (
-            f"stamps are at least {least:.3g} s old when they arrive, at most {tolerances.age:g} s is wanted:"
+            f"stamps are at least {least:.3g} s old when they arrive, allowed are {tolerances.age:g} s:"
             " stamp at the measurement and publish at once"
         )
         return Finding("stamps", FAIL, text)
     text = f"stamps rise and are {1e3 * float(np.median(age)):.1f} ms old when they arrive (median)"
     if np.median(age) > tolerances.age:
-        return Finding("stamps", WARN, f"{text}: the line or this machine is slow")
+        return Finding("stamps", WARN, f"{text}: the transport or this machine is slow")
     return Finding("stamps", PASS, text)
 
 
@@ -216,26 +214,24 @@ def _check_own_clock(samples):
     if not 0.1 < pace < 10.0:
         text = f"stamps advance {pace:.3g} s per second: stamps are nanoseconds of the time of measurement"
         return Finding("stamps", FAIL, text)
-    text = (
-        f"stamps rise, {pace:.2f} s per second, on a clock of their own: their age can't be judged"
-    )
+    text = f"stamps rise, {pace:.2f} s per second, on a separate clock: their age can't be judged"
     return Finding("stamps", PASS if abs(pace - 1.0) < 0.05 else WARN, text)
 
 
 def check_rate(samples, tolerances):
-    """Samples per second by stamps, which a slow reader does not change."""
+    """Samples per second, by stamps: a slow reader does not change them."""
     period = samples.period
     if period <= 0.0:
         return Finding("rate", FAIL, "no rate: stamps or sequence stand still")
     rate, wanted = 1.0 / period, tolerances.rate
     if wanted and abs(rate / wanted - 1.0) > tolerances.rate_error:
-        text = f"{rate:.1f} samples per second, {wanted:g} are wanted: set the device's rate"
+        text = f"{rate:.1f} samples per second, expected are {wanted:g}: set the device's rate"
         return Finding("rate", FAIL, text)
     return Finding("rate", PASS, f"{rate:.1f} samples per second")
 
 
 def check_jitter(samples, tolerances):
-    """Stamps beside the grid that the sequence counts."""
+    """Stamps compared with the grid that the sequence counts."""
     period = samples.period
     steps = np.diff(samples.sequence)
     steps, taken = steps[steps > 0], 1e-9 * np.diff(samples.stamp)[steps > 0]
@@ -243,12 +239,12 @@ def check_jitter(samples, tolerances):
         return Finding("jitter", SKIPPED, "too few samples, or stamps that stand still")
     off = np.abs(taken - steps * period) / period
     often, rare = float(np.median(off)), float(np.percentile(off, 99))
-    text = f"stamps are off their grid by {often:.1%} of a period (median), {rare:.1%} (99 of 100)"
+    text = f"stamps deviate from their grid by {often:.1%} of a period (median), {rare:.1%} (99th percentile)"
     if often > tolerances.jitter:
         return Finding("jitter", FAIL, f"{text}: stamp with the device's clock, not at reading")
     if rare > tolerances.jitter:
         return Finding(
-            "jitter", WARN, f"{text}: stamp with the device's clock, or ease the machine"
+            "jitter", WARN, f"{text}: stamp with the device's clock, or reduce the machine's load"
         )
     return Finding("jitter", PASS, text)
 
@@ -257,7 +253,7 @@ def check_jitter(samples, tolerances):
 
 
 def check_position(arm, samples):
-    """Angles where the joint can be."""
+    """Joint positions are within the joints' limits."""
     for i, joint in enumerate(arm.joints):
         low, high = joint.limits.position
         low, high = max(low, -FAR), min(high, FAR)
@@ -271,13 +267,13 @@ def check_position(arm, samples):
             f" {hint}"
         )
         return Finding("position", FAIL, text)
-    return Finding("position", PASS, "joint positions are where the joints can be")
+    return Finding("position", PASS, "joint positions are within the limits")
 
 
 def check_velocity(arm, samples):
-    """The integral of the velocity against the position."""
+    """The integrated velocity agrees with the position."""
     if samples.velocity is None:
-        return Finding("velocity", PASS, "joint_velocity is empty: the observer makes its own")
+        return Finding("velocity", PASS, "joint_velocity is empty: the observer estimates it")
     time = samples.time
     judged = []
     for i, name in enumerate(arm.joint_names):
@@ -295,7 +291,7 @@ def check_velocity(arm, samples):
         return Finding(
             "velocity", SKIPPED, "no joint moved: try --allow-motion, or move one by hand"
         )
-    return Finding("velocity", PASS, "joint velocities are the rates of the positions")
+    return Finding("velocity", PASS, "joint velocities are the derivatives of the positions")
 
 
 def _velocity_text(name, gain):
@@ -310,16 +306,16 @@ def _velocity_text(name, gain):
 
 
 def slope(y, x):
-    """Least-squares factor of y on x; 0 where x is 0."""
+    """Least-squares factor of y on x; 0 if x is 0."""
     square = float(x @ x)
     return float(y @ x) / square if square > 0.0 else 0.0
 
 
 def check_strain_at_rest(model, samples):
-    """Strains in their range, and at rest near those of the arm under its weight."""
+    """Strains are in their range, and at rest near those of the arm under its weight."""
     gauges = model.arm.gauges
     if samples.strain is None or not np.isfinite(samples.strain).all():
-        text = "no strain is published, or not all of it finite"
+        text = "no strain is published, or it is not all finite"
         return Finding("strain at rest", SKIPPED, text)
     greatest = np.abs(samples.strain).max(axis=0)
     i = int(np.argmax(greatest))
@@ -332,7 +328,7 @@ def check_strain_at_rest(model, samples):
         low, high = g.range
         stuck = float(((samples.strain[:, i] <= low) | (samples.strain[:, i] >= high)).mean())
         if stuck > 0.1:
-            text = f"strain of {g.name} is at the end of its range in {stuck:.0%} of the samples: mend its bridge"
+            text = f"strain of {g.name} is at the end of its range in {stuck:.0%} of the samples: fix its bridge"
             return Finding("strain at rest", FAIL, text)
     if np.ptp(samples.position, axis=0).max() > REST:
         return Finding("strain at rest", SKIPPED, "the arm is not at rest")
@@ -351,14 +347,14 @@ def check_strain_at_rest(model, samples):
 
 
 def check_frozen_strain(arm, samples, span=None):
-    """Strains that stay the same to the last bit while the joints move.
+    """Strains change while the joints move.
 
     Parameters
     ----------
     arm : Arm
     samples : Samples
     span : ndarray, shape (gauges,), optional
-        What the model's strains vary by over these samples; not given: a joint in motion bends every link.
+        Peak to peak of the model's strains over these samples; default: a joint in motion bends every link.
     """
     name = "frozen strain"
     if samples.strain is None:
@@ -366,7 +362,7 @@ def check_frozen_strain(arm, samples, span=None):
     if span is None:
         moves = np.ptp(samples.position, axis=0).max() > MOTION
         span = np.full(len(arm.gauges), np.inf if moves else 0.0)
-    # Readings of a coarse bridge may all round to one count.
+    # A coarse bridge may round all readings to one count.
     tells = span > 8.0 * np.array([g.uncertainty for g in arm.gauges])
     if not tells.any():
         return Finding(name, SKIPPED, "the arm did not bend enough: try --allow-motion")
@@ -374,17 +370,17 @@ def check_frozen_strain(arm, samples, span=None):
     frozen = [g.name for g, s in zip(arm.gauges, same, strict=True) if s]
     if frozen:
         text = (
-            f"strain of {', '.join(frozen)} did not change by a bit while the arm moved: is the converter"
-            " read anew for each sample?"
+            f"strain of {', '.join(frozen)} did not change at all while the arm moved: is the converter"
+            " read for each sample?"
         )
         return Finding(name, FAIL, text)
     return Finding(name, PASS, "strains change while the arm moves")
 
 
 def check_listening(model, samples, tolerances):
-    """All that listening can tell; `check_layout` has been passed.
+    """All checks of `samples` that need no motion, with the `tolerances` of the command line.
 
-    The `samples` are what was heard, the `tolerances` those of the command line.
+    `check_layout` must have passed.
 
     Returns
     -------

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a small push tells: signs, scales and order of joints, gauges and modes, beside the model's answer.
+r"""Checks of a driver by a small push: signs, scales and order of joints, gauges and modes, against the model.
 
 Joint j is pushed by one period of a sine,
 
 .. math:: u(t) = \bar u + A\,e_j\,\sin(2\pi t/T), \qquad B_{jj}\,A\,T^2/(2\pi) = \Delta q
 
 which leaves the slow subsystem (10) at rest, :math:`\Delta q` further; :math:`\bar u` holds the arm's weight. T is
-long beside the links' slowest period. The model of the arm file is moved by the same torque, from the driver's stamps
-and the torque it reports, and each measured signal y is put beside its prediction p: the factor
-:math:`y^Tp/p^Tp` is 1 where all is well.
+long compared with the links' slowest period. The model of the arm file moves under the same torque, by the driver's
+stamps and the torque it reports. Each measured signal y is compared with its prediction p: the factor
+:math:`y^Tp/p^Tp` is 1 if they agree.
 """
 
 from dataclasses import dataclass, replace
@@ -25,15 +25,15 @@ from .samples import Finding, Verdict
 
 PASS, WARN, FAIL, SKIPPED = Verdict.PASS, Verdict.WARN, Verdict.FAIL, Verdict.SKIPPED
 
-#: The push lasts so many periods of the slowest bending, and at least and at most so long [s].
-PERIODS, SHORTEST, LONGEST = 2.5, 0.5, 8.0
-#: Most of a joint's torque limit that a push takes [-].
-SHARE = 0.3
-#: Longest time without a sample in a push, as a share of it [-]: the torque over a longer one is anyone's guess.
-LONGEST_GAP = 0.05
-#: A signal is judged when its prediction spans so many of its resolutions.
+#: Duration of a push in periods of the slowest bending, and its limits [s].
+PERIODS, MIN_DURATION, MAX_DURATION = 2.5, 0.5, 8.0
+#: Maximum torque of a push, as a fraction of the joint's limit [-].
+MAX_TORQUE = 0.3
+#: Longest gap between samples, as a fraction of the push [-]; over a longer one the torque is unknown.
+MAX_GAP = 0.05
+#: A signal is judged if its prediction spans this many of its resolutions.
 RESOLUTIONS = 8.0
-#: A gauge or mode counts as silent below this share of the largest of its kind; it may be loud in another push.
+#: A gauge or mode below this fraction of the largest of its kind is not judged; another push may move it more.
 SILENT_GAUGE, SILENT_MODE = 0.1, 1e-3
 
 
@@ -51,7 +51,7 @@ class Push:
     hold : ndarray, shape (n,)
         What holds the arm's weight [N m].
     angle : float
-        How far it moves the joint, by the slow subsystem [rad].
+        Motion of the joint, by the slow subsystem [rad].
     """
 
     joint: int
@@ -68,14 +68,14 @@ class Push:
         return out
 
     def jolt(self, time, part):
-        """Half the amplitude forth for `part` seconds, then back: what comes to rest as it ends, (n,) [N m]."""
+        """Half the amplitude forth for `part` seconds, then back; it ends at rest after twice that, (n,) [N m]."""
         out = self.hold.copy()
         out[self.joint] += 0.5 * self.amplitude * (1.0 if time < part else -1.0)
         return out
 
 
 def plan(model, position, joint, angle=0.05):
-    """A `Push` of a joint by about `angle` [rad], less where that takes too much torque.
+    """A `Push` of a joint by about `angle` [rad], less if that takes too much torque.
 
     Parameters
     ----------
@@ -91,12 +91,12 @@ def plan(model, position, joint, angle=0.05):
     """
     terms = model.terms(np.asarray(position, float), np.zeros(model.n_joints))
     a, B = slow_subsystem(terms)
-    duration = SHORTEST
+    duration = MIN_DURATION
     if model.n_modes:
         speeds = np.abs(np.linalg.eigvals(fast_subsystem(terms)[0]))
-        duration = float(np.clip(PERIODS * 2.0 * np.pi / speeds.min(), SHORTEST, LONGEST))
+        duration = float(np.clip(PERIODS * 2.0 * np.pi / speeds.min(), MIN_DURATION, MAX_DURATION))
     reach = B[joint, joint] * duration**2 / (2.0 * np.pi)  # [rad/(N m)]
-    amplitude = min(angle / reach, SHARE * model.arm.joints[joint].limits.torque)
+    amplitude = min(angle / reach, MAX_TORQUE * model.arm.joints[joint].limits.torque)
     return Push(joint, amplitude, duration, -np.linalg.solve(B, a), amplitude * reach)
 
 
@@ -125,46 +125,44 @@ def sent_torque(samples, sequences, torques):
 
 
 def check_reported(arm, push, samples, sent):
-    """The reported torque beside the one sent."""
+    """The reported torque agrees with the one sent."""
     name, joint = "torque reported", arm.joint_names[push.joint]
     reported = samples.torque[:, push.joint]
     known = np.isfinite(reported)
     if known.mean() < 0.5:
-        text = f"the torque of {joint} is not known (NaN): send what was applied, observers use it"
+        text = f"the torque of {joint} is unknown (NaN): report what was applied, observers use it"
         return Finding(name, WARN, text)
     gain = slope(reported[known], sent[known, push.joint])
     if abs(gain) < 0.1:
         text = (
             f"the torque of {joint} stays {np.abs(reported[known]).max():.3g} N m while up to"
-            f" {np.abs(sent).max():.3g} is sent: torque is ignored, is the drive enabled?"
+            f" {np.abs(sent).max():.3g} is sent: torque is ignored: is the drive enabled?"
         )
         return Finding(name, FAIL, text)
     if gain < 0.0:
-        text = (
-            f"the torque of {joint} is reported with the wrong sign: the sign of what was asked for"
-        )
+        text = f"the torque of {joint} is reported with the wrong sign: it must have that of the torque sent"
         return Finding(name, FAIL, text)
     text = f"{joint} reports {gain:.2f} of the torque sent"
     if not 0.7 < gain < 1.4:
         return Finding(
-            name, FAIL, f"{text}: check the drive's scale and limits, and that all arrives"
+            name, FAIL, f"{text}: check the drive's scale and limits, and for lost messages"
         )
     return Finding(name, PASS, text)
 
 
 def replay(model, samples, sent, reported_holds):
-    """What the model does under the same torque, sample by sample.
+    """Motion of the model under the same torque, sample by sample.
 
     Parameters
     ----------
     model : ArmModel
     samples : Samples
-        The first one at rest, or nearly.
+        The first one at rest or nearly so.
     sent : ndarray, shape (N, n)
         See `sent_torque`.
     reported_holds : bool
-        Whether the reported torque is what was applied; else it is `sent`. Where it is zero though torque was sent,
-        the driver took the safe action, and so does the model.
+        Whether the reported torque was applied; otherwise `sent` was. Where the reported one is zero though torque was
+        sent, the driver took the safe action, and so does the model.
 
     Returns
     -------
@@ -196,16 +194,16 @@ def replay(model, samples, sent, reported_holds):
 
 
 def match(measured, predicted):
-    """Which prediction each measured signal is, up to its sign: the assignment with the least squares.
+    """Assign predictions to measured signals, up to sign, by least squares.
 
     `measured` and `predicted` are (N, k), a column per signal.
 
     Returns
     -------
     order : ndarray of int, shape (k,)
-        Signal i is prediction ``order[i]``.
+        Signal i fits prediction ``order[i]``.
     better : float
-        Sum of squares with each signal as its own prediction, over that of the assignment; 1 where they agree.
+        Sum of squares with each signal's own prediction over that of the assignment; 1 where they agree.
     """
     size = measured.shape[1]
     cost = np.array(
@@ -220,12 +218,12 @@ def match(measured, predicted):
     return order, 1.0 if not moved.any() else float(own / max(best, 1e-300))
 
 
-#: An exchange is believed when it explains the signals so many times better (squares).
+#: Two signals count as exchanged if that reduces the sum of squares by this factor.
 MUCH_BETTER = 4.0
 
 
 def check_order(what, names, measured, predicted):
-    """Signals that are named as others: a finding where two are exchanged, else None."""
+    """A finding if two signals are exchanged, otherwise None."""
     if len(names) < 2 or not np.ptp(predicted, axis=0).any():
         return None
     order, better = match(measured, predicted)
@@ -240,7 +238,7 @@ def check_order(what, names, measured, predicted):
 
 
 def check_response(arm, push, samples, position, gain_error):
-    """Whether the pushed joint moves the right way, about as far as the model.
+    """The pushed joint moves in the right direction, and about as far as the model.
 
     Parameters
     ----------
@@ -249,7 +247,7 @@ def check_response(arm, push, samples, position, gain_error):
     samples : Samples
         Since the push began.
     gain_error : float
-        How far measured over predicted motion may be off 1 [-].
+        Allowed deviation from 1 of measured over predicted motion [-].
     position : ndarray, shape (N, n)
         Of the model [rad], see `replay`.
     """
@@ -267,7 +265,7 @@ def check_response(arm, push, samples, position, gain_error):
         why = "torque is ignored: is the drive enabled, the brake open, the encoder alive?"
         return Finding(name, FAIL, f"{text}: {why}")
     if gain < 0.0:
-        why = "wrong sign: turn the sign of the position's or of the torque's scale, not of both"
+        why = "wrong sign: reverse the sign of the position's or of the torque's scale, not of both"
         return Finding(name, FAIL, f"{text}: {why}")
     if 25.0 < gain < 110.0:
         return Finding(name, FAIL, f"{text}: position is in degrees, send rad")
@@ -278,7 +276,7 @@ def check_response(arm, push, samples, position, gain_error):
 
 
 def check_strain_response(model, samples, deflection, gain_error):
-    """Whether the gauges bend the right way, each under its own name."""
+    """The gauges read the right sign, scale and link, each under its own name."""
     name, arm = "strain response", model.arm
     if samples.strain is None:
         return [Finding(name, SKIPPED, "no strain is published, or not all of it finite")]
@@ -304,7 +302,7 @@ def check_strain_response(model, samples, deflection, gain_error):
 
 
 def check_modes(model, samples, deflection, gain_error):
-    """Modal amplitudes, where the driver sends them, beside the strain map's and the model's."""
+    """Modal amplitudes, if the driver sends them, agree with the strain map and the model."""
     name, arm = "modes", model.arm
     if samples.amplitude is None:
         text = "no modal_amplitude is published: the observer maps the strain"
@@ -313,7 +311,7 @@ def check_modes(model, samples, deflection, gain_error):
         strain_map = StrainMap(model)
         expected = np.array([strain_map.amplitudes(s) for s in _strains(model, deflection)])
         if samples.strain is not None:
-            # What the strains give is known better than what the model does: noise and all.
+            # The strains, with their noise, are a better reference than the model.
             expected = np.array([strain_map.amplitudes(s) for s in samples.strain])
     else:
         expected = deflection[:, [model.mode_names.index(n) for n in arm.observed_modes]]
@@ -324,26 +322,28 @@ def check_modes(model, samples, deflection, gain_error):
 
 
 def _strains(model, deflection):
-    """Strains of the model, biases aside, shape (N, gauges)."""
+    """Strains of the model without biases, shape (N, gauges)."""
     gauges = model.arm.gauges
     return deflection @ (gauge_rows(model, gauges) * np.array([[g.gain] for g in gauges])).T
 
 
 def _signals(name, what, names, measured, expected, least, gain_error):
-    """Order, sign and scale of several signals beside their predictions."""
+    """Order, sign and scale of several signals agree with their predictions."""
     exchanged = check_order(what, names, measured, expected)
     if exchanged is not None:
         return exchanged
     span = np.ptp(expected, axis=0)
     judged = span > least
     if not judged.any():
-        text = f"the push bends the arm less than a {what} can tell: raise --angle"
+        text = f"the push bends the arm too little for any {what}: raise --angle"
         return Finding(name, SKIPPED, text)
     gains = {n: slope(measured[:, i], expected[:, i]) for i, n in enumerate(names) if judged[i]}
     for n, gain in gains.items():
         text = f"{what} {n} reads {gain:.3g} times what its model does"
         if gain < -0.05:
-            why = "wrong sign: turn the sign of its scale, or of surface_distance in the arm file"
+            why = (
+                "wrong sign: reverse the sign of its scale, or of surface_distance in the arm file"
+            )
             return Finding(name, FAIL, f"{text}: {why}")
         if abs(gain - 1.0) > gain_error:
             why = "check its scale (m/m), and gain, position and stiffness in the arm file"
@@ -353,13 +353,13 @@ def _signals(name, what, names, measured, expected, least, gain_error):
 
 
 def unseen(push, samples):
-    """Longest time without a sample while a joint was pushed [s]; 0 where it is short enough to judge the push."""
+    """Longest gap between samples in a push [s]; 0 if it is short enough to judge the push."""
     gap = float(np.diff(samples.time).max(initial=0.0))
-    return gap if gap > max(LONGEST_GAP * push.duration, 1.5 * samples.period) else 0.0
+    return gap if gap > max(MAX_GAP * push.duration, 1.5 * samples.period) else 0.0
 
 
 def check_push(model, push, samples, sent, tolerances):
-    """All that one push can tell.
+    """All checks of one push.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ def check_push(model, push, samples, sent, tolerances):
             " can't be judged: lower the rate, or give the machine more time"
         )
         return [Finding("response", SKIPPED, text)]
-    # Broken ones have been named by `check_finite`.
+    # `check_finite` has reported the others.
     kept = {k: getattr(samples, k) for k in ("velocity", "strain", "amplitude")}
     kept = {k: v if v is None or np.isfinite(v).all() else None for k, v in kept.items()}
     samples = replace(samples, **kept)
@@ -401,7 +401,7 @@ def check_push(model, push, samples, sent, tolerances):
     response = check_response(arm, push, samples, position, tolerances.gain)
     findings = [reported, response, velocity]
     if response.verdict == FAIL:
-        # Strains of an arm that does not do what its model does would be blamed for it.
+        # When the arm does not move as its model, its strains would be blamed for it.
         return findings
     findings += check_strain_response(model, samples, deflection, tolerances.gain)
     findings.append(check_modes(model, samples, deflection, tolerances.gain))
@@ -411,13 +411,13 @@ def check_push(model, push, samples, sent, tolerances):
 # When torque stops -----------------------------------------------------------------------------------
 
 
-def _share(samples, sent, joint):
-    """Reported torque of a joint over what was sent, (N,); 0 where it is not known, so not the torque sent."""
+def _ratio(samples, sent, joint):
+    """Reported torque of a joint over the torque sent, (N,); 0 where it is unknown."""
     return np.nan_to_num(samples.torque[:, joint] / sent[joint])
 
 
 def check_stop(samples, last, sent, joint, tolerances):
-    """The torque ends when no more comes.
+    """The torque ends when no new one comes.
 
     Parameters
     ----------
@@ -431,35 +431,35 @@ def check_stop(samples, last, sent, joint, tolerances):
     tolerances : Tolerances
     """
     name = "torque stops"
-    share = _share(samples, sent, joint)
+    ratio = _ratio(samples, sent, joint)
     before, after = samples.sequence <= last + 2, samples.sequence > last
-    if not (share[before][-5:] > 0.5).any():
-        text = "no torque was reported before it stopped: nothing to judge the watchdog by"
+    if not (ratio[before][-5:] > 0.5).any():
+        text = "no torque was reported before it stopped: the watchdog can't be judged"
         return Finding(name, SKIPPED, text)
     since = 1e-9 * (samples.stamp - samples.stamp[samples.sequence <= last][-1])
-    held = after & (share > 0.5)
+    held = after & (ratio > 0.5)
     on = float(since[held].max(initial=0.0))
     limit = tolerances.torque_timeout + 2.0 * samples.period + 0.02
     text = f"the torque went on for {on:.3f} s after the last one was sent"
     if held[-1] or on > 5.0 * limit:
         why = "take the safe action when no fresh torque has come for the timeout"
-        return Finding(name, FAIL, f"{text}, {tolerances.torque_timeout:g} s is wanted: {why}")
+        return Finding(name, FAIL, f"{text}, allowed are {tolerances.torque_timeout:g} s: {why}")
     if on > limit:
-        why = "shorten the watchdog's period, or ease the machine"
-        return Finding(name, WARN, f"{text}, {tolerances.torque_timeout:g} s is wanted: {why}")
+        why = "shorten the watchdog's period, or reduce the machine's load"
+        return Finding(name, WARN, f"{text}, allowed are {tolerances.torque_timeout:g} s: {why}")
     return Finding(name, PASS, text)
 
 
-#: What is sent that must not be applied, and why.
+#: Torques that must not be applied, and why.
 REFUSALS = {
     "DISABLED": "mode DISABLED means the safe action, whatever torque comes with it",
-    "wrong session": "a torque of another session answers a state of before the restart",
+    "wrong session": "a torque of another session answers a state from before the restart",
     "old sequence": "a torque that answers a state older than the timeout is too late",
 }
 
 
 def check_refused(kind, samples, sent, joint):
-    """A torque that must not be applied was not.
+    """A torque that must not be applied is not applied.
 
     Parameters
     ----------
@@ -472,7 +472,9 @@ def check_refused(kind, samples, sent, joint):
     joint : int
     """
     if not np.isfinite(samples.torque[:, joint]).any():
-        return Finding(kind, SKIPPED, "the torque is not known: can't tell whether it was applied")
-    if (_share(samples, sent, joint) > 0.5).any():
+        return Finding(
+            kind, SKIPPED, "the torque is unknown, so it can't be judged whether it was applied"
+        )
+    if (_ratio(samples, sent, joint) > 0.5).any():
         return Finding(kind, FAIL, f"it was applied: {REFUSALS[kind]}")
     return Finding(kind, PASS, f"not applied: {REFUSALS[kind]}")

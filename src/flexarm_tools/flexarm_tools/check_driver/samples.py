@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Verdict(str, Enum):
-    """What a check says. SKIPPED: there was nothing to judge it by."""
+    """Outcome of a check. SKIPPED: the samples did not allow a judgement."""
 
     PASS = "PASS"
     WARN = "WARN"
@@ -25,7 +25,7 @@ class Finding(NamedTuple):
     check : str
     verdict : Verdict
     text : str
-        What was seen, and what to do about it.
+        What was found, and what to do about it.
     """
 
     check: str
@@ -35,14 +35,14 @@ class Finding(NamedTuple):
 
 @dataclass
 class Samples:
-    """Samples of a driver in the order they came, N of them; columns in the arm file's order.
+    """N samples of a driver in the order of arrival; columns in the arm file's order.
 
     Attributes
     ----------
     arrival : ndarray, shape (N,)
         Time of arrival on a steady clock [s].
     clock : ndarray of int64, shape (N,)
-        The same on the clock that stamps are of [ns].
+        The same on the clock of the stamps [ns].
     stamp : ndarray of int64, shape (N,)
         [ns]
     session, sequence : ndarray of int64, shape (N,)
@@ -80,7 +80,7 @@ class Samples:
 
     @property
     def period(self):
-        """Median time between two samples by their stamps; 0 where stamps stand still [s]."""
+        """Median time between two samples by their stamps [s]; 0 where the sequence stands still."""
         steps = np.diff(self.sequence)
         advancing = steps > 0
         if not advancing.any():
@@ -88,27 +88,27 @@ class Samples:
         return float(np.median(1e-9 * np.diff(self.stamp)[advancing] / steps[advancing]))
 
 
-class Heard(NamedTuple):
-    """A message and when it came."""
+class Received(NamedTuple):
+    """A message and its time of arrival."""
 
     message: object  # flexarm_msgs/ArmState
     arrival: float  # [s] steady clock
     clock: int  # [ns]
 
 
-def samples(arm, heard):
+def samples(arm, received):
     """`Samples` of messages whose names and lengths are right (see `check_layout`).
 
     Parameters
     ----------
     arm : Arm
-    heard : sequence of Heard
+    received : sequence of Received
 
     Returns
     -------
     Samples
     """
-    messages = [h.message for h in heard]
+    messages = [h.message for h in received]
 
     def columns(field, names, wanted):
         first = messages[0]
@@ -125,8 +125,8 @@ def samples(arm, heard):
     torque = columns("joint_torque", "joint_names", arm.joint_names)
     position = columns("joint_position", "joint_names", arm.joint_names)
     return Samples(
-        arrival=np.array([h.arrival for h in heard]),
-        clock=head(h.clock for h in heard),
+        arrival=np.array([h.arrival for h in received]),
+        clock=head(h.clock for h in received),
         stamp=head(m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec for m in messages),
         session=head(m.session for m in messages),
         sequence=head(m.sequence for m in messages),
