@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many simulations at once on all cores: other initial states, other torques, other arms."""
+"""Many simulations in parallel: different initial states, torques or arms."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -12,16 +12,16 @@ from . import integrators
 
 
 def simulate(models, states, starts, ends, step, substeps=1, method="rk4", workers=None):
-    """Trajectories of many arms or of one arm from many states.
+    """Simulate many arms, or one arm from many states.
 
     Parameters
     ----------
     models : ArmModel or sequence of ArmModel
-        One for all, or one each, all with as many joints and modes.
+        One for all, or one each with the same numbers of joints and modes.
     states : ndarray, shape (b, 2 (n + m))
         Initial (q, delta, qd, delta_d).
     starts, ends : ndarray, shape (s, n) or (b, s, n)
-        Torque at both ends of each interval of ``substeps * step`` seconds, linear between [N m].
+        Torque at both ends of each interval of ``substeps * step`` seconds, linear between them [N m].
     step : float
         [s]
     substeps : int
@@ -29,35 +29,35 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
     method : str
         One of `integrators.METHODS`.
     workers : int, optional
-        Threads; as many as there are cores if not given. The compiled loops run without the interpreter's
-        lock.
+        Number of threads; default: that of the cores. The compiled loops release the interpreter's lock.
 
     Returns
     -------
     ndarray, shape (b, s + 1, 2 (n + m))
-        What is no longer finite went beyond what the model or the step holds for.
+        Values that are not finite are beyond the range of the model or the step.
 
     Raises
     ------
     ShapeError
-        For arrays that don't fit the models.
+        For arrays that do not fit the models.
     """
     states = np.atleast_2d(np.asarray(states, float))
     count, size = states.shape
     each = list(models) if isinstance(models, (list, tuple)) else [models] * count
     if len(each) != count:
-        raise ShapeError(f"{len(each)} models for {count} initial states")
+        raise ShapeError("must be one per state", field="models", value=len(each), limit=count)
     for model in each:
         if 2 * (model.n_joints + model.n_modes) != size:
+            entries = 2 * (model.n_joints + model.n_modes)
             raise ShapeError(
-                f"{model.arm.name}: states have {size} entries, wanted"
-                f" {2 * (model.n_joints + model.n_modes)}"
+                f"entries do not fit {model.arm.name}", field="states", value=size, limit=entries
             )
     first = models[0] if isinstance(models, (list, tuple)) and models else models
     n = getattr(first, "n_joints", 0)
     starts, ends = (np.asarray(torque, float) for torque in (starts, ends))
     if starts.shape != ends.shape or starts.ndim not in (2, 3) or starts.shape[-1] != n:
-        raise ShapeError(f"torque has shapes {starts.shape} and {ends.shape}, wanted (..., {n})")
+        shapes = (starts.shape, ends.shape)
+        raise ShapeError("are wrong shapes", field="torque", value=shapes, limit=f"(..., {n})")
     starts = np.ascontiguousarray(np.broadcast_to(starts, (count, *starts.shape[-2:])))
     ends = np.ascontiguousarray(np.broadcast_to(ends, starts.shape))
     out = np.empty((count, starts.shape[1] + 1, size))
@@ -73,6 +73,6 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
 
     workers = min(workers or os.cpu_count() or 1, count) or 1
     with ThreadPoolExecutor(workers) as pool:
-        # Each thread takes every so manieth run: chunks of equal cost whatever the order.
+        # Interleaved chunks cost the same whatever the order of the runs.
         list(pool.map(run, [range(k, count, workers) for k in range(workers)]))
     return out

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Brakes that stick: an arm without drive torque under Coulomb's law, without smoothing.
+r"""Brakes that stick: an arm without drive torque under Coulomb's law without smoothing.
 
-Brake i, of torque :math:`T_i`, gives :math:`-T_i\,\mathrm{sign}\,\dot q_i` while its joint turns. A joint at rest it
-holds with what that takes, up to :math:`T_i`. With the accelerations a of the joints at rest when their brakes give
-nothing, and H of (3) for those joints, the brakes' torques :math:`\lambda` are the only ones with
+Brake i, of torque :math:`T_i`, gives :math:`-T_i\,\mathrm{sign}\,\dot q_i` while its joint turns. It holds a joint
+at rest with the torque that is needed, up to :math:`T_i`. Let a be the accelerations of the joints at rest without
+their brakes, and H that of (3) for those joints. The brakes' torques :math:`\lambda` are the only ones with
 
 .. math::
     \ddot q = a + H\lambda, \qquad \ddot q_i = 0 \text{ and } |\lambda_i|\le T_i, \quad\text{or}\quad
@@ -12,8 +12,8 @@ nothing, and H of (3) for those joints, the brakes' torques :math:`\lambda` are 
 They minimise :math:`\tfrac12\lambda^TH\lambda + a^T\lambda` over a box (Gauss's least constraint); H is positive
 definite, and principal pivoting by the least index finds them (Murty 1974, Math. Program. 7, 367-370).
 
-Joints that stick are locked: taken out of the equations of motion, so that they rest to the last bit. A step within
-which a joint stops is cut there.
+Joints that stick are locked: they are taken out of the equations of motion, so that they rest to the last bit. A step
+in which a joint stops is divided there.
 """
 
 import math
@@ -24,69 +24,69 @@ from flexarm_dynamics.models.fixed_step import METHODS
 
 from . import integrators
 
-#: A joint has stopped when its speed is this share of what it was at the start of the step.
+#: A joint has stopped when its speed is this fraction of that at the start of the step.
 STOPPED = 1e-11
-#: What is left of a step and shorter than this share of it is not integrated.
+#: A rest of a step shorter than this fraction of it is not integrated.
 SLIVER = 1e-12
-#: While every brake holds, that is looked at so often [s].
-LOOK = 1e-3
-#: A brake that holds with less than this share of its torque does so without being solved for anew.
-SAFE_SHARE = 0.8
-#: Bounds of loops that end long before.
-PIVOTS, REFINEMENTS = 100, 80
+#: While every brake holds, this is checked at this interval [s].
+CHECK_INTERVAL = 1e-3
+#: A brake that holds with less than this fraction of its torque need not be solved for again.
+SAFE_FRACTION = 0.8
+#: Limits of loops that end long before.
+MAX_PIVOTS, MAX_REFINEMENTS = 100, 80
 
 
 def pivot(acceleration, response):
-    """Shares of their torque that brakes give joints at rest.
+    """Torques of brakes on joints at rest, as fractions of their full torque.
 
     Parameters
     ----------
     acceleration : ndarray, shape (k,)
-        When the brakes give nothing [rad/s^2].
+        Without the brakes [rad/s^2].
     response : ndarray, shape (k, k)
-        What the whole torque of each brake adds to it, by columns [rad/s^2].
+        What the full torque of each brake adds to it, by columns [rad/s^2].
 
     Returns
     -------
-    share : ndarray, shape (k,)
+    fraction : ndarray, shape (k,)
         From -1 to 1.
     slips : ndarray of int, shape (k,)
-        0: sticks; else the sign of the joint's acceleration.
+        0: it sticks; otherwise the sign of the joint's acceleration.
     """
     slips = np.zeros(acceleration.size, int)
-    for _ in range(PIVOTS):
+    for _ in range(MAX_PIVOTS):
         sticks = slips == 0
-        share = -slips.astype(float)
-        rest = acceleration + response @ share
-        share[sticks] = np.linalg.solve(response[np.ix_(sticks, sticks)], -rest[sticks])
-        slip = acceleration + response @ share
-        wrong = np.flatnonzero(np.where(sticks, np.abs(share) > 1.0, slip * slips < 0.0))
+        fraction = -slips.astype(float)
+        rest = acceleration + response @ fraction
+        fraction[sticks] = np.linalg.solve(response[np.ix_(sticks, sticks)], -rest[sticks])
+        slip = acceleration + response @ fraction
+        wrong = np.flatnonzero(np.where(sticks, np.abs(fraction) > 1.0, slip * slips < 0.0))
         if not wrong.size:
             break
         first = wrong[0]
-        slips[first] = -np.sign(share[first]) if sticks[first] else 0
-    return share, slips
+        slips[first] = -np.sign(fraction[first]) if sticks[first] else 0
+    return fraction, slips
 
 
 class Brakes:
-    """Steps of an arm whose joints are braked.
+    """Integrates an arm whose joints are braked.
 
     Parameters
     ----------
     model : ArmModel
     period : float
-        Of `advance` [s].
+        Period of `advance` [s].
     torque : ndarray, shape (n,)
-        Of each brake; 0: none [N m].
+        Torque of each brake [N m]; 0: none.
     friction : ndarray, shape (n, 3)
-        Of all joints, brakes aside: as `ArmModel.friction_table`.
+        Friction of all joints without brakes, as `ArmModel.friction_table`.
     implicit : bool
-        For modes too fast for an explicit method.
+        Use the implicit method, for modes too fast for an explicit one.
 
     Attributes
     ----------
     side : ndarray of int, shape (n,)
-        What each brake did last: 0 it held; 1, -1 its joint turned that way; 2: it has none.
+        Last state of each brake: 0 it held; 1, -1 its joint turned in this direction; 2: there is none.
     """
 
     #: `side` of a joint without brake.
@@ -104,18 +104,18 @@ class Brakes:
         self._known, self._at = None, np.zeros(n)
 
     def refine(self, factor):
-        """Take so many times the substeps."""
+        """Multiply the substeps by `factor`."""
         self.substeps *= factor
 
-    def advance(self, state, share=1.0):
-        """Advance `state`, (2 (n + m),), in place by a share of a period.
+    def advance(self, state, fraction=1.0):
+        """Advance `state`, (2 (n + m),), in place by a fraction of a period.
 
-        Brakes at rest are looked at every `LOOK` seconds, or substep where those are longer; while a joint turns,
-        every substep.
+        Brakes are checked at each substep while a joint turns, and every `CHECK_INTERVAL` (or substep, if that is
+        longer) while all hold.
         """
-        count = max(1, math.ceil(share * self.substeps))
-        step = share * self.period / count
-        at_once = max(1, int(LOOK / step))
+        count = max(1, math.ceil(fraction * self.substeps))
+        step = fraction * self.period / count
+        at_once = max(1, int(CHECK_INTERVAL / step))
         while count > 0 and np.isfinite(state).all():
             self._settle(state)
             moving = (self.side != 0) & self._has
@@ -127,12 +127,12 @@ class Brakes:
             count -= many
 
     def _cut_step(self, state, step):
-        """One substep, cut where joints stop; `_settle` has been called."""
+        """Integrate one substep, divided where joints stop; call `_settle` before."""
         left = step
         for _ in range(4 * self.side.size + 4):
             start = state.copy()
             self._stretch(state, left)
-            # A joint that left rest can't turn the other way: it sticks after all.
+            # A joint that left rest can't turn in the other direction: it sticks after all.
             while (back := self._left_rest(start) & (state[self._rates] * self.side < 0.0)).any():
                 self.side[back] = 0
                 state[:] = start
@@ -148,9 +148,9 @@ class Brakes:
             self._settle(state)
 
     def _stop(self, state, start, length, after):
-        """Leave the state where the first joint stops, by the Illinois method; the time that takes [s]."""
+        """Integrate until the first joint stops, by the Illinois method; return the time taken [s]."""
         low, high, before, last, reached = 0.0, length, 1.0, 0, length
-        for _ in range(REFINEMENTS):
+        for _ in range(MAX_REFINEMENTS):
             reached = (low * after - high * before) / (after - before)
             state[:] = start
             self._stretch(state, reached)
@@ -172,12 +172,12 @@ class Brakes:
         return self._has & (self.side != 0) & (start[self._rates] == 0.0)
 
     def _slowest(self, state, start):
-        """Least of the turning joints' speeds, each over that at the start; below zero: it has turned back."""
+        """Minimum speed of the turning joints, relative to the start; negative: a joint has turned back."""
         turns = self._turns(start)
         return (state[self._rates][turns] / start[self._rates][turns]).min(initial=np.inf)
 
     def _stretch(self, state, step, count=1):
-        """Steps in which no brake changes what it does."""
+        """Integrate steps in which no brake changes its state."""
         self._step.lock(self.side == 0)
         self._step(state, self._pull(), step, count, self.friction)
 
@@ -188,7 +188,7 @@ class Brakes:
     # Who sticks --------------------------------------------------------------------------------
 
     def _settle(self, state):
-        """Decide what each brake does."""
+        """Determine the state of each brake."""
         rates = state[self._rates]
         resting = self._has & (rates == 0.0)
         self.side[:] = np.where(self._has, np.sign(rates), self.FREE)
@@ -196,7 +196,7 @@ class Brakes:
             return
         viscous, coulomb, smoothing = self.friction.T
         friction = viscous * rates + coulomb * np.tanh(rates / smoothing)
-        pull = self._pull() - friction + self.model.friction(rates)  # the model has that of its own
+        pull = self._pull() - friction + self.model.friction(rates)  # the model adds its own
         free = self.model.derivative(state, pull)[self._rates]
         where = np.flatnonzero(resting)
         if self._holds(free[where], where, state):
@@ -211,9 +211,9 @@ class Brakes:
         self.side[where] = pivot(free[where], response)[1]
 
     def _holds(self, free, where, state):
-        """Whether all brakes at rest hold by far, by what was known of the arm in this pose."""
+        """Whether all brakes at rest hold with a margin, by the solution kept for this pose."""
         if self._known is None:
             return False
         joints, inverse, pose = self._known
         same = np.array_equal(joints, where) and np.array_equal(pose, state[: pose.size])
-        return same and bool(np.abs(inverse @ free).max() < SAFE_SHARE)
+        return same and bool(np.abs(inverse @ free).max() < SAFE_FRACTION)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults put into what the simulator publishes, so that the answers to them can be tested; the plant knows nothing.
+"""Faults in what the simulator publishes, to test how observer and controller respond to them.
 
-A fault is one line, "SIGNAL KIND [key=value ...]", as docs/fault_injection.md lists them. Times are simulated
-seconds since the start of the session; the same lines and seeds give the same messages. Nothing here knows ROS.
+A fault is one line, "SIGNAL KIND [key=value ...]", see docs/fault_injection.md. Times are simulated seconds since
+the start of the session. The same lines and seeds give the same messages. The plant is not affected. This module
+needs no ROS.
 """
 
 import math
@@ -13,10 +14,10 @@ import numpy as np
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.shown import show
 
-#: What the kind `huge` reads.
+#: Value of the kind `huge`.
 HUGE = 1e12
-#: The longest delay [s].
-LONGEST_DELAY = 10.0
+#: [s]
+MAX_DELAY = 10.0
 
 #: Field to the names of its entries.
 FIELDS = {
@@ -27,7 +28,7 @@ FIELDS = {
     "modal_amplitude": "mode_names",
 }
 WINDOW = ("from", "for")
-#: Of one or all entries of a field: keys, and which of them have to be there.
+#: Kinds for one or all entries of a field: their keys, and those that are required.
 VALUE_KINDS = {
     "nan": ((), ()),
     "inf": ((), ()),
@@ -37,9 +38,9 @@ VALUE_KINDS = {
     "saturate": (("at",), ("at",)),
     "delay": (("by",), ("by",)),
 }
-#: Of a whole field.
+#: Kinds for a whole field.
 FIELD_KINDS = {"drop": ((), ()), "short": ((), ()), "long": ((), ())}
-#: Of the other signals.
+#: Kinds for the other signals.
 OTHER_KINDS = {
     "state": {
         "drop": (("share", "seed"), ()),
@@ -55,7 +56,7 @@ OTHER_KINDS = {
 
 @dataclass
 class Sample:
-    """What one `arm_state` says.
+    """Contents of one `arm_state`.
 
     Attributes
     ----------
@@ -63,7 +64,7 @@ class Sample:
     names : dict of str to list of str
         ``joint_names``, ``gauge_names``, ``mode_names``.
     values : dict of str to ndarray or None
-        `FIELDS` and ``modal_rate``; None: not known, empty on the topic.
+        `FIELDS` and ``modal_rate``; None: unknown, empty on the topic.
     """
 
     sequence: int
@@ -80,7 +81,7 @@ class Fault:
     ----------
     signal, kind : str
     entry : str
-        Joint, gauge or mode; empty: all of the field.
+        Joint, gauge or mode; empty: the whole field.
     keys : tuple of (str, float)
         As given.
     """
@@ -95,11 +96,11 @@ class Fault:
         return " ".join([where, self.kind, *(f"{k}={v!r}" for k, v in self.keys)])
 
     def get(self, key, default):
-        """Value of a key."""
+        """The value of a key, or `default`."""
         return dict(self.keys).get(key, default)
 
     def acts(self, time):
-        """Whether it acts at `time` [s]; a sample's time is taken to the nanosecond."""
+        """Whether it acts at `time` [s], which counts to the nanosecond."""
         begin = self.get("at", 0.0) if self.signal == "clock" else self.get("from", 0.0)
         return begin - 1e-9 <= time < begin + self.get("for", math.inf) - 1e-9
 
@@ -111,7 +112,7 @@ def parse(text, arm):
     ----------
     text : str
     arm : Arm
-        Whose joints, gauges and modes there are.
+        Its joints, gauges and modes may be named.
 
     Returns
     -------
@@ -120,28 +121,28 @@ def parse(text, arm):
     Raises
     ------
     ParameterError
-        Naming the line, the word, and what may stand there.
+        With the word as its value, and what is allowed there.
     """
 
-    def refuse(word, allowed):
-        raise ParameterError(f"faults: {show(text)}: {show(word)}: {allowed}")
+    def refuse(word, problem, limit=None):
+        raise ParameterError(f"in {show(text)}: {problem}", field="faults", value=word, limit=limit)
 
     words = text.split()
     if len(words) < 2:
         refuse(text, 'a fault is "SIGNAL KIND [key=value ...]"')
     signal, dot, entry = words[0].partition(".")
     if signal not in FIELDS and signal not in OTHER_KINDS:
-        refuse(words[0], f"no such signal; there are {', '.join((*FIELDS, *OTHER_KINDS))}")
+        refuse(words[0], "no such signal", ", ".join((*FIELDS, *OTHER_KINDS)))
     if dot and signal not in FIELDS:
         refuse(words[0], f"{signal} has no parts")
     if dot:
         names = _names(arm)[FIELDS[signal]]
         if entry not in names:
-            refuse(words[0], f"{signal} is of {', '.join(names) or 'nothing on this arm'}")
+            refuse(words[0], f"{signal} has no such entry", ", ".join(names) or "none on this arm")
     kinds = OTHER_KINDS.get(signal) or (VALUE_KINDS if dot else {**FIELD_KINDS, **VALUE_KINDS})
     if words[1] not in kinds:
-        more = " (one entry can't be missing: take nan)" if dot and words[1] in FIELD_KINDS else ""
-        refuse(words[1], f"{words[0]} can be {', '.join(kinds)}{more}")
+        more = ": one entry can't be missing, use nan" if dot and words[1] in FIELD_KINDS else ""
+        refuse(words[1], f"no kind of {words[0]}{more}", ", ".join(kinds))
     allowed, needed = kinds[words[1]]
     if signal != "clock":
         allowed = (*allowed, *WINDOW)
@@ -149,10 +150,12 @@ def parse(text, arm):
     for word in words[2:]:
         key, equals, value = word.partition("=")
         if key not in allowed or not equals:
-            refuse(word, f"{words[1]} takes {', '.join(f'{k}=…' for k in allowed)}")
+            refuse(word, f"no key of {words[1]}", ", ".join(f"{k}=…" for k in allowed))
         if key in keys:
             refuse(word, f"{key} is given twice")
-        keys[key] = _number(key, value, signal, words[1], lambda why, word=word: refuse(word, why))
+        keys[key] = _number(
+            key, value, signal, words[1], lambda *why, word=word: refuse(word, *why)
+        )
     for key in needed:
         if key not in keys:
             refuse(words[1], f"needs {key}=…")
@@ -160,7 +163,7 @@ def parse(text, arm):
 
 
 def _number(key, text, signal, kind, refuse):
-    """The checked value of a key."""
+    """The value of a key, checked."""
     try:
         value = int(text) if key == "seed" else float(text)
     except (ValueError, OverflowError):
@@ -177,9 +180,9 @@ def _number(key, text, signal, kind, refuse):
     elif key == "seed":
         low, high = 0, 2**31 - 1
     elif kind == "delay":
-        low, high = 1e-9, LONGEST_DELAY
+        low, high = 1e-9, MAX_DELAY
     if not low <= value <= high:
-        refuse(f"must lie between {low:g} and {high:g}")
+        refuse("out of range", f"from {low:g} to {high:g}")
     return value
 
 
@@ -192,13 +195,13 @@ def _names(arm):
 
 
 class FaultInjector:
-    """Turns each sample into the messages that are sent.
+    """Turns each sample into the messages to send.
 
     Parameters
     ----------
     arm : Arm
     lines : sequence of str
-        Faults; they act in this order, those of `state` last.
+        Faults, which act in this order; those of `state` act last.
 
     Attributes
     ----------
@@ -210,13 +213,8 @@ class FaultInjector:
         self.faults = ()
         self.set(lines)
 
-    @property
-    def idle(self):
-        """Whether there is nothing that could change a message, now or later."""
-        return not self.faults
-
     def set(self, lines):
-        """Take other faults, all or none; what the ones before have kept is forgotten.
+        """Replace the faults, all or none, and forget what the old ones held.
 
         Raises
         ------
@@ -226,13 +224,13 @@ class FaultInjector:
         self.reset()
 
     def reset(self):
-        """A new session: times start anew."""
-        self._kept = {}  # number of a fault to what it keeps
+        """Begin a new session: times start again."""
+        self._kept = {}  # number of a fault to what it holds
         self._waiting = []  # (due [ns], sample), in the order they came
         self._swapped = None
 
     def outgoing(self, sample, time):
-        """Messages to be sent now, in order; none, one, or several.
+        """The messages to send now, in order: none, one or several.
 
         Parameters
         ----------
@@ -258,16 +256,16 @@ class FaultInjector:
         for fault in self.faults:
             if fault.acts(time):
                 _whole_fault(fault, out)
-        return self._line(out, now, time)
+        return self._messages(out, now, time)
 
     def _value_fault(self, number, fault, out, time):
-        """A fault of one field."""
+        """Apply a fault of one field."""
         values, acts = out.values.get(fault.signal), fault.acts(time)
         if values is None or not values.size:
             return
         names = out.names[FIELDS[fault.signal]]
         where = [names.index(fault.entry)] if fault.entry else slice(None)
-        if fault.kind == "delay":  # it has to know what was before it acts
+        if fault.kind == "delay":  # it needs the values from before it acts
             held = self._past(number, fault, values, time)
             if acts:
                 values[where] = held[where]
@@ -290,21 +288,21 @@ class FaultInjector:
             values[where] = {"nan": np.nan, "inf": np.inf, "huge": HUGE}[fault.kind]
 
     def _past(self, number, fault, values, time):
-        """Values of so long ago; before the start those of the start."""
+        """The values of the fault's delay ago; before the start, the first ones."""
         past = self._kept.setdefault(number, [])
         past.append((time, values.copy()))
         while len(past) > 1 and past[1][0] <= time - fault.get("by", 0.0) + 1e-9:
             past.pop(0)
         return past[0][1]
 
-    def _line(self, sample, now, time):
-        """What is lost, late, twice or out of order on the way."""
+    def _messages(self, sample, now, time):
+        """Apply faults of messages: lost, late, twice, out of order."""
         ready, acting = [sample], [f for f in self.faults if f.signal == "state" and f.acts(time)]
         kinds = {f.kind for f in acting}
         if any(_lost(f, sample.sequence) for f in acting):
             ready = []
         delay = sum(f.get("by", 0.0) for f in acting if f.kind == "delay")
-        # A message is never overtaken on its way, as on the topic.
+        # No message overtakes another, as on the topic.
         due = max([now + round(1e9 * delay), *(d for d, _ in self._waiting[-1:])])
         self._waiting += [(due, s) for s in ready]
         ready = [s for d, s in self._waiting if d <= now]
@@ -314,7 +312,7 @@ class FaultInjector:
         return self._swap(ready, "swap" in kinds)
 
     def _swap(self, ready, acts):
-        """Every other message is kept back until the next one has gone."""
+        """Hold every other message back until the next one has been sent."""
         out = []
         for s in ready:
             if self._swapped is not None:
@@ -330,15 +328,16 @@ class FaultInjector:
 def _lost(fault, sequence):
     if fault.kind != "drop":
         return False
-    share = fault.get("share", 1.0)
-    # Of the number alone: the same samples are lost whenever the fault was set.
-    return share >= 1.0 or np.random.default_rng([fault.get("seed", 0), sequence]).random() < share
+    fraction = fault.get("share", 1.0)
+    # By the sequence alone: the same samples are lost whenever the fault was set.
+    random = np.random.default_rng([fault.get("seed", 0), sequence])
+    return fraction >= 1.0 or random.random() < fraction
 
 
 def _whole_fault(fault, out):
-    """Faults of stamps and names."""
+    """Apply a fault of stamps or names."""
     if fault.signal == "clock" or fault.kind == "future":
-        # A stamp of before 1970 can't be sent.
+        # A message can't hold a stamp before 1970.
         out.stamp_ns = max(0, out.stamp_ns + round(1e9 * fault.get("by", 0.0)))
     elif fault.signal == "names" and fault.kind == "wrong":
         out.names["joint_names"][0] = f"not_{out.names['joint_names'][0]}"

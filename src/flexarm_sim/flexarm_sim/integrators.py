@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integration of a plant: fixed steps in real time and lockstep, error-controlled offline."""
+"""Integration of a plant: fixed steps in real time and in lockstep, error-controlled offline."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -21,7 +21,7 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     torque : callable
         ``torque(t, state)`` -> (n,) [N m]; smooth between the given times.
     times : ndarray, shape (k,)
-        Where the solution is wanted, from the initial time on [s].
+        Times of the solution, beginning with the initial time [s].
     rtol, atol : float
         Tolerances.
 
@@ -38,7 +38,7 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     def derivative(t, s):
         out = model.derivative(s, torque(t, s))
         if not np.isfinite(out).all():  # solve_ivp would shorten its step for ever
-            raise ModelError(f"{model.arm.name}: integration stopped at {t} s: not finite any more")
+            raise ModelError(f"integration stopped at {t} s: not finite", field=model.arm.name)
         return out
 
     if times[0] == times[-1]:
@@ -54,5 +54,6 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     )
     if not result.success:
         reached = result.t[-1] if result.t.size else times[0]
-        raise ModelError(f"{model.arm.name}: integration stopped at {reached} s: {result.message}")
+        problem = f"integration stopped at {reached} s: {result.message}"
+        raise ModelError(problem, field=model.arm.name)
     return result.y.T

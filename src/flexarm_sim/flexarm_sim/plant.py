@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm that is simulated: its state, its motion under torque, its safe action."""
+"""The simulated arm: its state, its motion under torque, and its safe action."""
 
 import math
 
@@ -10,12 +10,12 @@ from flexarm_dynamics.errors import ModelError, ShapeError
 from . import integrators
 from .brakes import Brakes
 
-#: Where the arm file gives no `damp_coefficient`, `damp` is the drive's velocity loop, within the joint's torque limit
-#: T: -T tanh(qd / DAMP_SPEED) [rad/s]. Links that swing on move the joint by a part of that speed.
+#: Without a `damp_coefficient` in the arm file, `damp` is the drive's velocity loop within the joint's torque limit
+#: T: -T tanh(qd / DAMP_SPEED) [rad/s]. Links that continue to vibrate move the joint at a fraction of that speed.
 DAMP_SPEED = 0.05
-#: Without a torque limit it stops the rigid arm with this rate [1/s].
+#: Without a torque limit, it stops the rigid arm at this rate [1/s].
 DAMP_RATE = 10.0
-#: The safe action is integrated in more substeps where it damps faster than this: rate * substep.
+#: The safe action is integrated in more substeps if rate * substep of its damping exceeds this [-].
 DAMP_RATE_PER_STEP = 2.0
 
 
@@ -25,7 +25,7 @@ class Plant:
     Parameters
     ----------
     model : ArmModel
-        The plant's own model; may have more modes than the controller's.
+        The plant's model; it may have more modes than the controller's.
     period : float
         Interval over which torque is constant [s].
     integrator : str
@@ -56,43 +56,46 @@ class Plant:
             self._brakes.refine(refinement)
 
     def reset(self, position=None, delta=None):
-        """At rest at `position` [rad], bent by `delta`; not given: as its own weight bends it, joints held."""
+        """Put the arm at rest at `position` [rad], bent by `delta`; by default as its weight bends it, joints held."""
         n = self.model.n_joints
         position = np.zeros(n) if position is None else np.asarray(position, float)
         if position.shape != (n,):
-            raise ShapeError(f"initial position has shape {position.shape}, wanted {(n,)}")
+            raise ShapeError(
+                "is the wrong shape", field="initial position", value=position.shape, limit=(n,)
+            )
         self.state[:] = 0.0
         self.q[:] = position
         self.delta[:] = self.model.static_deflection(position) if delta is None else delta
 
-    def advance(self, torque, share=1.0):
-        """One period, or a share of it, under constant torque, shape (n,) [N m]."""
-        self._run(torque, self._friction, share, self.substeps)
+    def advance(self, torque, fraction=1.0):
+        """Advance by one period, or a fraction of it, under constant torque, shape (n,) [N m]."""
+        self._run(torque, self._friction, fraction, self.substeps)
 
-    def advance_safely(self, share=1.0):
-        """One period, or a share of it, without drive torque, under each joint's safe action."""
+    def advance_safely(self, fraction=1.0):
+        """Advance by one period, or a fraction of it, without drive torque, under each joint's safe action."""
         if self._brakes is None:
-            self._run(self._no_torque, self._safe, share, self._safe_substeps)
+            self._run(self._no_torque, self._safe, fraction, self._safe_substeps)
             return
-        self._brakes.advance(self.state, share)
+        self._brakes.advance(self.state, fraction)
         self._check()
 
-    def _run(self, torque, friction, share, substeps):
-        count = max(1, math.ceil(share * substeps))  # no longer ones than of a whole period
-        self._advance(self.state, torque, share * self.period / count, count, friction)
+    def _run(self, torque, friction, fraction, substeps):
+        count = max(1, math.ceil(fraction * substeps))  # none longer than those of a whole period
+        self._advance(self.state, torque, fraction * self.period / count, count, friction)
         self._check()
 
     def _check(self):
         if not np.isfinite(self.state).all():
             raise ModelError(
-                f"the state of {self.model.arm.name} is no longer finite: torque or speed beyond what its"
-                " model holds for; reset the simulator"
+                "is no longer finite: torque or speed are beyond the range of its model",
+                field=f"state of {self.model.arm.name}",
+                hint="reset the simulator",
             )
 
     def _damped(self):
-        """Friction table, shape (n, 3), with what the safe action `damp` adds to it.
+        """Friction table, shape (n, 3), with the safe action `damp` added.
 
-        A joint's own Coulomb friction takes the smoothing of the velocity loop that it acts beside.
+        A joint's own Coulomb friction takes over the smoothing of the velocity loop.
         """
         table = self._friction.copy()
         for joint, inertia, row in zip(self.model.arm.joints, self._inertia(), table, strict=True):
@@ -114,24 +117,24 @@ class Plant:
         )
 
     def _refinement(self, integrator):
-        """By how many substeps each of an explicit method is divided, to bear the safe action's damping.
+        """Factor of the substeps of an explicit method that keeps it stable under the safe action's damping.
 
-        A joint before a flexible link turns with little inertia while the link bends: it may be damped faster
-        than the highest mode, for which substeps are chosen, swings.
+        A joint before a flexible link turns with little inertia while the link bends. Its damping may be faster
+        than the highest mode, for which the substeps are chosen.
         """
         if integrators.METHODS[integrator] is None:
             return 1
         n = self.model.n_joints
         viscous, coulomb, speed = self._safe.T
-        slope = viscous + np.where(coulomb > self._friction[:, 1], coulomb / speed, 0.0)
-        damped = self._terms().H[:n, :n] @ np.diag(slope)
+        damping = viscous + np.where(coulomb > self._friction[:, 1], coulomb / speed, 0.0)
+        damped = self._terms().H[:n, :n] @ np.diag(damping)
         fastest = np.abs(np.linalg.eigvals(damped)).max()
         return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
 
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:
             return joint.brake_torque
-        # No datum: what stops the rigid arm from 1 rad/s in 0.1 s.
+        # Not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
 
     def _terms(self):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles the numba kernels into their cache, so that no node waits for it: ``python -m flexarm_sim.precompile``."""
+"""Compiles the numba kernels into their cache: ``python -m flexarm_sim.precompile``.
+
+Otherwise the first node that uses a kernel would wait for it.
+"""
 
 from concurrent.futures import ProcessPoolExecutor
 
@@ -11,12 +14,12 @@ from flexarm_dynamics.models import model
 from .integrators import METHODS
 from .plant import Plant
 
-#: One arm of each structure that is shipped.
+#: One shipped arm of each structure.
 ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
 
 
 def main():
-    """Use everything once, on two cores; numba keeps what it compiled for that."""
+    """Run each kernel once, on two cores; numba caches what it compiles for that."""
     with ProcessPoolExecutor(2) as pool:
         for job in [pool.submit(linearise), pool.submit(loops), pool.submit(arms)]:
             job.result()

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What the simulator measures: encoder and strain gauges.
+r"""Sensors of the simulated arm: encoders and strain gauges.
 
 A gauge reads, for the plant's amplitudes :math:`\delta`,
 
 .. math:: \varepsilon = g\,R\,\delta + b + w + n
 
 with the drift w, a random walk whose change over a sample of length h has the variance ``drift**2 h``, and the
-white noise n. The bridge rounds this to its counts and ends at the ends of its range: those two are always
-there where the arm file states them, noise and drift when they are asked for.
+white noise n. The bridge rounds this to counts and saturates at the ends of its range. Counts and range always apply
+if the arm file states them; noise and drift only on request.
 """
 
 import numpy as np
@@ -16,16 +16,16 @@ from flexarm_dynamics.arm.strain_map import gauge_rows
 
 
 class Sensors:
-    """Encoder counts and strains of a plant.
+    """Readings of encoders and gauges of a plant.
 
     Parameters
     ----------
     model : ArmModel
-        The plant's model: gauges see all of its modes.
+        The plant's model: gauges measure all of its modes.
     noise : bool
-        Whether gauges have the noise and drift that the arm file states.
+        Whether gauges have the noise and drift of the arm file.
     seed : int
-        Of the noise and drift.
+        Seed of noise and drift.
     period : float
         Time between two readings, over which the bias drifts [s].
     """
@@ -48,15 +48,15 @@ class Sensors:
         self.reset()
 
     def reset(self):
-        """Start the noise again; the drift from zero."""
+        """Start the noise again, and the drift from zero."""
         self._random = np.random.default_rng(self._seed)
-        # A stream of its own: an arm file without drift has the same noise as one with it.
+        # A separate stream: with or without drift, an arm file has the same noise.
         self._walk_random = np.random.default_rng([self._seed, 1])
         self.drift = np.zeros_like(self.bias)
         self._first = True
 
     def position(self, q, out):
-        """Encoder reading of joint angles, rounded to counts where the arm file states them [rad]."""
+        """Encoder readings of the angles `q`, rounded to counts if the arm file states them, into `out` (n,) [rad]."""
         out[:] = q
         quantised = self._step > 0.0
         if quantised.any():
@@ -64,7 +64,7 @@ class Sensors:
         return out
 
     def strain(self, delta, out):
-        """Gauge readings [strain], one period after the last ones."""
+        """Gauge readings for amplitudes `delta`, one period after the last ones, into `out` (gauges,) [-]."""
         np.dot(self.rows, delta, out=out)
         out += self.bias
         if self.walk.any():

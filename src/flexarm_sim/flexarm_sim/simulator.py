@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated arm behind its sensors, sample by sample; what the simulator node calls."""
+"""The simulated arm with its sensors, sample by sample: the mathematics of the simulator node."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.parameters import Parameter, parameter
+from flexarm_dynamics.parameters import parameter
 
 from . import integrators
 from .plant import Plant
@@ -39,7 +39,7 @@ PARAMETERS = (
     parameter("noise", False, read_only=True).described(
         "Whether gauges have the noise and drift of the arm file."
     ),
-    Parameter("seed", "int", 0, "Seed of the noise.", low=0, high=2**31 - 1, read_only=True),
+    parameter("seed", 0, "-", 0, 2**31 - 1, read_only=True).described("Seed of the noise."),
     parameter("publish_rates", False, read_only=True).described(
         "Publish the true rates of the observed modes in modal_rate: for tests; no real arm has them."
     ),
@@ -58,7 +58,7 @@ class Simulator:
     Parameters
     ----------
     settings : mapping
-        Checked values of `PARAMETERS`; `arm` and `plant_arm` may each be an `Arm` in the place of a name.
+        Checked values of `PARAMETERS`; `arm` and `plant_arm` may each be an `Arm` instead of a name.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Simulator:
         if settings["plant_modes"]:
             plant_arm = plant_arm.with_modes(settings["plant_modes"])
         self._same_names(plant_arm)
-        # The order of the gauges is that of the arm file the others know.
+        # The gauges are in the order of the controller's arm file.
         gauges = {g.name: g for g in plant_arm.gauges}
         plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
         self.plant_model = model.build(plant_arm)
@@ -106,14 +106,17 @@ class Simulator:
             mine, its = getattr(self.arm, what), getattr(plant_arm, what)
             if set(mine) != set(its) or (what == "joint_names" and mine != its):
                 raise ModelError(
-                    f"plant_arm {plant_arm.name} has {what} {list(its)}, arm {self.arm.name} has"
-                    f" {list(mine)}: they must be the same"
+                    f"are not the {what} of arm {self.arm.name}",
+                    field=f"plant_arm {plant_arm.name}",
+                    value=list(its),
+                    limit=list(mine),
                 )
         missing = set(self.arm.observed_modes) - set(plant_arm.mode_names)
         if missing:
             raise ModelError(
-                f"plant_arm {plant_arm.name} lacks the modes {', '.join(sorted(missing))} that arm"
-                f" {self.arm.name} observes: raise plant_modes"
+                f"lacks the modes {', '.join(sorted(missing))} that arm {self.arm.name} observes",
+                field=f"plant_arm {plant_arm.name}",
+                hint="raise plant_modes",
             )
 
     @property
@@ -122,38 +125,38 @@ class Simulator:
         return 1e-9 * (self.stamp_ns - self.START_NS)
 
     def reset(self, position=None):
-        """Back to rest at the initial position; sequence and time start again."""
+        """Put the arm at rest at `position` [rad], by default the initial one; sequence and time start again."""
         self.plant.reset(self.settings["initial_position"] if position is None else position)
         self.sensors.reset()
         self.sequence, self.stamp_ns = 0, self.START_NS
         self.torque[:] = 0.0
         self._measure()
 
-    def advance(self, torque, before=None, share=0.0):
-        """One period under `torque` (n,) [N m], or under the safe actions where it is None.
+    def advance(self, torque, before=None, delay=0.0):
+        """Advance by one period under `torque` (n,) [N m]; None: under the safe actions.
 
-        When torque comes late, `before` goes on to act over the first `share` of the period; the torque of the
-        next sample is then the mean over the period.
+        When the torque comes late, `before` acts during the first part of the period, of which `delay` is the
+        fraction [-]. The torque of the next sample is the mean over the period.
         """
-        parts = [(before, share)] if share > 0.0 else []
-        self.advance_in_parts([*parts, (torque, 1.0 - share)])
+        parts = [(before, delay)] if delay > 0.0 else []
+        self.advance_in_parts([*parts, (torque, 1.0 - delay)])
 
     def advance_in_parts(self, parts):
-        """One period under several torques in turn: pairs of torque, or None, and its share of the period."""
+        """Advance by one period under several torques in turn; `parts` are pairs (torque or None, fraction)."""
         self.torque[:] = 0.0
-        for torque, share in parts:
-            self._advance(torque, share)
+        for torque, fraction in parts:
+            self._advance(torque, fraction)
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         self._measure()
 
-    def _advance(self, torque, share):
-        """A share of a period under one torque, which counts into the mean."""
+    def _advance(self, torque, fraction):
+        """Advance by a fraction of a period under one torque, and add it to the mean."""
         if torque is None:
-            self.plant.advance_safely(share)
+            self.plant.advance_safely(fraction)
         else:
-            self.plant.advance(torque, share)
-            self.torque += share * np.asarray(torque)
+            self.plant.advance(torque, fraction)
+            self.torque += fraction * np.asarray(torque)
 
     def _measure(self):
         plant = self.plant
@@ -166,5 +169,5 @@ class Simulator:
 
 
 def _arm(given):
-    """An arm as given, or from its file."""
+    """An `Arm`, as given or from its file."""
     return given if isinstance(given, Arm) else arm_file.load(given)

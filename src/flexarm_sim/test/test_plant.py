@@ -182,20 +182,22 @@ def test_a_brake_far_too_strong_for_the_time_step_stops_the_arm_without_chatter(
 @pytest.mark.parametrize("torque", [np.nan, np.inf, 1e200])
 def test_a_state_that_is_not_finite_is_an_error_that_names_the_arm(arm_r, torque):
     plant = Plant(arm_r, 1e-3)
-    with pytest.raises(ModelError, match=r"state of R is no longer finite.*reset"):
+    with pytest.raises(ModelError) as error:
         for _ in range(20):
             plant.advance(np.array([torque]))
+    assert error.value.field == "state of R" and "reset" in error.value.hint
     plant.reset()
     plant.advance(np.array([1.0]))
     assert np.isfinite(plant.state).all()
 
 
 def test_an_initial_position_of_the_wrong_shape_is_refused_naming_both(arm_r):
-    with pytest.raises(ShapeError, match=r"\(2,\), wanted \(1,\)"):
+    with pytest.raises(ShapeError) as error:
         Plant(arm_r, 1e-3).reset([0.0, 1.0])
+    assert (error.value.value, error.value.limit) == ((2,), (1,))
 
 
-def test_reset_puts_the_arm_at_rest_where_it_is_told(arm_r):
+def test_reset_puts_the_arm_at_rest_at_the_given_position(arm_r):
     plant = Plant(arm_r, 1e-3)
     plant.advance(np.array([5.0]))
     plant.reset([0.4], [0.01, 0.002])

@@ -338,7 +338,11 @@ def changed(field, function):
         (changed("stamp", lambda t: t + 10**8), "stamps", "in the future"),
         (changed("stamp", lambda t: 0 * t), "stamps", "100% of the stamps do not rise"),
         (changed("stamp", lambda t: t // 1000), "stamps", "0.001 s per second"),
-        (changed("stamp", lambda t: t - (t - t[0]) // 5), "rate", "250.0 samples per second, expected are 200"),
+        (
+            changed("stamp", lambda t: t - (t - t[0]) // 5),
+            "rate",
+            "250.0 samples per second, expected are 200",
+        ),
     ],
 )
 def test_other_faults_are_named(bench, change, check, text):
