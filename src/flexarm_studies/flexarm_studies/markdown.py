@@ -32,7 +32,7 @@ def _cell(value):
 
 
 def write_between(file, begin, end, text):
-    """Put text between the markers of a Markdown file.
+    """Replace the text between the markers of a Markdown file.
 
     Parameters
     ----------
@@ -44,12 +44,12 @@ def write_between(file, begin, end, text):
     Raises
     ------
     FlexarmError
-        When the file has no markers; it is left as it was.
+        When the file has no markers; it is left unchanged.
     """
     path = Path(file)
     whole = path.read_text(encoding="utf-8")
     if begin not in whole or end not in whole:
-        raise FlexarmError(f"{file}: no lines {begin} and {end} to write between")
+        raise FlexarmError(f"has no lines {begin} and {end}", field=str(file))
     head, rest = whole.split(begin, 1)
     tail = rest.split(end, 1)[1]
     path.write_text(f"{head}{begin}\n{text}\n{end}{tail}", encoding="utf-8")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Says what is going on: a line that fills on a terminal, a line per step elsewhere."""
+"""Progress of long commands: a bar on a terminal, a line per step elsewhere."""
 
 import sys
 import time
@@ -11,7 +11,7 @@ class Progress:
     Parameters
     ----------
     stream : file, optional
-        Where to; standard error if not given.
+        Output; standard error if not given.
     """
 
     WIDTH = 24
@@ -32,7 +32,7 @@ class Progress:
             print(f"{self._elapsed()} {self._label}", file=self._stream, flush=True)
 
     def fraction(self, done):
-        """How much of the step is done, 0 to 1."""
+        """Show the fraction of the step that is done, 0 to 1."""
         if self._live:
             full = round(self.WIDTH * min(max(done, 0.0), 1.0))
             bar = "#" * full + "." * (self.WIDTH - full)
@@ -40,7 +40,7 @@ class Progress:
             self._stream.flush()
 
     def done(self):
-        """The last step is over."""
+        """End the last step."""
         self._finish()
 
     def _finish(self):

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes for many runs at once."""
+"""Worker processes for many runs."""
 
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 
-#: Environment of workers: one thread each, or they hinder each other.
+#: Set to 1 for workers: with several threads each they would slow each other down.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @contextmanager
 def processes(count):
-    """An executor of so many processes, which end with it; what was not begun by then is dropped.
+    """An executor with `count` processes, which end with the context; calls that have not started are dropped.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often intervals cover the truth, and how wide they are, on simulated arms drawn at random.
+"""How often the intervals cover the truth, and how wide they are, for simulated arms drawn at random.
 
 ``python -m flexarm_studies.identification.coverage --arms 100`` draws arms around `nominal`, shakes and measures each
 one with noise and encoder counts, identifies it from the nominal arm's file, and prints a table.
@@ -24,29 +24,29 @@ from .fit import identify
 from .quantities import changed, quantities
 from .recording import Recording
 
-#: How far each parameter is drawn from the nominal one [-].
+#: Largest relative deviation of each parameter from the nominal one [-].
 SPREAD = 0.3
 #: Rms noise of the gauges [strain], and counts of the encoder.
 NOISE, COUNTS = 0.5e-6, 4096
-#: What shakes the arm: a sweep over both modes, then free.
+#: The excitation: a sweep over both modes, then no torque.
 SETTINGS = {"kind": "sweep", "amplitude": 6.0, "duration": 4.0, "rest": 2.0}
 SETTINGS |= {"frequency_low": 0.3, "frequency_high": 20.0}
 
 
 def nominal(counts=COUNTS, noise=NOISE):
-    """The arm whose file is given: one_link with friction, an encoder and gauges that say their noise."""
+    """The arm whose file the fit gets: one_link with friction, an encoder, and gauges with noise."""
     arm = arm_file.load("one_link")
     joint = replace(arm.joints[0], friction=Friction(0.2, 0.1, 0.01), encoder_counts=counts)
     payload = replace(
         arm.payload, inertia=tuple(tuple(10.0 * x for x in r) for r in arm.payload.inertia)
     )
     gauges = tuple(replace(g, noise=noise) for g in arm.gauges)
-    # The closed form of this arm: the same equations, faster.
+    # The closed form of this arm has the same equations and is faster.
     return replace(arm, joints=(joint,), gauges=gauges, payload=payload, model="one_link")
 
 
 def drawn(arm, random, recording=None):
-    """An arm with every parameter drawn within `SPREAD`, biases within 50 microstrain."""
+    """An arm with all parameters drawn within `SPREAD`, and biases within 50 microstrain."""
     found = quantities(arm, recording or _still(arm))
     values = [
         50e-6 * random.uniform(-1, 1)
@@ -63,7 +63,7 @@ def _still(arm):
 
 
 def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
-    """What a simulated arm's encoder and gauges read while it is shaken.
+    """Readings of a simulated arm's encoder and gauges during the excitation.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
     seed : int
         Of the noise.
     drive : Arm, optional
-        The arm that the excitation is planned for; the truth if not given.
+        The arm for which the excitation is planned; the truth if not given.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
 
 
 def run(arms, seed=0, rate=250.0, settings=SETTINGS, progress=None):
-    """Identify so many arms; one dict per parameter and derived value.
+    """Identify `arms` arms; a row per parameter and derived value.
 
     `settings` are those of the identification.
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a person knows of an arm and its file does not say: frequencies, damping and coupling of its modes.
+r"""Values that follow from an arm file: frequencies, damping and coupling of its modes.
 
-Of the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with the locked
+For the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with the locked
 mode i is :math:`\gamma_{ji} = (M_{12}\Psi)_{ji}` with the mode's shape :math:`\Psi_i` of unit modal mass: its
-square is what mode i takes of the inertia that joint j moves. Free modes are those of (2) with structural damping and
-the joints' viscous friction. Intervals come from the parameters' covariance by the delta method.
+square is the part of the inertia about joint j that belongs to mode i. Free modes are those of (2) with structural
+damping and the joints' viscous friction. Intervals come from the parameters' covariance by the delta method.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from flexarm_dynamics.models import model
 
 from .quantities import changed
 
-#: Difference step, of a quantity's scale [-].
+#: Difference step, as a fraction of a quantity's scale [-].
 STEP = 1e-5
 
 
@@ -57,15 +57,15 @@ def derived(arm, position, identified=None):
     widths = np.full(values.size, np.nan)
     if identified is not None and values.size:
         found, base = identified.quantities, identified.values
-        slopes = np.zeros((values.size, len(found)))
+        derivative = np.zeros((values.size, len(found)))
         for j in np.flatnonzero(np.isfinite(identified.half_widths)):
             if found[j].kind in ("gain", "bias"):
                 continue
             moved = base.copy()
             moved[j] += STEP * found[j].scale
             other = values_of(changed(identified.arm, found, moved), position)[1]
-            slopes[:, j] = (other - values) / (STEP * found[j].scale)
-        variance = np.einsum("ij,jk,ik->i", slopes, identified.covariance, slopes)
+            derivative[:, j] = (other - values) / (STEP * found[j].scale)
+        variance = np.einsum("ij,jk,ik->i", derivative, identified.covariance, derivative)
         widths = 1.959964 * np.sqrt(np.maximum(variance, 0.0))
     return [
         Derived(name, unit, float(v), float(w))

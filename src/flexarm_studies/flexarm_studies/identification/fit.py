@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Output-error fit of an arm's parameters, with intervals that hold when the residuals are coloured.
+r"""Output-error fit of an arm's parameters, with intervals that are valid for coloured residuals.
 
-Parameters :math:`\theta`, gauge biases and initial state x_0 are chosen so that the prediction of `predictor` is
-nearest to the measurement,
+Parameters :math:`\theta`, gauge biases and initial state x_0 are those whose prediction (`predictor`) is nearest to the
+measurement,
 
 .. math:: \min_{\theta, x_0} \sum_k\sum_c w_{kc}\,(y_{kc} - \hat y_{kc})^2/\sigma_c^2 ,
 
-with :math:`\sigma_c` of each channel from its residuals. An encoder that stays on one count for r samples has told
-one thing, not r: its samples weigh :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and 9.)
+with :math:`\sigma_c` of each channel from its residuals. An encoder that stays on one count for r samples has made one
+measurement, not r: its samples have the weight :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and 9.)
 
-A frequency that is off by a share s is out of step after 1/(2 s) periods, where the sum has other minima: the fit
-begins with the first periods of the motion and goes on to longer and longer parts of it.
+A frequency with a relative error s is out of step after 1/(2 s) periods, and from there on the sum has other minima:
+the fit begins with the first periods of the motion and continues with longer and longer parts of it.
 
 The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
 
 .. math:: P = A^{-1} S A^{-1}, \quad A = J^T J, \quad
           S = \sum_{|l|\le L}\left(1 - \tfrac{|l|}{L + 1}\right)\sum_k s_k s_{k+l}^T
 
-(Newey and West 1987; L by Andrews 1991 from the most coloured channel), which for white residuals is the usual
-:math:`\sigma^2 (J^TJ)^{-1}`; of both the larger variance is taken. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
+(Newey and West 1987; L by Andrews 1991 from the most coloured channel). For white residuals this is the usual
+:math:`\sigma^2 (J^TJ)^{-1}`; the larger of the two variances is used. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
 
-What the motion does not determine keeps the file's value: a parameter whose interval is wider than a share of its
-value, the worst one first, and the rest fitted again.
+A parameter that the motion does not determine keeps the file's value: one whose interval is wider than a fraction of
+its value, the worst one first; then the others are fitted again.
 """
 
 from dataclasses import dataclass, field
@@ -36,48 +36,48 @@ from .quantities import changed, held, quantities
 
 #: Two-sided 95 % of the normal distribution.
 NORMAL = 1.959964
-#: Difference step of the Jacobian, of a quantity's scale [-].
+#: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
 STEP = 1e-7
-#: Parts of the motion that are fitted one after the other: periods of the slowest mode, and how they grow.
+#: The first part of the motion that is fitted, in periods of the slowest mode, and the factor to each next part.
 FIRST_PERIODS, GROWTH = 1.0, 2.0
-#: In the parts, a quantity is held to the file's value with this deviation, of its scale [-].
+#: Standard deviation of the prior around the file's value in these parts, as a fraction of the scale [-].
 PRIOR = 0.5
-#: Quantities stay within these multiples of their scale [-].
-MOST = 30.0
-#: A channel's residual is taken as no smaller than this [rad], [strain].
-LEAST = 1e-9
-#: A residual that is prior to any fit is worth so much where no noise is stated, of the signal [-].
+#: Largest value of a quantity, in multiples of its scale [-].
+MAX_SCALED = 30.0
+#: Smallest noise that a channel is assumed to have [rad], [strain].
+MIN_NOISE = 1e-9
+#: Noise assumed before any fit where none is stated, as a fraction of the signal [-].
 ASSUMED = 1e-3
-#: Least bandwidth of the covariance is this times the third root of the samples [-].
+#: Smallest bandwidth of the covariance, in multiples of the third root of the number of samples [-].
 LAG_FACTOR = 1.0
-#: Correlation of a residual with the one before that counts at most [-].
-MOST_COLOUR = 0.97
-#: The model does not explain the motion when a channel's residual is so much of the signal's deviation [-].
+#: Largest correlation between neighbouring residuals that is used [-].
+MAX_CORRELATION = 0.97
+#: The model does not explain the motion if a channel's residual exceeds this fraction of the signal's deviation [-].
 POOR = 0.05
-#: Stiffnesses that are tried where the first fit is poor, times the file's [-].
+#: Stiffnesses that are tried after a poor first fit, as factors of the file's [-].
 TRIED = (0.4, 0.6, 1.6, 2.5)
-#: Singular value of the Jacobian, columns scaled to one, below which it is zero to its own precision [-].
+#: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-5
-#: So close to its least value, in scales, a quantity has it.
+#: A quantity this close to its smallest value has that value, as a fraction of its scale [-].
 AT_LIMIT = 1e-6
-#: Correlation from which on two parameters are named together [-].
+#: Two parameters with a larger correlation are named together [-].
 TOGETHER = 0.95
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """What a fit found.
+    """Result of a fit.
 
     Attributes
     ----------
     arm : Arm
-        With the found values; the file's where a quantity is held or undetermined.
+        With the fitted values; the file's where a quantity is held or undetermined.
     quantities : list of Quantity
-        All of them.
+        Of the arm, fitted or not.
     values, half_widths : ndarray, shape (p,)
-        Value, and half of the 95 % interval; NaN where the file's value was kept [SI].
+        Values, and half-widths of the 95 % intervals, NaN where the file's value was kept [SI].
     covariance : ndarray, shape (p, p)
-        Of the values; zero where held.
+        Of the values; zero where they are held.
     initial : ndarray, shape (2 (n + m),)
         Initial state.
     predicted : ndarray, shape (s, n + g)
@@ -86,7 +86,7 @@ class Identified:
     noise : ndarray, shape (n + g,)
         Rms residual of each channel [rad], [strain].
     held, undetermined : tuple of str
-        Kept because asked for; because the motion does not tell them.
+        Kept on request; kept because the motion does not determine them.
     warnings : tuple of str
     """
 
@@ -104,18 +104,18 @@ class Identified:
     warnings: tuple = field(default=())
 
 
-def identify(arm, recording, hold=(), share=0.5):
+def identify(arm, recording, hold=(), limit=0.5):
     """Fit an arm's parameters to a recorded motion.
 
     Parameters
     ----------
     arm : Arm
-        Where the fit starts, and what is kept where the motion tells nothing.
+        Start of the fit, and the values of everything that the motion does not determine.
     recording : Recording
     hold : sequence of str
         Names, or patterns with ``*``, of quantities that keep the file's value.
-    share : float
-        Of a quantity's value; one with a wider half-interval is undetermined [-].
+    limit : float
+        A quantity is undetermined if its half-width exceeds this fraction of its value [-].
 
     Returns
     -------
@@ -124,19 +124,19 @@ def identify(arm, recording, hold=(), share=0.5):
     Raises
     ------
     FlexarmError
-        For a pattern that names nothing, and where the model can't follow the motion at all.
+        For a pattern that matches nothing, and where the model can't follow the motion at all.
     """
     problem = Problem(arm, recording, hold)
     problem.leave_out_singular()
     problem.fit()
-    while (worst := problem.undetermined(share)) is not None:
+    while (worst := problem.undetermined(limit)) is not None:
         problem.leave_out(worst)
         problem.refine()
     return problem.result()
 
 
 class Problem:
-    """A fit under way; see the module."""
+    """A fit in progress; see the module."""
 
     def __init__(self, arm, recording, hold=()):
         self.arm, self.recording = arm, recording
@@ -156,7 +156,7 @@ class Problem:
     # Scales ----------------------------------------------------------------------------------
 
     def _weights(self):
-        """Square roots of w, shape (s, n + g): runs of one count weigh as one; what is missing not at all."""
+        """Square roots of w, shape (s, n + g): a run on one count weighs as one sample, a missing value nothing."""
         weight = np.isfinite(self.measured).astype(float)
         for c in range(self.predictor.n):
             reading = self.measured[:, c]
@@ -167,9 +167,9 @@ class Problem:
         return weight
 
     def _prior_noise(self):
-        """Rms error that each channel is taken to have before any fit."""
+        """Noise that each channel is assumed to have before any fit, rms."""
         spread = self.measured.std(axis=0)
-        noise = np.maximum(ASSUMED * spread, LEAST)
+        noise = np.maximum(ASSUMED * spread, MIN_NOISE)
         for c, joint in enumerate(self.arm.joints):
             if joint.encoder_counts:
                 noise[c] = max(noise[c], 2.0 * np.pi / joint.encoder_counts / np.sqrt(12.0))
@@ -178,7 +178,7 @@ class Problem:
         return noise
 
     def _state_scale(self):
-        """Of the initial state's differences: what its channels span, as angles, amplitudes and rates."""
+        """Scales of the initial state's angles, amplitudes and rates, from the ranges of the measurements."""
         m = self.predictor.m
         angle = np.maximum(np.ptp(self.recording.position, axis=0), 1e-3)
         link = max(link.length for link in self.arm.links)
@@ -194,7 +194,7 @@ class Problem:
         return np.concatenate([scales, self.state_scale])
 
     def _point(self, x):
-        """Values of all quantities, and initial state, of scaled unknowns."""
+        """Values of all quantities and initial state, from scaled unknowns."""
         values, p = self.values.copy(), int(self.free.sum())
         values[self.free] = x[:p] * self._scales[:p]
         return values, x[p:] * self.state_scale
@@ -208,7 +208,7 @@ class Problem:
         arm = changed(self.arm, self.found, values)
         predicted = self.predictor.predict(arm, initial, samples)
         r = self.weight[:samples] * (self.measured[:samples] - predicted) / self.noise
-        # A model that runs away is far off, and says so with a number.
+        # A model that diverges gets a large, finite residual.
         return np.clip(np.nan_to_num(r, nan=1e6, posinf=1e6, neginf=-1e6), -1e6, 1e6)
 
     def jacobian(self, x, samples):
@@ -222,7 +222,7 @@ class Problem:
             other = values.copy()
             other[index] += STEP * self.found[index].scale
             other = changed(self.arm, self.found, other)
-            # Gains and biases move nothing: the states are those of before.
+            # Gains and biases don't affect the motion: the states are the same.
             same = self.found[index].kind in ("gain", "bias")
             made = (states, built) if same else self.predictor.states(other, initial, samples)
             out[:, :, j] = (self.predictor.outputs(other, *made) - base) / STEP
@@ -237,7 +237,7 @@ class Problem:
     # The fit ---------------------------------------------------------------------------------
 
     def fit(self):
-        """Fit longer and longer parts, then the whole; other stiffnesses where that ends badly."""
+        """Fit longer and longer parts, then the whole; after a poor fit, start again from other stiffnesses."""
         self._fit_from(1.0)
         best = self._kept()
         stiff = any(q.kind == "EI" for q, free in zip(self.found, self.free, strict=True) if free)
@@ -251,11 +251,11 @@ class Problem:
         for channel in self.poor():
             self.warnings.append(
                 f"{channel}: the fit leaves more than {100 * POOR:g} % of it; the model does not explain this"
-                " motion, and the intervals are not to be trusted"
+                " motion, don't trust the intervals"
             )
 
     def _kept(self):
-        """The present point, and its cost by the noise assumed before any fit: comparable between fits."""
+        """The current point, and its cost under the noise assumed before any fit, which compares between fits."""
         noise, self.noise = self.noise, self._prior_noise()
         cost = float(np.sum(self.residuals(self._unknowns(), len(self.measured)) ** 2))
         self.noise = noise
@@ -270,7 +270,7 @@ class Problem:
         self.refine()
 
     def refine(self):
-        """Fit the whole, with the noise that the residuals show."""
+        """Fit the whole, with noise estimated from the residuals."""
         whole = len(self.measured)
         for tolerance in (1e-4, 1e-7):
             self._solve(whole, prior=False, tolerance=tolerance, most=40)
@@ -293,7 +293,7 @@ class Problem:
         return ends
 
     def _solve(self, samples, prior, tolerance, most):
-        """Least squares from where the point is; with `prior`, held to the file's values a little."""
+        """Least squares from the current point; with `prior`, weakly held to the file's values."""
         start, p = self._unknowns(), int(self.free.sum())
         scales = self._scales[:p]
         file = self.file[self.free] / scales
@@ -309,8 +309,8 @@ class Problem:
 
         low = np.array([q.low for q in self.found])[self.free] / scales
         bounds = (np.full(start.size, -np.inf), np.full(start.size, np.inf))
-        bounds[0][:p], bounds[1][:p] = low, MOST
-        start[:p] = np.clip(start[:p], low + 1e-9, MOST)
+        bounds[0][:p], bounds[1][:p] = low, MAX_SCALED
+        start[:p] = np.clip(start[:p], low + 1e-9, MAX_SCALED)
         solution = least_squares(
             residuals, start, jacobian, bounds, ftol=tolerance, xtol=1e-9, gtol=1e-10, max_nfev=most
         )
@@ -319,10 +319,10 @@ class Problem:
     def _measure_noise(self):
         r = self.residuals(self._unknowns(), len(self.measured)) * self.noise
         rms = np.sqrt(np.sum(r**2, axis=0) / np.maximum(np.sum(self.weight**2, axis=0), 1.0))
-        self.noise = np.maximum(rms, LEAST)
+        self.noise = np.maximum(rms, MIN_NOISE)
 
     def poor(self):
-        """Names of channels that the fit does not explain."""
+        """Names of the channels that the fit does not explain."""
         names = (*self.arm.joint_names, *self.arm.gauge_names)
         used = self.weight.any(axis=0)
         spread = np.array(
@@ -360,8 +360,8 @@ class Problem:
         grow *= np.sqrt(used / max(used - x.size, 1))
         return robust * np.outer(grow, grow) / np.outer(size, size)
 
-    def undetermined(self, share):
-        """Index of the free quantity whose interval is widest beside its value, beyond `share`; None."""
+    def undetermined(self, limit):
+        """Index of the free quantity with the widest interval relative to its value; None if within `limit`."""
         if not self.free.any():
             return None
         cov, indices = self.covariance(), np.flatnonzero(self.free)
@@ -369,7 +369,7 @@ class Problem:
         values = np.abs(self.values[indices]) / np.array([self.found[i].scale for i in indices])
         ratio = widths / np.maximum(values, 1.0)
         worst = int(np.argmax(ratio))
-        if not ratio[worst] > share:
+        if not ratio[worst] > limit:
             return None
         deviation = np.sqrt(np.diag(cov))[: indices.size]
         alike = np.abs(cov[worst, : indices.size]) / (deviation[worst] * deviation)
@@ -378,12 +378,12 @@ class Problem:
         ]
         why = f"its interval would be +-{100.0 * ratio[worst]:.3g} % of it"
         if partners:
-            why += f", and it can't be told from {', '.join(partners)}"
+            why += f", and it acts like {', '.join(partners)}"
         self._because = why
         return int(indices[worst])
 
     def leave_out_singular(self):
-        """Leave out what does not move the measurements at all, or only as others do."""
+        """Leave out quantities that don't affect the measurements, or only in the same way as others."""
         while self.free.any():
             J = self.jacobian(self._unknowns(), len(self.measured))
             J = J.reshape(-1, J.shape[-1])
@@ -391,16 +391,16 @@ class Problem:
             indices = np.flatnonzero(self.free)
             silent = np.flatnonzero(size[:p] <= 1e-12 * max(size.max(), 1e-300))
             if silent.size:
-                self._because = "it moves nothing that was measured"
+                self._because = "it affects nothing that was measured"
                 self.leave_out(int(indices[silent[0]]))
                 continue
             _, values, directions = np.linalg.svd(J / np.maximum(size, 1e-300), full_matrices=False)
-            share = np.abs(directions[-1])
-            involved = np.flatnonzero(share[:p] > 0.1)
+            parts = np.abs(directions[-1])
+            involved = np.flatnonzero(parts[:p] > 0.1)
             if values[-1] > SINGULAR * values[0] or not involved.size:
                 return
             names = [self.found[indices[k]].name for k in involved]
-            # The one that moves least goes by the file.
+            # The one with the smallest effect keeps the file's value.
             least = int(involved[np.argmin(size[involved])])
             self._because = f"{', '.join(names)} act alike on what was measured"
             self.leave_out(int(indices[least]))
@@ -418,13 +418,13 @@ class Problem:
         )
 
     def _end_at_limits(self):
-        """What the search left a hair above its least possible value has that value."""
+        """Set quantities that ended just above their smallest value to that value."""
         low = np.array([q.low for q in self.found])
         close = self.free & (self.values - low < AT_LIMIT * np.array([q.scale for q in self.found]))
         self.values = np.where(close, low, self.values)
 
     def result(self):
-        """The fit as it stands."""
+        """The result of the fit so far."""
         p, indices = len(self.found), np.flatnonzero(self.free)
         covariance, widths = np.zeros((p, p)), np.full(p, np.nan)
         if indices.size:
@@ -450,7 +450,7 @@ def bandwidth(r):
     sample to the next.
     """
     power = np.maximum(np.sum(r**2, axis=0), 1e-300)
-    rho = np.clip(np.max(np.abs(np.sum(r[1:] * r[:-1], axis=0)) / power), 0.0, MOST_COLOUR)
+    rho = np.clip(np.max(np.abs(np.sum(r[1:] * r[:-1], axis=0)) / power), 0.0, MAX_CORRELATION)
     alpha = 4.0 * rho**2 / (1.0 - rho**2) ** 2
     third = len(r) ** (1.0 / 3.0)
     return int(np.ceil(max(1.1447 * alpha ** (1.0 / 3.0), LAG_FACTOR) * third))

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What an arm would have measured: its own model under the recorded torque, from an initial state.
+r"""Predicts measurements: the arm's own model under the recorded torque, from an initial state.
 
 .. math::
     \dot x = f(x, u_k; \theta), \qquad
     \hat y_k = \begin{bmatrix} q(t_k)\\ g\,R\,\delta(t_k) + b\end{bmatrix}
 
 with the full equations of motion (2) and the torque :math:`u_k` constant over the interval that ends at
-:math:`t_k`, integrated by the compiled stepper: no linearisation, so that friction and products of deflections
-count. The initial state x_0 is unknown, and estimated with the parameters.
+:math:`t_k`, integrated by the compiled stepper. Nothing is linearised: friction and products of deflections count.
+The initial state x_0 is unknown and estimated with the parameters.
 """
 
 import numpy as np
@@ -20,21 +20,21 @@ from flexarm_sim import integrators
 
 #: Integrator of the prediction: few steps of high order.
 METHOD = "dop853"
-#: The highest mode may come to lie so much higher than the file says.
+#: The fitted highest mode may be this much faster than the file's [-].
 MARGIN = 1.3
-#: Steps are so much longer than the simulator's: the error stays below a thousandth of a microstrain (tested).
+#: Steps are longer than the simulator's by this factor: the error stays below a thousandth of a microstrain (tested).
 LONGER = 2.0
-#: Friction's rate times step at which the method is still well stable: its limit is near 6.
+#: Largest product of friction's rate and step: the method is stable up to about 6 [-].
 STABLE = 3.0
 
 
 class Predictor:
-    """Predicts measurements of arms alike in structure.
+    """Predicts measurements of arms with the same structure.
 
     Parameters
     ----------
     arm : Arm
-        As the file says; fixes the number of integration steps.
+        The file's arm, which fixes the number of integration steps.
     recording : Recording
     """
 
@@ -51,14 +51,14 @@ class Predictor:
     def states(self, arm, initial, samples=None):
         """States at each sample, shape (s, 2 (n + m)), and the model.
 
-        NaN where the model runs away; None for a model where there can be none of this arm.
+        NaN where the model diverges; None in place of a model where the arm can have none.
 
         Parameters
         ----------
         arm : Arm
         initial : ndarray, shape (2 (n + m),)
         samples : int, optional
-            How many; all if not given.
+            Number of samples; all if not given.
         """
         try:
             built = model.build(arm)
@@ -67,7 +67,7 @@ class Predictor:
         return self.run(built, initial, samples), built
 
     def run(self, built, initial, samples=None):
-        """States of a model that is there already, as `states`."""
+        """As `states`, for a given model."""
         count = len(self.recording.position) if samples is None else samples
         states = np.full((count, 2 * (self.n + self.m)), np.nan)
         if built is not None:
@@ -114,14 +114,14 @@ class Predictor:
 
 
 def _friction_rate(built, recording):
-    """Greatest rate at which friction may stop a joint alone [1/s], for twice the friction of the file.
+    """Largest rate at which friction alone may stop a joint [1/s], for twice the file's friction.
 
-    At low speed Coulomb friction is viscous, coulomb / smoothing; on a joint that turns little mass that is quick
-    beside the bending, and steps too long for it make noise of the prediction.
+    At low speed Coulomb friction acts as viscous friction, coulomb / smoothing. On a joint that turns little mass this
+    is fast compared with the bending, and steps that are too long for it turn the prediction into noise.
     """
     n = built.n_joints
     viscous, coulomb, smoothing = built.friction_table().T
-    # Where the file says none, what would count in this motion.
+    # Where the file states none: what would have an effect in this motion.
     coulomb = np.maximum(coulomb, 0.02 * np.abs(recording.torque).max(axis=0))
     give = np.diag(built.terms(recording.position[0], np.zeros(n)).H)[:n]
     return 2.0 * float(np.max(give * (viscous + coulomb / smoothing)))
@@ -130,8 +130,8 @@ def _friction_rate(built, recording):
 def stepper(built):
     """The compiled stepper of a model that is used once.
 
-    The straight-line code of a chain is written for its numbers: to compile it anew for each set of parameters
-    would take longer than the motion.
+    A chain's straight-line code contains its numbers. Compiling it for each set of parameters would take longer than
+    simulating the motion, so the general code is used.
 
     `built` is the model.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which numbers of an arm file a motion tells of: each by its path in the file, with its scale and limits."""
+"""The numbers of an arm file that can be identified: path in the file, scale and smallest value of each."""
 
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -22,14 +22,14 @@ class Quantity:
     kind : str
         One of EI, damping, hub_inertia, viscous, coulomb, payload_mass, payload_inertia, gain, bias.
     where : tuple
-        Which one: indices of link or joint or gauge, direction, mode.
+        Index of the link, joint or gauge, then direction and mode.
     unit : str
     dimension : str
         As `flexarm_dynamics.arm.units` names it.
     scale : float
-        Of its changes, and what an interval is put beside where the value is near zero.
+        Size of its changes; an interval is compared with it where the value is near zero.
     low : float
-        Least possible value.
+        Smallest possible value.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Quantity:
     low: float = 0.0
 
     def get(self, arm):
-        """Its value in an arm, SI."""
+        """The value in an arm [SI]."""
         return float(_GET[self.kind](arm, *self.where))
 
     def put(self, arm, value):
@@ -50,7 +50,7 @@ class Quantity:
 
 
 def quantities(arm, recording):
-    """All quantities of an arm that may be identified, in the file's order.
+    """All quantities of an arm that can be identified, in the file's order.
 
     Parameters
     ----------
@@ -116,12 +116,15 @@ def held(found, patterns):
     """
     names = set()
     for pattern in patterns:
-        # A path's brackets are no character class of a pattern.
+        # The brackets of a path are literal, not a character class.
         literal = pattern.replace("[", "[[]")
         match = {q.name for q in found if fnmatch(q.name, literal)}
         if not match:
             raise FlexarmError(
-                f"--hold {pattern}: no such parameter (there are {', '.join(q.name for q in found)})"
+                "matches no parameter",
+                field="--hold",
+                value=pattern,
+                limit=", ".join(q.name for q in found),
             )
         names |= match
     return names
@@ -165,7 +168,7 @@ def _put_stiffness(arm, value, i, direction):
     arm = _link(arm, i, stiffness={**link.stiffness, direction: value})
     if not flexibility.frequencies:
         return arm
-    # Measured frequencies give the shapes; they go with the stiffness, and the shapes stay as they are.
+    # Measured frequencies determine the shapes: scaled with the stiffness, they leave the shapes unchanged.
     frequencies = tuple(float(ratio * f) for f in flexibility.frequencies)
     return _flexibility(arm, i, direction, frequencies=frequencies)
 
