@@ -88,11 +88,11 @@ class ArmNode(LifecycleNode):
     # Made and unmade with the configuration ----------------------------------------------------
 
     def make_publisher(self, kind, topic, profile, **kwargs):
-        """A publisher that lives until clean-up; whoever can't hear it is shown in diagnostics."""
+        """A publisher that lives until clean-up; incompatible subscriptions are shown in diagnostics."""
         return self._keep(self.destroy_publisher, self._publisher(kind, topic, profile, **kwargs))
 
     def make_subscription(self, kind, topic, callback, profile, **kwargs):
-        """A subscription that lives until clean-up; whom it can't hear is shown in diagnostics."""
+        """A subscription that lives until clean-up; incompatible publishers are shown in diagnostics."""
         events, take = self._mismatches.callbacks(False, "qos_overriding_options" in kwargs)
 
         def create(own):
@@ -226,7 +226,7 @@ class ArmNode(LifecycleNode):
         return now if now.nanoseconds else self._system.now()
 
     def _with_mismatches(self, level, message, values):
-        """What a node says of itself, and which of its topics somebody can't be heard on."""
+        """The node's own status, and the topics with an incompatible publisher or subscription."""
         found = self._mismatches.texts()
         if not found:
             return level, message, values
@@ -239,7 +239,7 @@ class ArmNode(LifecycleNode):
         kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
         if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:
-            if len(self._reported) > 100:  # names in a message are anybody's
+            if len(self._reported) > 100:  # a message may hold any names
                 self._reported.clear()
             self._reported[kind] = now
             self.get_logger().warning(text)

@@ -82,7 +82,7 @@ class NodeParameters:
         node.add_post_set_parameters_callback(self._on_applied)
 
     def _warn_unknown(self):
-        """A misspelt name in a parameter file is ignored by ROS; a person should hear of it.
+        """A misspelt name in a parameter file is ignored by ROS; so the node warns.
 
         One file may serve all nodes, so that only names like one of this node's are worth a word.
         """

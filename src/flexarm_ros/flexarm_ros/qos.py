@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service on the line: reliable, volatile, the newest sample only; overridable by parameters.
+"""Quality of service on the control path: reliable, volatile, the newest sample only; overridable by parameters.
 
-Two ends of a topic whose policies don't go together exchange nothing, and neither would say so: `Mismatches` does.
+A publisher and a subscription with incompatible policies exchange nothing, without an error: `Mismatches` reports them.
 """
 
 import copy
@@ -110,7 +110,7 @@ class _Mismatch:
 
 
 class Mismatches:
-    """Other ends of a node's topics that nothing is exchanged with, for want of compatible policies.
+    """Publishers and subscriptions of other nodes that are incompatible with this node's.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class Mismatches:
         self._found = {k: m for k, m in self._found.items() if id(m.end) not in gone}
 
     def texts(self):
-        """What is wrong now, by topic; what was put right or has left is forgotten. Not on the control path."""
+        """The present mismatches, by topic; those that were fixed or have left are dropped. Not on the control path."""
         self._found = {k: m for k, m in self._found.items() if self._lasts(m)}
         return {topic: m.text for (topic, _, _), m in self._found.items()}
 

@@ -12,9 +12,9 @@ import time
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-#: Longest wait of services, timers and slow topics for their turn [s].
+#: Services, timers and slow topics are served at least this often [s].
 HOUSEKEEPING = 0.02
-#: So many of them are served in one turn for each node; looking for them costs about 0.2 ms each.
+#: How many of them are served in one turn for each node; looking for each costs about 0.2 ms.
 AT_ONCE = 2
 
 

@@ -54,7 +54,7 @@ def leave(code):
 
         get_default_context().destroy()
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # nobody reads it any more
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # a closed pipe
             stream.flush()
     os._exit(code)
 

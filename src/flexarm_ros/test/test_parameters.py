@@ -160,10 +160,12 @@ def test_lengths_are_checked_once_the_arm_is_known_and_one_value_is_spread(make)
     ),
     ids=str,
 )
-def test_a_refused_set_gives_the_reason_keeps_the_value_and_tells_nobody(make, name, value, reason):
+def test_a_refused_set_gives_the_reason_keeps_the_value_and_notifies_no_one(
+    make, name, value, reason
+):
     node, parameters = make()
-    told = []
-    parameters.on_change(told.append)
+    notified = []
+    parameters.on_change(notified.append)
     before = parameters[name]
     result = set_one(node, name, value)
     assert not result.successful
@@ -172,41 +174,41 @@ def test_a_refused_set_gives_the_reason_keeps_the_value_and_tells_nobody(make, n
     assert (
         node.get_parameter(name).value == before or list(node.get_parameter(name).value) == before
     )
-    assert told == []
+    assert notified == []
 
 
 def test_a_set_is_applied_once_taken_and_says_what_changed(make):
     node, parameters = make()
-    told = []
-    parameters.on_change(lambda names: told.append((names, parameters["slow.kp"])))
+    notified = []
+    parameters.on_change(lambda names: notified.append((names, parameters["slow.kp"])))
     assert set_one(node, "slow.kp", [9.0]).successful
-    assert told == [({"slow.kp"}, [9.0])]
+    assert notified == [({"slow.kp"}, [9.0])]
     both = [RosParameter("slow.kp", value=[1.0]), RosParameter("fast.alpha", value=2.0)]
     assert node.set_parameters_atomically(both).successful
-    assert told[1:] == [({"slow.kp", "fast.alpha"}, [1.0])]
+    assert notified[1:] == [({"slow.kp", "fast.alpha"}, [1.0])]
 
 
 def test_an_atomic_set_is_all_or_nothing(make):
     node, parameters = make()
-    told = []
-    parameters.on_change(told.append)
+    notified = []
+    parameters.on_change(notified.append)
     for last in (RosParameter("slow.gain", value="m12"), RosParameter("fast.alpha", value=-1.0)):
         result = node.set_parameters_atomically([RosParameter("slow.kp", value=[9.0]), last])
         assert not result.successful and last.name in result.reason
         assert parameters["slow.kp"] == [6.25]
         assert list(node.get_parameter("slow.kp").value) == [6.25]
-    assert told == []
+    assert notified == []
 
 
 def test_an_undeclared_name_is_refused_and_one_declared_elsewhere_is_none_of_ours(make):
     node, parameters = make()
-    told = []
-    parameters.on_change(told.append)
+    notified = []
+    parameters.on_change(notified.append)
     with pytest.raises(rclpy.exceptions.ParameterNotDeclaredException, match="undeclared"):
         set_one(node, "slow.kq", [1.0])
     node.declare_parameter("mine", 1)
     assert set_one(node, "mine", 2).successful
-    assert told == []
+    assert notified == []
 
 
 def test_a_value_that_is_set_later_does_not_change_what_was_read_before(make):
@@ -220,7 +222,7 @@ def test_a_value_that_is_set_later_does_not_change_what_was_read_before(make):
 
 
 class Ear:
-    """A logger that keeps what it hears."""
+    """A logger that keeps what it gets."""
 
     def __init__(self):
         self.warnings = []

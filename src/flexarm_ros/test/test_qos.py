@@ -63,11 +63,11 @@ def test_an_override_that_cannot_be_used_names_the_topic(publisher, policies, re
 
 
 def test_advice_says_what_to_change_on_either_side():
-    heard = qos.advice("/a/s", "reliability", publishes=False)
-    assert "have it offer reliable" in heard
-    assert heard.endswith("-p qos_overrides./a/s.subscription.reliability:=best_effort")
-    hearing = qos.advice("/a/s", "durability", publishes=True)
-    assert "have it ask for volatile" in hearing
-    assert hearing.endswith("-p qos_overrides./a/s.publisher.durability:=transient_local")
+    subscribing = qos.advice("/a/s", "reliability", publishes=False)
+    assert "have it offer reliable" in subscribing
+    assert subscribing.endswith("-p qos_overrides./a/s.subscription.reliability:=best_effort")
+    publishing = qos.advice("/a/s", "durability", publishes=True)
+    assert "have it ask for volatile" in publishing
+    assert publishing.endswith("-p qos_overrides./a/s.publisher.durability:=transient_local")
     assert "qos_overrides" not in qos.advice("/d", "durability", publishes=True, overrides=False)
     assert "give both ends the same deadline" in qos.advice("/d", "deadline", publishes=True)

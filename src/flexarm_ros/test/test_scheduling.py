@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU affinity and real-time priority: what is taken, what is refused and how that is said."""
+"""CPU affinity and real-time priority: what is taken, what is refused and how that is reported."""
 
 import os
 import subprocess
@@ -78,12 +78,12 @@ def test_a_refused_priority_is_a_warning_that_says_what_to_do(monkeypatch):
     def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
-    said = []
+    messages = []
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    scheduling.apply([], 20, said.append)
-    assert len(said) == 1
+    scheduling.apply([], 20, messages.append)
+    assert len(messages) == 1
     for word in ("realtime_priority 20", "Operation not permitted", "rtprio", "cap_sys_nice"):
-        assert word in said[0]
+        assert word in messages[0]
 
 
 HURRIED = """

@@ -249,7 +249,7 @@ def test_csv_and_commands(tmp_path, capsys):
     # The file's own comments are still there.
     assert text.splitlines()[0] in out.read_text()
     assert plot.stat().st_size > 10_000
-    with pytest.raises(FlexarmError, match="that is the arm file itself"):
+    with pytest.raises(FlexarmError, match="is the arm file itself"):
         options.out = str(file)
         options.function(options)
 

@@ -92,11 +92,21 @@ def _list(text, count, name):
     try:
         values = [float(v) for v in text.split(",")]
     except ValueError:
-        raise TrajectoryError(f"--{name} {text!r}: write numbers, comma separated") from None
+        raise TrajectoryError(
+            "is not a list of numbers",
+            field=f"--{name}",
+            value=text,
+            hint="separate them by commas",
+        ) from None
     values = values * count if spread and len(values) == 1 else values
     if len(values) != count or not all(map(math.isfinite, values)):
         each = "x,y,z" if what == "coordinates" else "one per joint"
-        raise TrajectoryError(f"--{name} {text!r}: {count} finite {what} are wanted, {each}")
+        raise TrajectoryError(
+            "does not fit",
+            field=f"--{name}",
+            value=text,
+            limit=f"{count} finite {what}, {each}",
+        )
     return values
 
 
@@ -145,18 +155,18 @@ def prepare(options):
     arm = model.build(arm_file.load(options.arm))
     profile = profile_of(options, np.zeros(arm.n_joints), arm)
     trajectory = specs.sampled(profile, arm, points_of(options))
-    said = {"profile": options.profile, "duration_s": profile.duration}
+    found = {"profile": options.profile, "duration_s": profile.duration}
     if options.dry_run:
-        said |= effects(profile, arm)
+        found |= effects(profile, arm)
         if not options.json:
-            print(description(said))
+            print(description(found))
     if options.out:
         files.write(options.out, trajectory)
-        said |= {"out": options.out, "points": len(trajectory.times_ns)}
+        found |= {"out": options.out, "points": len(trajectory.times_ns)}
         if not options.json:
-            print(f"{options.out}: {said['points']} points, {profile.duration:g} s")
+            print(f"{options.out}: {found['points']} points, {profile.duration:g} s")
     if options.json:
-        print(json.dumps(said, allow_nan=False))
+        print(json.dumps(found, allow_nan=False))
 
 
 def effects(profile, arm):
@@ -183,10 +193,10 @@ def effects(profile, arm):
     return {"joints": joints, "vibration_energy_J": energies}
 
 
-def description(said):
+def description(found):
     """What `prepare` found, for people."""
-    lines = [f"{said['profile']}: {said['duration_s']:.6g} s"]
-    for joint in said["joints"]:
+    lines = [f"{found['profile']}: {found['duration_s']:.6g} s"]
+    for joint in found["joints"]:
         torque, limit = joint["peak_slow_torque_Nm"], joint["torque_limit_Nm"]
         lines.append(
             f"  {joint['name']}: {joint['from_rad']:.4g} to {joint['to_rad']:.4g} rad, at most"
@@ -195,8 +205,8 @@ def description(said):
         )
         if limit is not None and torque > limit:
             lines[-1] += ": it will be clipped; give it more time"
-    if "vibration_energy_J" in said:
-        energy = said["vibration_energy_J"]
+    if "vibration_energy_J" in found:
+        energy = found["vibration_energy_J"]
         lines.append(
             f"  vibration about the quasi-steady state, without fast control: {energy['mean']:.3g} J on"
             f" average, {energy['left_at_the_end']:.3g} J left at the end"
@@ -213,7 +223,7 @@ def _of(limit):
 
 
 def publish(options, ros_args=None):
-    """Publish once, with stamp 0 (now), to a controller that is there; say what became of it.
+    """Publish once, with stamp 0 (now), and report whether the controller accepted it.
 
     With ``--dry-run`` or ``--out`` nothing is published: `prepare`.
 
@@ -239,7 +249,7 @@ def publish(options, ros_args=None):
     settings = settings_of(options, len(names))
     built = model.build(arm) if specs.needs_model(options.profile, settings) else None
     if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
-        profile_of(options, [0.0] * len(names), built)  # wrong options are said before it waits
+        profile_of(options, [0.0] * len(names), built)  # refuse wrong options before waiting
     with Session("publish_trajectory", args=ros_args or (), patience=options.timeout) as session:
         states = session.tap(CompositeState, "controller/state")
         publisher = session.publisher(JointTrajectory, options.topic)
@@ -270,17 +280,17 @@ def publish(options, ros_args=None):
         )
         after = states.newest
     if after.accepted_trajectory_id == before.accepted_trajectory_id:
-        raise FlexarmError(f"refused: {after.rejected_reason}")
-    said = {
+        raise FlexarmError(f"the controller refused the trajectory: {after.rejected_reason}")
+    found = {
         "profile": options.profile,
         "trajectory_id": after.accepted_trajectory_id,
         "points": len(message.points),
         "duration_s": profile.duration,
     }
     print(
-        json.dumps(said)
+        json.dumps(found)
         if options.json
-        else f"{options.profile}: accepted as trajectory {said['trajectory_id']}, {said['points']} points,"
+        else f"{options.profile}: accepted as trajectory {found['trajectory_id']}, {found['points']} points,"
         f" {profile.duration:g} s"
     )
 

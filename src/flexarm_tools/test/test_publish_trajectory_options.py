@@ -57,7 +57,7 @@ def test_wrong_usage_exits_2_and_says_how(words, capsys):
     assert "usage: flexarm" in capsys.readouterr().err
 
 
-def test_an_error_is_said_in_one_line_and_exits_1(monkeypatch, capsys):
+def test_an_error_is_one_line_and_exits_1(monkeypatch, capsys):
     def refuse(options, ros_args=None):
         raise TrajectoryError("no such motion")
 
@@ -100,13 +100,13 @@ def test_without_options_it_is_the_papers_motion():
 
 
 @pytest.mark.parametrize("kind", ["paper", "quintic"])
-def test_a_motion_goes_from_where_to_where_and_as_long_as_it_is_told(kind):
+def test_a_motion_goes_from_where_to_where_and_for_as_long_as_given(kind):
     motion = profile(kind, "--from", "0.5", "--to", "-1.25", "--duration", "3.5")
     assert_allclose([motion.position(0.0), motion.position(3.5)], [[0.5], [-1.25]], rtol=1e-12)
     assert_allclose([motion.velocity(0.0), motion.velocity(3.5)], 0.0, atol=1e-12)
 
 
-def test_a_motion_starts_at_the_reference_unless_it_is_told_otherwise():
+def test_a_motion_starts_at_the_reference_unless_it_is_given_another_start():
     assert_allclose(profile("quintic", reference=[0.7]).position(0.0), [0.7])
     assert_allclose(profile("paper", reference=[0.7]).position(2.0), [np.pi / 2])
     assert_allclose(profile("quintic", "--from", "0", reference=[0.7]).position(0.0), [0.0])
@@ -121,13 +121,13 @@ def test_one_angle_stands_for_all_joints_and_a_list_for_each():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--to", "ninety"], r"--to 'ninety': write numbers, comma separated"),
-        (["--to", ""], r"--to '': write numbers"),
-        (["--to", "1,"], r"--to '1,': write numbers"),
-        (["--to", "1,2"], r"--to '1,2': 1 finite angles are wanted"),
-        (["--to", "nan"], r"--to 'nan': 1 finite angles"),
-        (["--from", "inf"], r"--from 'inf': 1 finite angles"),
-        (["--from", "0;1"], r"--from '0;1': write numbers"),
+        (["--to", "ninety"], r"--to: 'ninety' is not a list of numbers"),
+        (["--to", ""], r"--to: '' is not a list of numbers"),
+        (["--to", "1,"], r"--to: '1,' is not a list of numbers"),
+        (["--to", "1,2"], r"--to: '1,2' does not fit \(1 finite angles"),
+        (["--to", "nan"], r"--to: 'nan' does not fit \(1 finite angles"),
+        (["--from", "inf"], r"--from: 'inf' does not fit \(1 finite angles"),
+        (["--from", "0;1"], r"--from: '0;1' is not a list of numbers"),
         (["--duration", "0"], r"duration: 0\.0 s"),
         (["--duration", "-2"], r"duration: -2\.0 s"),
         (["--duration", "nan"], r"duration: nan s"),
@@ -172,8 +172,8 @@ def test_a_line_leads_the_tip_from_where_the_reference_is():
             "shaper modes: 3 are not possible for R",
         ),
         (["line"], "line: tip is missing"),
-        (["line", "--tip", "1,2"], r"--tip '1,2': 3 finite coordinates are wanted, x,y,z"),
-        (["line", "--tip", "1"], r"--tip '1': 3 finite coordinates are wanted"),
+        (["line", "--tip", "1,2"], r"--tip: '1,2' does not fit \(3 finite coordinates"),
+        (["line", "--tip", "1"], r"--tip: '1' does not fit \(3 finite coordinates"),
         (["line", "--tip", "1,0,0", "--to", "1"], "line: 'to' is no setting"),
         (["line", "--tip", "3,0,0"], "tip path: R can't follow it|is where the tip is already"),
         (["least-exciting", "--torque-limit", "-1"], r"torque_limit\[0\]: -1"),
@@ -198,7 +198,7 @@ def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, capsy
     assert_allclose(read.accelerations, expected.accelerations, rtol=1e-15)
 
 
-def test_a_torque_that_will_be_clipped_is_said(capsys):
+def test_a_torque_that_will_be_clipped_is_reported(capsys):
     assert exit_code(["publish", "paper", "--duration", "1", "--dry-run"]) == 0
     assert "of 13.5582: it will be clipped" in capsys.readouterr().out
 

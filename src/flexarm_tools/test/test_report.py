@@ -552,7 +552,7 @@ def test_an_empty_bag_and_what_is_no_bag_say_what_to_do(tmp_path):
     with pytest.raises(FlexarmError, match=r"a folder, a .mcap or a .db3"):
         command.read([tmp_path / "notes.txt"])
     (tmp_path / "junk.mcap").write_bytes(b"hello" * 100)
-    with pytest.raises(FlexarmError, match=r"no MCAP file"):
+    with pytest.raises(FlexarmError, match=r"is not an MCAP file"):
         command.read([tmp_path / "junk.mcap"])
     (tmp_path / "folder" / "metadata.yaml").write_text("- a\n- b: [\n")
     with pytest.raises(FlexarmError, match=r"can't be read as a bag"):
@@ -785,7 +785,7 @@ def test_a_recording_ends_with_ctrl_c_and_is_a_bag_of_the_nodes_arm(tmp_path, mo
     run = read(tmp_path / "bag")
     assert run.time.size == 10 and run.arm.name == "R" and run.contents.namespace == "/left"
     printed = capsys.readouterr().out
-    assert "10 arm_state" in printed and "nothing came on arm_state_estimate" in printed
+    assert "10 arm_state" in printed and "no messages on arm_state_estimate" in printed
     assert f"flexarm report {tmp_path / 'bag'}\n" in printed
 
 

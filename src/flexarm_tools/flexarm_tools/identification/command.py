@@ -57,14 +57,18 @@ def add_arguments(parser):
 def identify(options):
     """Run ``identify``; the result as plain data."""
     if (options.live is None) == (options.recording is None):
-        raise FlexarmError("either a bag or CSV file, or --live SECONDS")
+        raise FlexarmError("give either a bag or CSV file, or --live SECONDS")
     if not options.undetermined > 0.0:
-        raise FlexarmError(f"--undetermined {options.undetermined:g}: a share above 0 is wanted")
+        raise FlexarmError(
+            "is out of range", field="--undetermined", value=options.undetermined, limit="above 0"
+        )
     out = None
     if options.out:
         out = Path(options.out)
         if out.exists() and out.samefile(arm_file.find(options.arm)):
-            raise FlexarmError(f"--out {out}: that is the arm file itself; give another name")
+            raise FlexarmError(
+                "is the arm file itself", field="--out", value=str(out), hint="give another name"
+            )
         out.parent.mkdir(parents=True, exist_ok=True)
     arm = arm_file.load(options.arm)
     progress = Progress()

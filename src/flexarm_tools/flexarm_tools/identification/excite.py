@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm excite``: shakes a running arm with the node `excite`, and writes a bag of what it did meanwhile."""
+"""``flexarm excite``: shakes a running arm with the node `excite` and records a bag of it."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from flexarm_studies.progress import Progress
 
 from .live import PATIENCE, START_DRIVER
 
-#: Wall time without a new state after which the arm is taken for lost [s].
+#: Timeout for the next state; after it the arm counts as lost [s].
 SILENCE = 10.0
 #: This process's node.
 RECORDER = "excite_recorder"
@@ -65,24 +65,24 @@ def excite(options):
     from ..recording.recorder import Recorder, write_bag
 
     if not options.allow_motion:
-        raise FlexarmError("this moves the arm: stand clear, and give --allow-motion")
+        raise FlexarmError("this moves the arm", hint="stand clear, and give --allow-motion")
     out = Path(options.out)
     if out.exists():
-        raise FlexarmError(f"--out {out}: exists already")
+        raise FlexarmError("exists already", field="--out", value=str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     arm_file.load(options.arm)  # refused here, and not in another process's log
     with Session(RECORDER, namespace=options.namespace) as session:
         recorder = Recorder(session, ("arm_state", "joint_torque"))
         session.wait_for("arm_state", lambda: recorder.raw["arm_state"], PATIENCE, START_DRIVER)
         if session.taps["joint_torque"].publishers():
-            raise FlexarmError("a controller sends joint_torque: stop it")
+            raise FlexarmError("a controller sends joint_torque", hint="stop it")
         progress = Progress()
         progress.step(f"shake {options.arm}")
-        said = _run(options, session)
+        output = _run(options, session)
         progress.done()
         kept = between(recorder.messages(), recorder.raw)
     if not kept["joint_torque"]:
-        raise FlexarmError(f"no torque was sent:\n{said}")
+        raise FlexarmError(f"no torque was sent:\n{output}")
     write_bag(out, kept, options.arm)
     count = len(kept["arm_state"])
     print(
@@ -90,8 +90,8 @@ def excite(options):
         if options.json
         else f"{count} states in {out}"
     )
-    if "excitation complete" not in said:
-        raise FlexarmError(f"{_ending(said) or said}; what came before is in {out}")
+    if "excitation complete" not in output:
+        raise FlexarmError(f"{_ending(output) or output}; what came before is in {out}")
     return out
 
 
@@ -108,7 +108,7 @@ def node_parameters(options):
 
 
 def _run(options, session):
-    """Run the node until it says that it has ended; what it said."""
+    """Run the node until it reports its end; its output."""
     from ..running.processes import arguments, executable
 
     values = node_parameters(options)
@@ -120,18 +120,20 @@ def _run(options, session):
             env={**os.environ, "RCUTILS_LOGGING_USE_STDOUT": "0"},
         )  # fmt: skip
 
-        def said():
+        def output():
             return os.pread(log.fileno(), 1_000_000, 0).decode(errors="replace")
 
         def ended():
-            return process.poll() is not None or "excitation complete" in said() or _ending(said())
+            return (
+                process.poll() is not None or "excitation complete" in output() or _ending(output())
+            )
 
         states = session.taps["arm_state"].messages
         try:
             while not ended():
                 seen = len(states)
                 if not session.serve(SILENCE, lambda seen=seen: len(states) > seen or ended()):
-                    raise FlexarmError(f"no arm_state for {SILENCE:g} s\n{said()}")
+                    raise FlexarmError(f"no arm_state for {SILENCE:g} s\n{output()}")
             session.poll()
         finally:
             process.send_signal(signal.SIGINT)
@@ -140,19 +142,19 @@ def _run(options, session):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        return said()
+        return output()
 
 
-def _ending(said):
-    """The line that says why it was stopped."""
-    lines = [x for x in said.splitlines() if "excitation stopped" in x or "not configured" in x]
+def _ending(output):
+    """The line that gives the reason why it was stopped."""
+    lines = [x for x in output.splitlines() if "excitation stopped" in x or "not configured" in x]
     return lines[0].split("]: ")[-1] if lines else ""
 
 
 def between(messages, raw):
     """The raw messages from the first enabled torque to the last, topic to {stamp [ns]: bytes}.
 
-    Before and after acts the safe action, which no torque tells of.
+    Before and after them the safe action moves the arm, and no message holds its torque.
     """
     from flexarm_ros.messages import stamp_ns
 

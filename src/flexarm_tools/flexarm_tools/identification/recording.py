@@ -9,7 +9,7 @@ from flexarm_studies.identification.recording import from_tables, read_csv
 
 
 def of_contents(contents, arm):
-    """The `Recording` in a bag's `Contents`.
+    """The `Recording` in a bag's `contents`.
 
     Raises
     ------

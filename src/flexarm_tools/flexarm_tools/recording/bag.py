@@ -180,9 +180,8 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
     source = _Source(path, notes)
     store, readers, block, size = typestore(), {}, {}, 0
     folder = tempfile.TemporaryDirectory(prefix="flexarm-report-")
-    heard, count = {}, 0
+    count = 0
     for topic, kind, raw in source.messages(lambda t, k: _wanted(t, k, namespace)):
-        heard[topic] = kind
         block.setdefault((topic, kind), []).append(raw)
         count, size = count + 1, size + len(raw)
         if count % BLOCK == 0 or size > BLOCK_BYTES:
@@ -220,7 +219,7 @@ def from_messages(raw, arm):
 def _bag(path):
     """The bag that a path means."""
     if not path.exists():
-        raise FlexarmError(f"{path}: no such file or folder")
+        raise FlexarmError("no such file or folder", field=str(path))
     if path.is_dir() and not _is_bag(path) and _is_bag(path / "bag"):
         return path / "bag"
     if path.is_dir() and not _is_bag(path):
@@ -239,7 +238,7 @@ def _is_bag(path):
 
 
 def arm_of(path, notes):
-    """The arm that a bag's metadata tell of, None where they don't."""
+    """The arm in a bag's metadata; None without one."""
     place = (path if path.is_dir() else path.parent) / "metadata.yaml"
     try:
         data = yaml.safe_load(place.read_text(encoding="utf-8"))
@@ -284,7 +283,7 @@ class _Source:
             raise
         except FlexarmError:
             raise
-        except Exception as error:  # what rosbags says of a broken bag is of many kinds
+        except Exception as error:  # rosbags raises many types for a broken bag
             problem = str(error) or type(error).__name__
         yield from self._up_to_the_break(wanted, given, problem)
 
@@ -304,7 +303,7 @@ class _Source:
         files = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
         if not files or files[0].suffix != ".mcap":
             raise FlexarmError(
-                f"{self.path}: can't be read as a bag: {problem}; `ros2 bag reindex` may mend it"
+                f"{self.path}: can't be read as a bag: {problem}; `ros2 bag reindex` may repair it"
             )
         count = 0
         for file in files:
@@ -330,7 +329,7 @@ def _nothing(path, source, namespace):
 
 
 def _enough(contents, others):
-    """Whether there is an arm to tell of; refuse a bag without."""
+    """Whether there are states of an arm; refuse a bag without."""
     if "arm_state" in contents.tables or "arm_state_estimate" in contents.tables:
         return True
     if others > 1:

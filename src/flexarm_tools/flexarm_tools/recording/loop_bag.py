@@ -31,7 +31,7 @@ class LoopBag:
     arm : str
         Shipped name or path of the arm file, which goes into the bag.
     observer : str
-        Name of the observer, as the node tells it.
+        Name of the observer, as the node publishes it.
 
     Raises
     ------
@@ -42,7 +42,12 @@ class LoopBag:
     def __init__(self, folder, loop, arm, observer=""):
         self.folder, self._loop, self._observer = Path(folder), loop, observer
         if self.folder.exists():
-            raise FlexarmError(f"--bag {folder}: exists already; name another one or remove it")
+            raise FlexarmError(
+                "exists already",
+                field="--bag",
+                value=str(folder),
+                hint="name another one or remove it",
+            )
         arm_ = loop.model.arm
         self._measured, self._estimate = StateWriter(arm_), StateWriter(arm_)
         self._torque, self._state = TorqueWriter(arm_, 1), CompositeStateWriter(loop.model)
@@ -72,7 +77,7 @@ class LoopBag:
             )
             self._put("observer/state", message)
         self._put("joint_torque", self._torque.answer(sample, enabled, loop.controller.torque))
-        # There is no callback whose time could be told.
+        # There is no callback whose computing time could be measured.
         self._put("controller/state", self._state.fill(sample, loop.controller, math.nan))
 
     def _put(self, topic, message):

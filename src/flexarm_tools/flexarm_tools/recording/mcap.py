@@ -29,7 +29,7 @@ def messages(path):
     """
     with open(path, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise FlexarmError(f"{path}: no MCAP file: it does not begin like one")
+            raise FlexarmError("is not an MCAP file: it does not begin like one", field=str(path))
         kinds, channels = {}, {}
         yield from _of(_records(file.read), kinds, channels)
 
@@ -67,9 +67,7 @@ def _of(records, kinds, channels):
                     yield (*channels[number], content[22:])
             elif kind == _CHUNK:
                 yield from _of(_records(_reader(_chunk(content))), kinds, channels)
-        except (
-            Exception
-        ):  # what is said of broken bytes is of many kinds: here is the end of what can be read
+        except Exception:  # broken bytes raise many types: nothing after them can be read
             return
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm record``: a bag of a running arm, of a driver or of the simulator alike.
 
-It listens to the line's topics and writes what comes, message by message, so that memory stays small however long it
-takes. The arm's name is asked of the nodes, and the text of its file goes into the bag.
+It writes each message of the arm's topics as it arrives, so that memory stays small in a recording of any length. It
+asks the nodes for the arm's name and puts the text of the arm file into the bag.
 """
 
 import datetime
@@ -14,11 +14,11 @@ from pathlib import Path
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
-#: Wait for the first message [s].
+#: Timeout for the first message [s].
 PATIENCE = 10.0
-#: Between two looks at the middleware's queues, and between two lines on a terminal [s].
-POLL_PERIOD, TELL_PERIOD = 0.005, 0.5
-#: Nodes that know the arm; the first one that answers is believed.
+#: Time between two looks at the middleware's queues, and between two lines on a terminal [s].
+POLL_PERIOD, SHOW_PERIOD = 0.005, 0.5
+#: Nodes that know the arm; the first answer is taken.
 ASKED = ("observer", "controller", "observer_controller", "simulator")
 
 
@@ -52,13 +52,17 @@ def record(options):
     """
     duration = options.duration
     if duration is not None and not duration > 0.0:
-        raise FlexarmError(f"--duration {duration}: a number greater than 0 is wanted")
+        raise FlexarmError(
+            "is out of range", field="--duration", value=duration, limit="greater than 0"
+        )
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     out = Path(options.out or f"results/bag-{stamp}")
     if out.exists():
-        raise FlexarmError(f"--out {out}: exists already; name another one or remove it")
+        raise FlexarmError(
+            "exists already", field="--out", value=str(out), hint="name another one or remove it"
+        )
     if options.arm:
-        arm_file.load(options.arm)  # refused here, and not after the recording
+        arm_file.load(options.arm)  # refuse a wrong one before the recording
     with Listener(options.namespace) as listener:
         listener.wait_for_first(PATIENCE)
         _take(listener, out, options.arm, duration, options.json)
@@ -69,7 +73,7 @@ def _take(listener, out, arm, duration, as_json=False):
     """Record until the duration is over, Ctrl-C or SIGTERM; what was counted."""
     from .recorder import BagWriter
 
-    began, told, ended = time.monotonic(), 0.0, None
+    began, shown, ended = time.monotonic(), 0.0, None
     asked = None if arm else listener.ask_arm()
     with BagWriter(out, arm or "", listener.namespace) as bag:
         taken = Taken(bag, arm or "")
@@ -78,16 +82,16 @@ def _take(listener, out, arm, duration, as_json=False):
             while duration is None or time.monotonic() < began + duration:
                 taken.take(listener.poll(), time.time_ns())
                 if asked is not None and not taken.arm:
-                    taken.believe(asked())
-                if time.monotonic() > told + TELL_PERIOD:
-                    told = time.monotonic()
-                    taken.show(told - began)
+                    taken.put_arm(asked())
+                if time.monotonic() > shown + SHOW_PERIOD:
+                    shown = time.monotonic()
+                    taken.show(shown - began)
         except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the way to end it; SIGTERM
             ended = end
         taken.take(listener.poll(), time.time_ns())
     if sys.stderr.isatty():
         print(file=sys.stderr)
-    taken.tell(out, as_json)
+    taken.report(out, as_json)
     if isinstance(ended, SystemExit):
         raise ended
     return taken
@@ -100,7 +104,7 @@ class Taken:
     ----------
     bag : BagWriter
     arm : str
-        What the bag already says.
+        The bag's arm so far.
     """
 
     def __init__(self, bag, arm=""):
@@ -119,13 +123,13 @@ class Taken:
             if rows:
                 self._from, self._to = self._from or now_ns, now_ns
 
-    def believe(self, arm):
+    def put_arm(self, arm):
         """Put the arm that a node has named into the bag, if its file is here."""
         if not arm or arm == self._unusable:
             return
         try:
             arm_file.load(arm)
-            self.bag.tell_arm(arm)
+            self.bag.put_arm(arm)
             self.arm = arm
         except FlexarmError as error:
             self._unusable = arm
@@ -147,20 +151,20 @@ class Taken:
             )
             sys.stderr.flush()
 
-    def tell(self, out, as_json=False):
-        """The last lines: what is in the bag, and what to do with it."""
+    def report(self, out, as_json=False):
+        """Print what is in the bag and what to do with it."""
         if as_json:
-            said = {"out": str(out), "arm": self.arm or None, "seconds": self.seconds}
-            print(json.dumps(said | {"messages": self.counts}))
+            summary = {"out": str(out), "arm": self.arm or None, "seconds": self.seconds}
+            print(json.dumps(summary | {"messages": self.counts}))
             return
         there = [f"{count} {topic}" for topic, count in self.counts.items() if count]
         missing = [topic for topic, count in self.counts.items() if not count]
         print(f"{out}: {self.seconds:.1f} s; {', '.join(there)}")
         if missing:
-            print(f"nothing came on {', '.join(missing)}")
+            print(f"no messages on {', '.join(missing)}")
         without = "" if self.arm else " --arm ARM"
         if not self.arm:
-            print("no node said which arm this is: give it to the report with --arm")
+            print("no node reported its arm: give it to the report with --arm")
         print(f"next: flexarm report {out}{without}")
 
 
@@ -208,7 +212,7 @@ class Listener:
         others = [n for n in there if node.count_publishers(n)]
         hint = f"; there are {', '.join(sorted(others))}: give their --namespace" if others else ""
         return (
-            f"nothing came in {where} for {seconds:g} s: start the driver (or simulator), in the same"
+            f"no message of an arm in {where} for {seconds:g} s; start the driver (or simulator), in the same"
             f" ROS_DOMAIN_ID{hint}"
         )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records the line as serialised messages; reads them back; writes a bag that common viewers open."""
+"""Records an arm's topics as serialised messages, and writes them as a bag."""
 
 import struct
 from pathlib import Path
@@ -21,7 +21,7 @@ TOPICS = {
     "observer/state": ObserverState,
 }
 
-#: Publisher of each topic on the line.
+#: Topics that each node publishes.
 PUBLISHERS = {
     "simulator": ("arm_state",),
     "observer": ("arm_state_estimate", "observer/state"),
@@ -29,14 +29,15 @@ PUBLISHERS = {
 }
 
 
-#: Messages that a publisher keeps for a recorder which falls behind.
+#: Messages that a publisher keeps for a recorder that falls behind.
 KEPT = 1000
 
 
 def keep_for_recording(node):
-    """Parameters of a node whose messages are recorded: the line itself keeps the newest sample alone.
+    """Parameters of a node whose messages are recorded.
 
-    A recorder that the machine leaves waiting is sent again what it missed only while the publisher has it.
+    On the control path a publisher keeps the newest sample alone. A recorder that falls behind on a busy machine gets
+    what it missed only while the publisher still has it.
     """
     return {f"qos_overrides./{topic}.publisher.depth": KEPT for topic in PUBLISHERS[node]}
 
@@ -74,7 +75,7 @@ class Recorder:
         }
 
     def complete(self):
-        """Whether something has come on every topic."""
+        """Whether every topic has a message."""
         return all(self.raw.values())
 
     @property
@@ -84,7 +85,7 @@ class Recorder:
         return raw_stamp_ns(newest) if newest else 0
 
     def samples(self, begin_ns, end_ns):
-        """One serialised message per stamp and topic: what was sent again is kept once, the last time.
+        """One serialised message per stamp and topic; of one that was sent again, the last.
 
         Parameters
         ----------
@@ -159,7 +160,7 @@ class BagWriter:
         Directory of the bag; must not exist.
     arm : str, optional
         Shipped name or path of the arm file: its name and its text go into the bag's metadata (``custom_data``), so
-        that whoever reads the bag knows the arm.
+        that a reader of the bag knows the arm.
     namespace : str
         In front of the topics' names.
     """
@@ -173,10 +174,10 @@ class BagWriter:
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
         if arm:
-            self.tell_arm(arm)
+            self.put_arm(arm)
 
-    def tell_arm(self, arm):
-        """Have the bag say which arm it is of; any time before it is closed."""
+    def put_arm(self, arm):
+        """Put the arm file into the metadata; possible until the bag is closed."""
         from flexarm_dynamics.arm import arm_file
 
         path = arm_file.find(arm)
@@ -184,7 +185,7 @@ class BagWriter:
         self._writer.set_custom_data(ARM_TEXT, path.read_text(encoding="utf-8"))
 
     def add(self, topic, kind):
-        """Name a topic that is not the line's, and its type, such as ``trajectory_msgs/msg/JointTrajectory``."""
+        """Add a topic that is not in `TOPICS`, with its type, such as ``trajectory_msgs/msg/JointTrajectory``."""
         self._connections[topic] = self._writer.add_connection(
             f"{self._before}/{topic}", kind, typestore=self._store
         )

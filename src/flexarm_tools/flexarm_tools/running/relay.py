@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bare relay of the line's messages through as many processes: what the middleware alone costs.
+"""A bare relay of the control path's messages through three processes: what the middleware alone costs.
 
 Each of three plain nodes answers the message it gets with a ready-made one of the same type and size, and
 sends the same side messages; nothing is computed. ``python -m flexarm_tools.running.relay ROLE ARM [COUNT|SPIN]``: of a
@@ -32,7 +32,7 @@ from .processes import Processes, own_domain
 
 
 def filled_state(arm):
-    """An `ArmState` of the size that the line has."""
+    """An `ArmState` of the size that the control path has."""
     writer = StateWriter(arm)
     for field in ("joint_position", "joint_velocity", "joint_torque"):
         writer.write(field, [0.0] * len(arm.joints))

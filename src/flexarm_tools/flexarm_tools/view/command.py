@@ -147,7 +147,7 @@ def start(options, stack):
 
 
 class View:
-    """Hears the nodes, shows them, and does what is done on the page, in one thread.
+    """Shows what the nodes publish and carries out what is done on the page, in one thread.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ class View:
         self.link, self.options, self.stack = link, options, stack
         self.page = None
         self.home = None
-        self._heard_at = 0.0
+        self._received_at = 0.0
 
     def run(self):
         """Serve until it is interrupted."""
@@ -199,30 +199,30 @@ class View:
             webbrowser.open(page.url)
 
     def _turn(self):
-        """What was done on the page, and what was heard since the last turn."""
+        """Carry out what was done on the page; show what has arrived since the last turn."""
         now, page = time.monotonic(), self.page
         while not page.done.empty():
             name, *words = page.done.get()
             (getattr(self, f"_do_{name}", None) or getattr(self.link, name))(*words)
         try:
-            heard = self.link.take()
+            snapshot = self.link.take()
         except MessageError as error:
             page.say(str(error), True)
             return
-        if heard is None:
-            if now > self._heard_at + SILENCE:
-                page.silence(now - self._heard_at if self._heard_at else 0.0)
+        if snapshot is None:
+            if now > self._received_at + SILENCE:
+                page.silence(now - self._received_at if self._received_at else 0.0)
             return
-        self._heard_at = now
+        self._received_at = now
         if self.home is None:
-            self.home = heard.q
-            page.aim(first_target(self.drawer.arm, heard.q))
+            self.home = snapshot.q
+            page.aim(first_target(self.drawer.arm, snapshot.q))
         picture = self.drawer.picture(
-            heard.q, heard.delta, heard.slow, heard.fast, page.exaggeration
+            snapshot.q, snapshot.delta, snapshot.slow, snapshot.fast, page.exaggeration
         )
-        self.trail.add(picture.tip, heard.session)
-        error = self.drawer.tip_error(heard.q, heard.delta, heard.reference)
-        page.show(heard, picture, self.trail.points, error)
+        self.trail.add(picture.tip, snapshot.session)
+        error = self.drawer.tip_error(snapshot.q, snapshot.delta, snapshot.reference)
+        page.show(snapshot, picture, self.trail.points, error)
         page.plot(now)
 
     def _do_back(self, duration):

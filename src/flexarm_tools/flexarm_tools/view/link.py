@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page hears of the nodes and tells them, in one thread, without a callback per sample."""
+"""The live view's connection to the nodes, in one thread, without a callback per sample."""
 
 import time
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ REST = 0.25
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What the topics said last; arrays in the arm's order, SI."""
+class Snapshot:
+    """The newest values of the topics; arrays in the arm's order, SI."""
 
     time: float
     session: int
@@ -48,7 +48,7 @@ class Heard:
 
 
 class Link:
-    """A node that looks on, and speaks for the page.
+    """Reads the loop's topics, and publishes and asks for the page.
 
     Parameters
     ----------
@@ -101,14 +101,16 @@ class Link:
         if control is not None:
             if list(control.joint_names) != list(self._arm.joint_names):
                 raise MessageError(
-                    f"controller/state is of joints {list(control.joint_names)}, not of {self._arm.name}"
+                    f"are not those of {self._arm.name}",
+                    field="controller/state joint_names",
+                    value=list(control.joint_names),
                 )
             self.control = control
         if msg is None or self.control is None:
             return None
         delta = self._amplitudes.read(msg, self._sample).copy()
         c = self.control
-        return Heard(
+        return Snapshot(
             time=1e-9 * stamp_ns(msg.header.stamp),
             session=msg.session,
             q=self._sample.position.copy(),
@@ -137,7 +139,7 @@ class Link:
         if msg.name == self._controller.strip("/").replace("/", ".") and msg.level >= 30:
             self.say(f"controller: {msg.msg}", True)
 
-    # Speaking --------------------------------------------------------------------------------
+    # Commands --------------------------------------------------------------------------------
 
     def move(self, target, duration):
         """Publish a motion from where the reference is to joint angles [rad] in so many seconds."""

@@ -86,7 +86,7 @@ class Page:
         )
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
         self._gains, self._plotted = {}, 0.0
-        self._said = deque(maxlen=MESSAGES)
+        self._messages = deque(maxlen=MESSAGES)
         modes = len(arm.mode_names)
         self._histories = {
             "tip": History(1),
@@ -265,34 +265,36 @@ class Page:
 
     def say(self, text, bad):
         """Show a message to the person, above the last ones."""
-        self._said.appendleft((text, bad))
+        self._messages.appendleft((text, bad))
         lines = "".join(
             f'<div style="color:{"#c92a2a" if bad else "#495057"};opacity:{1.0 - 0.3 * i}">{html.escape(text)}</div>'
-            for i, (text, bad) in enumerate(self._said)
+            for i, (text, bad) in enumerate(self._messages)
         )
         self._message.content = (
             '<div id="message" style="margin:0 0.8em 0.6em;font-size:0.8em;overflow-wrap:anywhere">'
             f"{lines}</div>"
         )
 
-    def show(self, heard, picture, trail, tip_error):
+    def show(self, snapshot, picture, trail, tip_error):
         """Show a state.
 
         Parameters
         ----------
-        heard : link.Heard
+        snapshot : link.Snapshot
         picture : Picture
         trail : (k, 3) ndarray
         tip_error : float
             [m]
         """
-        self._histories["tip"].add(heard.time, [1e3 * tip_error], heard.session)
-        self._histories["modes"].add(heard.time, 1e3 * heard.delta, heard.session)
-        self._histories["torques"].add(heard.time, (*heard.slow, *heard.fast), heard.session)
+        self._histories["tip"].add(snapshot.time, [1e3 * tip_error], snapshot.session)
+        self._histories["modes"].add(snapshot.time, 1e3 * snapshot.delta, snapshot.session)
+        self._histories["torques"].add(
+            snapshot.time, (*snapshot.slow, *snapshot.fast), snapshot.session
+        )
         with self.server.atomic():
             self._draw(picture, trail)
-            put(self._head, header(heard.state, heard.reason))
-            put(self._numbers, numbers(self.arm, heard, tip_error))
+            put(self._head, header(snapshot.state, snapshot.reason))
+            put(self._numbers, numbers(self.arm, snapshot, tip_error))
 
     def plot(self, now):
         """Draw the plots, if it is time to; `now` in seconds of any steady clock."""
@@ -303,8 +305,10 @@ class Page:
             plot.data = self._histories[name].columns()
 
     def silence(self, seconds):
-        """Nothing has been heard for so long."""
-        text = f"nothing heard for {seconds:.0f} s" if seconds >= 2.0 else "waiting for the nodes"
+        """Show that nothing has been received for so many seconds."""
+        text = (
+            f"nothing received for {seconds:.0f} s" if seconds >= 2.0 else "waiting for the nodes"
+        )
         put(self._head, header("", "", text))
 
     def offer_gains(self, found):
@@ -328,7 +332,7 @@ class Page:
         return self._by_hand(lambda: ("turn", gain.name, gain.index, float(slider.value)))
 
     def take_values(self, values):
-        """Parameters have these values now, whoever set them."""
+        """Parameters have these values now, set here or by another program."""
         for name, value in values.items():
             for i, number in enumerate(value if isinstance(value, list) else [value]):
                 slider = self._gains.get((name, i if isinstance(value, list) else None))
@@ -379,19 +383,24 @@ def header(state, reason, other=""):
     )
 
 
-def numbers(arm, heard, tip_error):
+def numbers(arm, snapshot, tip_error):
     """What the state says in numbers, as HTML."""
     rows = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{q:.3f}</td><td>{1e3 * (r - q):.2f}</td>"
         f"<td>{s:.2f}</td><td>{f:.2f}</td></tr>"
         for name, q, r, s, f in zip(
-            arm.joint_names, heard.q, heard.reference, heard.slow, heard.fast, strict=True
+            arm.joint_names,
+            snapshot.q,
+            snapshot.reference,
+            snapshot.slow,
+            snapshot.fast,
+            strict=True,
         )
     )
-    saturated = ' <b style="color:#e67700">torque at its limit</b>' if heard.saturated else ""
+    saturated = ' <b style="color:#e67700">torque at its limit</b>' if snapshot.saturated else ""
     return (
         '<div style="margin:0 0.8em 0.4em;font-size:0.8em">'
-        f'<span id="time">{heard.time:.2f}</span> s, motion <span id="trajectory">{heard.trajectory}</span>,'
+        f'<span id="time">{snapshot.time:.2f}</span> s, motion <span id="trajectory">{snapshot.trajectory}</span>,'
         f' tip error <span id="tip">{1e3 * tip_error:.2f}</span> mm{saturated}'
         '<table id="joints" style="width:100%;text-align:right;font-variant-numeric:tabular-nums">'
         '<tr style="color:#868e96"><td></td><td>[rad]</td><td>error [mrad]</td><td>slow [N m]</td><td>fast</td></tr>'
