@@ -805,7 +805,7 @@ def test_what_can_not_be_recorded_is_refused(tmp_path):
 def test_simulate_takes_a_bag_only_with_a_controller(capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["simulate", "R", "--bag", "x"])
-    assert end.value.code == 1 and "--bag: only with --controller" in capsys.readouterr().err
+    assert end.value.code == 1 and "only with --controller" in capsys.readouterr().err
 
 
 def test_an_arm_that_was_read_has_no_name_in_its_bag(tmp_path):
