@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/trajectories.md: what shapers and motions leave of vibration.
+"""Prints the tables of docs/trajectories.md: the residual vibration of shapers and motions.
 
-Made by `python docs/trajectories.py`.
-
-The arm gets the slow torque (10) of the motion and nothing else, no feedback: the full model, integrated, from rest.
+Run `python docs/trajectories.py`. Only the slow torque (10) of the motion acts on the arm, without feedback. The full
+model is integrated from rest.
 """
 
 import numpy as np
@@ -32,7 +31,7 @@ def simulate(arm, motion):
 
 
 def motions(arm, start, end, duration):
-    """Families side by side, all of the same duration: a shaped motion is the shorter before it is shaped."""
+    """Yield the families with their motions, all of the same duration: a shaped motion is shorter before shaping."""
     yield "quintic", profiles.quintic(start, end, duration)
     for k in (3, 4):
         yield f"smooth, smoothness {k}", profiles.smooth(start, end, duration, k)
@@ -45,7 +44,7 @@ def motions(arm, start, end, duration):
 
 
 def shaper_table():
-    """Residual vibration of the shapers where the mode is not where it was taken to be."""
+    """Print the residual vibration of the shapers for a wrong frequency of the mode."""
     offs = (0.0, 0.05, 0.1, 0.2, 0.3)
     print("| mode off by | " + " | ".join(f"{100 * off:g} %" for off in offs) + " |")
     print("|---" * (len(offs) + 1) + "|")

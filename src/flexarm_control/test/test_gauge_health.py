@@ -142,7 +142,7 @@ def test_a_gauge_that_can_be_spared_comes_back_after_as_many_good_samples(lab):
     assert out == [()] * 5 + [(1,)] * 20 + [()] * 15
 
 
-def test_gauges_of_another_link_give_theirs_and_the_modes_that_nobody_sees_are_named():
+def test_gauges_of_another_link_give_theirs_and_the_unobserved_modes_are_named():
     arm = model.build(arm_file.load("two_link"))
     health = health_of(arm)
     strain = np.array([1e-5, 1e-5, NAN, 1e-5])

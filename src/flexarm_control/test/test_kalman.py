@@ -540,26 +540,26 @@ def listening(arm, **options):
     """A Kalman filter behind its gauges, and a function that gives it the next sample of strains."""
     core = observe(arm, "kalman", options)
 
-    def hear(strain):
+    def receive(strain):
         s = ArmSample(1, 2, 4)
-        s.stamp_ns, s.session, s.sequence = (500 + hear.count) * 2 * MS, 1, hear.count
+        s.stamp_ns, s.session, s.sequence = (500 + receive.count) * 2 * MS, 1, receive.count
         s.torque[:], s.strain, s.amplitude = 0.0, np.array(strain), None
-        hear.count += 1
+        receive.count += 1
         core.step(s)
 
-    hear.count = 0
-    return core, hear
+    receive.count = 0
+    return core, receive
 
 
 def test_without_a_gauge_the_filter_knows_that_the_others_tell_less(lab):
-    core, hear = listening(lab, stuck_samples=5)
+    core, receive = listening(lab, stuck_samples=5)
     random = np.random.default_rng(0)
     noise = np.array([g.uncertainty for g in lab.arm.gauges])
     for _ in range(60):
-        hear(noise * random.standard_normal(4))
+        receive(noise * random.standard_normal(4))
     whole = core.observer.covariance_diagonal.copy()
     for _ in range(60):
-        hear([np.nan, *(noise[1:] * random.standard_normal(3))])
+        receive([np.nan, *(noise[1:] * random.standard_normal(3))])
     assert core.observer.gauges_lost == (0,)
     # R is what the amplitudes of the three gauges left scatter.
     strains = noise * random.standard_normal((20000, 4))
@@ -570,21 +570,21 @@ def test_without_a_gauge_the_filter_knows_that_the_others_tell_less(lab):
     assert (core.observer.covariance_diagonal > 1.05 * whole).all()
     # It comes back with the gauge.
     for _ in range(120):
-        hear(noise * random.standard_normal(4))
+        receive(noise * random.standard_normal(4))
     assert core.observer.gauges_lost == ()
     assert_allclose(core.observer.covariance_diagonal, whole, rtol=0.02)
 
 
 def test_a_calibration_is_no_innovation(lab):
-    core, hear = listening(lab, calibration_samples=20)
+    core, receive = listening(lab, calibration_samples=20)
     bias = np.array([20e-6, -35e-6, 5e-6, 3e-6])
     for _ in range(60):
-        hear(bias)
+        receive(bias)
     wrong = np.abs(core.observer.amplitude).max()
     assert wrong > 1e-4
     core.calibrate()
     for _ in range(5):
-        hear(bias)
+        receive(bias)
         assert np.abs(core.observer.innovation).max() < 1e-3 * wrong
         assert np.abs(core.observer.amplitude).max() < 1e-3 * wrong
         assert np.abs(core.observer.rate).max() < 1e-5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm gauges``: noise of the amplitudes, the best places, modes that can't be told apart."""
+"""``flexarm gauges``: noise of the amplitudes, the best places, modes that can't be distinguished."""
 
 import json
 from itertools import combinations
@@ -114,7 +114,7 @@ def test_the_best_places_are_better_than_the_present_ones_and_one_more_helps(cap
     assert place["assumed"] == ["1 microstrain rms of noise"]
 
 
-def test_modes_that_the_gauges_cannot_tell_apart_are_named(capsys):
+def test_modes_that_the_gauges_cannot_distinguish_are_named(capsys):
     code, out, _ = run(capsys, "R", "--modes", "3")
     assert code == 0
     assert "root, middle can't distinguish link1_y_mode1" in out

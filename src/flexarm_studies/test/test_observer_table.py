@@ -121,5 +121,5 @@ def test_what_the_command_can_not_use_it_refuses(words, field, value):
 
 
 def test_an_unknown_observer_is_refused_by_name():
-    with pytest.raises(UnknownComponentError, match="nobody"):
-        observer_table.table("R", [1000.0], {"none": (0.0, 0)}, [0.0], ["nobody"], 0.1)
+    with pytest.raises(UnknownComponentError, match="unknown_name"):
+        observer_table.table("R", [1000.0], {"none": (0.0, 0)}, [0.0], ["unknown_name"], 0.1)

@@ -319,7 +319,7 @@ def test_the_share_of_saturated_samples(arm_r):
     assert_allclose(metrics_of(record, arm_r)["saturation_share"], 100 / 401, rtol=1e-12)
 
 
-def test_under_gravity_errors_are_told_about_the_static_sag_as_well(tmp_path):
+def test_under_gravity_errors_about_the_static_sag_are_reported_as_well(tmp_path):
     def fall(data):
         data["gravity"] = [0.0, -9.81, 0.0]
 
@@ -670,7 +670,7 @@ def test_wrong_options_are_exit_code_1_and_named(capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-def test_noise_that_the_arm_file_does_not_state_is_said(capsys, tmp_path):
+def test_noise_that_the_arm_file_does_not_state_is_a_warning(capsys, tmp_path):
     def quiet(data):
         for gauge in data["gauges"]:
             gauge.pop("noise", None)

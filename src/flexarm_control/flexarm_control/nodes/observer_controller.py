@@ -2,7 +2,7 @@
 """Observer and controller in one process: the estimate goes to the controller by a call, not through the middleware.
 
 The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics; only
-`arm_state_estimate` is not subscribed to any more. It is published after the torque, where somebody listens.
+`arm_state_estimate` is not subscribed to any more. It is published after the torque, if it has subscribers.
 """
 
 from flexarm_ros.node import run
@@ -45,7 +45,7 @@ class Handover:
         self._publisher, self._controller = publisher, controller
 
     def publish(self, message):
-        """Have the controller answer, then publish for whoever listens."""
+        """Have the controller answer, then publish if the topic has subscribers."""
         self._controller.take(message)
         if self._publisher.get_subscription_count():
             self._publisher.publish(message)
