@@ -18,6 +18,7 @@ from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
 from flexarm_dynamics.errors import DesignError, ParameterError
 from flexarm_dynamics.models.model import build
 from flexarm_dynamics.parameters import check_all
+from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 MS = 10**6  # [ns]
 FILE_LIMIT = 10.0 * POUND_FORCE_FOOT  # [N m] of arm R
@@ -659,6 +660,17 @@ def test_a_limit_exceeded_by_half_is_a_fault_at_once(arm_r):
     assert_array_equal(core.torque, [0.0])
 
 
+def test_a_limit_that_stays_exceeded_is_a_fault_when_its_patience_is_over(arm_r):
+    core = controller(arm_r, tracking_error_limit=0.2, limit_patience=0.1)
+    core.step(sample(0))
+    states = []
+    for k in range(1, 200):
+        core.step(sample(k, 0.25))
+        states.append(core.state)
+    assert 99 <= states.index(State.FAULT) <= 101
+    assert "in spite of the stop" in core.reason
+
+
 def test_a_limit_that_holds_again_is_forgiven(arm_r):
     core = controller(arm_r, tracking_error_limit=0.2, limit_patience=0.1)
     core.step(sample(0))
@@ -698,6 +710,18 @@ def limited():
     joint = arm.joints[0]
     limits = replace(joint.limits, position=(-3.14, 3.14), velocity=10.0)
     return build(replace(arm, joints=(replace(joint, limits=limits),)))
+
+
+@pytest.mark.parametrize(("beyond", "state"), [(-0.005, State.TRACKING), (0.005, State.STOPPING)])
+def test_the_range_of_a_joint_is_kept_with_its_braking_distance(beyond, state):
+    model, limit, speed, margin = limited(), 10.0, 5.0, 0.05
+    _, B = slow_subsystem(model.terms(np.zeros(1), np.zeros(1)))
+    distance = speed**2 / (2.0 * B[0, 0] * limit)
+    settings = {"tracking_error_limit": 0.0, "position_margin": margin, "torque_limit": [limit]}
+    core = controller(model, **settings)
+    k = tracking(core, 20)
+    core.step(sample(k, 3.14 + margin - distance + beyond, velocity=[speed]))
+    assert core.state == state, core.reason
 
 
 def test_a_torque_at_its_limit_for_long_stops_the_arm(arm_r):
