@@ -18,7 +18,7 @@ def arm_r():
 
 @pytest.fixture(scope="session")
 def arm_p3():
-    """Model of the paper's arm, data that reproduces print."""
+    """Model of the paper's arm, data that reproduces the published numbers."""
     return model.build(arm_file.load("P3"))
 
 

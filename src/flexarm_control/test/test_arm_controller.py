@@ -69,7 +69,7 @@ def answer(core):
 
 
 class Scripted:
-    """A law that gives what it is told to."""
+    """A law that returns the given torques."""
 
     def __init__(self, *torques):
         self.torques = list(torques)
@@ -779,7 +779,7 @@ def test_limits_are_taken_whole_or_not_at_all():
 
 
 @pytest.mark.parametrize("slow", ["linear_model_following", "adaptive_model_following"])
-def test_a_rehearsal_leaves_nothing_behind(arm_r, slow):
+def test_a_warm_up_leaves_nothing_behind(arm_r, slow):
     def made():
         return controller(arm_r, design(arm_r, {"type": slow}, FAST))
 

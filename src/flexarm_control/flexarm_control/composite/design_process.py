@@ -31,7 +31,7 @@ class _Pickler(pickle.Pickler):
     """Writes every model of the arm as a name."""
 
     def __init__(self, file, arm):
-        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        super().__init__(file, protocol=-1)
         self._arm = arm
 
     def persistent_id(self, obj):

@@ -9,8 +9,8 @@ with V the stabilising solution of
 
 .. math:: 0 = V(A_2 + \alpha I) + (A_2 + \alpha I)^T V - V B_2 R^{-1} B_2^T V + Q .
 
-(Print has exp(-alpha tau) in (18); its Riccati equation (20) is that of exp(+2 alpha t).) A2 and B2 of (11)
-are taken at one joint configuration, the trajectory's end, so that no Riccati equation is solved under way.
+(The published (18) has exp(-alpha tau); the published Riccati equation (20) is that of exp(+2 alpha t).)
+A2 and B2 of (11) are taken at one joint configuration, the end of the trajectory: no design is made under way.
 Every eigenvalue of the closed boundary layer has a real part below -alpha.
 """
 

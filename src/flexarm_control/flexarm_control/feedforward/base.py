@@ -46,7 +46,7 @@ class Feedforward(Component, ABC):
     torque : ndarray, shape (n,)
         What makes it [N m].
     limit : ndarray, shape (n,)
-        Torque limit in force [N m]; infinite: none.
+        Active torque limit [N m]; infinite: none.
     """
 
     #: Whether `prepare` has anything to do.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller of an arm: reference, composite control, limits; what happens when a state is bad is `supervisor`'s."""
+"""The controller of an arm: reference, composite control and limits, supervised; samples in, torques out."""
 
 import numpy as np
 
@@ -119,7 +119,7 @@ class ArmController:
 
     @property
     def torque_limit(self):
-        """Limit in force, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
+        """Active limit, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
         return self._limit
 
     @property
@@ -274,7 +274,7 @@ class ArmController:
         law.fast_fraction = self._fast_fraction(law.fast_fraction, dt)
         try:
             u = law.step(q, qd, sample.amplitude, sample.rate, reference, dt)
-        except Exception as error:  # a law may be anybody's: whatever it raises, no torque follows
+        except Exception as error:  # a user's law may raise anything: no torque then
             self.fail(f"the control law failed: {type(error).__name__}: {error}")
             return False
         if not (u.dot(u) < np.inf or np.isfinite(u).all()):

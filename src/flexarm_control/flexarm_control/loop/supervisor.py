@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Safety supervisor: which state the controller is in, and what it may not let happen.
+r"""Safety supervisor: the controller's state, and the limits that stop the arm.
 
 States and what leads from one to the next:
 
-- INACTIVE: no torque; until a valid state and a converged observer, then READY. Left and entered without help.
-- READY, TRACKING, HOLDING: torque; before, during and after a trajectory.
-- STOPPING: torque; the *reference* is brought to rest from where it is (not from the measurement), while the fast
-  control goes on damping; then HOLDING.
-- FAULT: no torque, so that each joint's safe action acts; stays until `Supervisor.recover`.
+- INACTIVE: no torque; until a valid state and a converged observer, then READY. Entered and left automatically.
+- READY, TRACKING, HOLDING: torque, before, during and after a trajectory.
+- STOPPING: torque. The *reference* is brought to rest from where it is (not from the measurement) while the fast
+  control continues to damp; then HOLDING.
+- FAULT: no torque, so that each joint's safe action acts, until `Supervisor.recover`.
 
-A smooth stop follows when a limit is exceeded, `ratio` above 1:
+The arm is stopped smoothly when a limit is exceeded, that is, when one of these ratios is above 1:
 
 .. math:: |q_r - q|/e_{max},\; |\dot q|/\dot q_{max},\; |\delta|/\delta_{max},\; |\varepsilon|/\varepsilon_{max},\;
           t_{saturated}/t_{max}
 
 and, for the joints' range with braking distance, :math:`q + \dot q|\dot q|/2D` with D the deceleration that the
-torque limit allows. A fault follows above `FAULT_RATIO`, or when a limit stays exceeded for `limit_patience`, and at
-once where the state can't be trusted.
+torque limit allows. A ratio above `FAULT_RATIO` is a fault, and so is a limit that stays exceeded for `limit_patience`,
+or a state that can't be trusted.
 """
 
 from enum import IntEnum
@@ -33,8 +33,8 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 FAULT_RATIO = 1.5
 #: Deceleration of a joint whose torque has no limit [rad/s^2].
 FREE_DECELERATION = 10.0
-#: Part of the deceleration which the torque limit allows that a smooth stop takes.
-STOP_SHARE = 0.5
+#: A smooth stop uses this fraction of the deceleration that the torque limit allows.
+STOP_FRACTION = 0.5
 
 PARAMETERS = (
     parameter("tracking_error_limit", 0.5, "rad", 0.0, 100.0).described(
@@ -98,7 +98,7 @@ class Supervisor:
     settings : mapping
         Checked values of `PARAMETERS`.
     torque_limit : ndarray, shape (n,)
-        In force [N m]; infinite where there is none.
+        Active [N m]; infinite where there is none.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Supervisor:
         n = self.model.n_joints
         able = _deceleration(self.model, torque_limit)
         wanted = np.array(settings["stop_deceleration"])
-        finite = np.where(np.isfinite(able), STOP_SHARE * able, FREE_DECELERATION)
+        finite = np.where(np.isfinite(able), STOP_FRACTION * able, FREE_DECELERATION)
         fastest = np.array([j.limits.velocity for j in arm.joints])
         limit = np.concatenate(
             [

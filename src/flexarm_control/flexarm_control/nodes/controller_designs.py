@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changed parameters of the controller node: put into force, after a design where they need one, or set back."""
+"""Changed parameters of the controller node: applied, after a design where they need one, or set back."""
 
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 
@@ -11,7 +11,7 @@ from .controller_parameters import of_design, of_limits
 
 
 class Designs:
-    """Puts changed parameters into force, or sets them back to those that are.
+    """Applies changed parameters, or sets them back to the active ones.
 
     Parameters
     ----------
@@ -66,9 +66,9 @@ class Designs:
             log.error(f"design refused, the old law goes on: {kind}{error}")
             self._set_back(values, self._design)
 
-    def _set_back(self, values, in_force):
-        """Set the parameters that differ from those in force back to them."""
-        old = [RosParameter(name, value=v) for name, v in in_force.items() if values[name] != v]
+    def _set_back(self, values, active):
+        """Set the parameters that differ from the active ones back to those."""
+        old = [RosParameter(name, value=v) for name, v in active.items() if values[name] != v]
         self._node.hand_over(self._node.set_parameters_atomically, old)
 
     def close(self):

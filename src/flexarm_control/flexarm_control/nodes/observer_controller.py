@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observer and controller in one process: the estimate goes to the controller by a call, not through the middleware.
+"""Observer and controller in one process: the estimate reaches the controller by a call, not by a message.
 
 The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics; only
 `arm_state_estimate` is not subscribed to any more. It is published after the torque, if it has subscribers.
@@ -33,7 +33,7 @@ class CalledController(ControllerNode):
 
 
 class Handover:
-    """Stands in the place of the publisher of estimates.
+    """Takes the place of the publisher of estimates.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ class AdaptiveModelFollowing(SlowLaw):
     learning : float
         Rate of the estimate at the last sample [1/s].
     model : PayloadModel
-        The arm with that payload; whoever calls `torque` takes the terms from it.
+        The arm with that payload; the `terms` that `torque` gets are taken from it.
 
     Raises
     ------
@@ -188,7 +188,7 @@ class AdaptiveModelFollowing(SlowLaw):
             u += self._coriolis(self._one.forces, q, qd, s)
             u += (self.model.scale - 1.0) * self._coriolis(self._difference, q, qd, s)
         beyond = (np.abs(u) > self._limit).any()
-        heard = s - np.clip(s, -self._dead_zone, self._dead_zone)
+        beyond_zone = s - np.clip(s, -self._dead_zone, self._dead_zone)
         Y = self.regressor(q, qd, speed, acceleration)
-        self.learning = 0.0 if beyond else self.gamma * float(Y @ heard)
+        self.learning = 0.0 if beyond else self.gamma * float(Y @ beyond_zone)
         return u

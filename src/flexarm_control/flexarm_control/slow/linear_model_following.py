@@ -4,8 +4,8 @@ r"""Linear model following, (17) of Siciliano & Book (1986), for any number of j
 .. math::
     \bar u = B^{-1}(q)\,[\ddot\theta_{ref} + k_v(\dot\theta_{ref} - \dot\theta) + k_p(\theta_{ref} - \theta)]
 
-with B of the slow subsystem (10), whose inverse is the rigid arm's inertia: `m11` for one link. Print
-multiplies by ``1/h11`` instead, with H = M^-1: the slow poles are then not where they were designed
+with B of the slow subsystem (10), whose inverse is the rigid arm's inertia: `m11` for one link. The
+published law multiplies by ``1/h11``, with H = M^-1: the slow poles are then not where they were designed
 (-2.14 +- 0.88j instead of the double pole -2.5 on the paper's arm). ``gain: h11`` reproduces that.
 
 Assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. Else use `model_following`.
@@ -26,7 +26,7 @@ class LinearModelFollowing(SlowLaw):
         KP,
         KV,
         parameter("gain", "m11", choices=("m11", "h11")).described(
-            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as print has it."
+            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as published."
         ),
     )
 

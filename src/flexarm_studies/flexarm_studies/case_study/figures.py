@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures 2-11 of the paper, slow control against composite; one figure, one story.
 
-Axes are in the paper's units (degrees, feet, lbf ft), so that they can be laid beside print.
+Axes are in the paper's units (degrees, feet, lbf ft), so that they can be laid beside the published ones.
 """
 
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop without ROS: the very objects that the nodes call, sample by sample; and the continuous loop."""
+"""The loop without ROS: the same objects that the nodes call, sample by sample; and the continuous loop."""
 
 from collections import deque
 
@@ -141,9 +141,9 @@ class ClosedLoop:
 
     #: The observer has this long to converge [s].
     MAX_START = 10.0
-    #: A longer delay than this is a wrong number [s].
+    #: A longer delay is taken for a mistake [s].
     MAX_DELAY = 1.0
-    #: A joint farther than this off its reference is not controlled any more [rad].
+    #: The loop counts as lost when a joint is farther from its reference [rad].
     MAX_ERROR = 2.0 * np.pi
 
     def step(self):

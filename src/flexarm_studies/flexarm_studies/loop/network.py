@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network between the arm and its control: samples are lost and late, and the loop goes on as the nodes do.
+"""A network that loses and delays samples between the arm and its control.
 
-A sample of `arm_state` is lost with a probability, each on its own; else it arrives after ``delay`` and a random
-time, uniform from 0 to ``jitter``, drawn anew for each. One that arrives after a newer one is dropped, as a DDS
-reader drops it. Observer and controller answer at arrival, and the torque acts at once: what is late on the way of
-the torque has the same effect on the arm as what is late on the way of the sample.
+Each sample of `arm_state` is lost with a given probability, independently of the others; else it arrives after
+``delay`` and a random time, uniform from 0 to ``jitter``. One that arrives after a newer one is dropped, as a DDS
+reader drops it. Observer and controller answer at arrival, as the nodes do, and the torque acts at once: a delay of
+the torque would have the same effect on the arm as a delay of the sample.
 
 The driver's rules are those of `flexarm_ros.torque_gate`: a torque acts until the next one, but no longer than
-`TORQUE_TIMEOUT` after the sample that it answers; then each joint's safe action does. The controller gives up
-without a sample for `STATE_TIMEOUT`, as its node does.
+`TORQUE_TIMEOUT` after the sample that it answers; then each joint's safe action acts. As in its node, the
+controller disables the torque after `STATE_TIMEOUT` without a sample.
 """
 
 import math
@@ -22,11 +22,11 @@ from flexarm_dynamics.errors import FlexarmError, MessageError
 
 from .closed_loop import ClosedLoop
 
-#: A torque is too old when it answers a sample that was measured longer ago [s].
+#: Maximum age of the sample that a torque answers [s].
 TORQUE_TIMEOUT = 0.05
-#: Without a sample for so long the controller gives up [s].
+#: The controller disables the torque after this long without a sample [s].
 STATE_TIMEOUT = 0.5
-#: A trajectory starts so long after it was sent [s].
+#: From sending a trajectory to its start [s].
 LEAD = 0.1
 
 
@@ -100,14 +100,14 @@ class NetworkedLoop(ClosedLoop):
     Attributes
     ----------
     timeouts : int
-        How often the driver went over to the safe action for want of a fresh torque.
+        How often the driver took the safe action because there was no fresh torque.
     """
 
     def __init__(self, *args, network, **others):
         super().__init__(*args, **others)
         self.network = network
         self.timeouts = 0
-        self._sent, self._heard_ns = -1, self.simulator.stamp_ns
+        self._sent, self._last_arrival_ns = -1, self.simulator.stamp_ns
         self._torque, self._until_ns = None, 0
 
     def follow(self, trajectory, duration):
@@ -140,14 +140,14 @@ class NetworkedLoop(ClosedLoop):
             self.network.send(copied(self.measure()))
         while arrived := self.network.receive(now):
             self._take(*arrived)
-        if now - self._heard_ns > 1e9 * STATE_TIMEOUT and self.controller.enabled:
+        if now - self._last_arrival_ns > 1e9 * STATE_TIMEOUT and self.controller.enabled:
             self.controller.distrust(f"no sample for {STATE_TIMEOUT:g} s")
             self._torque = None
         return self.controller.enabled
 
     def _take(self, now_ns, sample):
         """Observer and controller on a sample that arrives; the driver on their torque."""
-        self._heard_ns = now_ns
+        self._last_arrival_ns = now_ns
         enabled = self._answer_to(sample)
         self._torque = self.controller.torque.copy() if enabled else None
         self._until_ns = sample.stamp_ns + round(1e9 * TORQUE_TIMEOUT)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run of an arm under control, described by plain data: what `flexarm simulate --controller` runs.
 
-A scenario says which arm, which parameters of observer and controller, which motion, and in what the arm differs
-from what its controller knows. It goes through JSON and to other processes; the same scenario gives the same
-samples, to the last bit.
+A scenario states the arm, the parameters of observer and controller, the motion, and how the simulated arm differs
+from the one that its controller knows. It can be written as JSON and sent to other processes; the same scenario
+gives the same samples, to the last bit.
 """
 
 import difflib
@@ -29,10 +29,10 @@ from .closed_loop import ClosedLoop
 from .metrics import tracking_metrics
 from .network import Network, NetworkedLoop
 
-#: Parameters of the nodes themselves: they say nothing of the loop.
+#: Parameters of the nodes themselves: they do not affect the loop.
 OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
 CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS)
-#: What a scenario says itself.
+#: Fields of a scenario have these.
 OF_SCENARIOS = ("plant_arm", "plant_modes", "noise", "seed")
 
 
@@ -79,7 +79,7 @@ class Scenario:
     tolerance : float
         Of the tip, for the settling time [m].
     repeat : int
-        How often the motion is carried out, for laws that learn. In between the arm goes back the way it came.
+        Number of times that the motion is run, for laws that learn; in between the arm returns the same way.
     """
 
     arm: str
@@ -129,7 +129,7 @@ def parameters(file, settings=()):
     nodes = parameter_files.load(file)
     of_simulator = {p.name for p in SIMULATOR_PARAMETERS}
     found = {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
-    # The rate is the simulator's: what the controller is told of it is for other sources.
+    # The rate is the simulator's; the controller's parameter of that name is for other sources.
     found |= {k: v for k, v in nodes["simulator"].items() if k in of_simulator}
     for node in ("observer", "controller"):
         own = parameter_files.PREFIXES[node]
