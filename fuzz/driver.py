@@ -22,7 +22,7 @@ MOST = 2**53
 class Lines(Reader):
     """`protocol`: a frame is one, whole and of numbers that a message holds; else it is none."""
 
-    name, share, error, batch = "serial line", 5.0, (), 5
+    name, weight, error, batch = "serial line", 5.0, (), 5
 
     def run(self, rng):
         lines, found, clock = protocol.Lines(), [], MeasurementTime()

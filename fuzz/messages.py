@@ -105,7 +105,7 @@ def same(array_, values):
 class States(Reader):
     """`StateReader`: names in any order, lengths, everything beside."""
 
-    name, share, error = "state message", 18.0, MessageError
+    name, weight, error = "state message", 18.0, MessageError
     words = (
         "header.stamp",
         *STATE_FIELDS,
@@ -156,7 +156,7 @@ class States(Reader):
 class Torques(Reader):
     """`TorqueReader`: what may move an arm."""
 
-    name, share, error = "torque message", 18.0, MessageError
+    name, weight, error = "torque message", 18.0, MessageError
     words = ("joint_names", "torque", "mode")
 
     def __init__(self, arm="two_link"):
@@ -186,7 +186,7 @@ class Torques(Reader):
 class Gate(Reader):
     """`TorqueGate`: a driver's life with any controllers."""
 
-    name, share, batch = "torque gate", 6.0, 20
+    name, weight, batch = "torque gate", 6.0, 20
     TIMEOUT = 0.05
 
     def __init__(self, arm="two_link"):

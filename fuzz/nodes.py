@@ -284,11 +284,11 @@ def fuzz(count, seed, say, patience=180.0):
         bench.patience = max(bench.patience, patience)
         nodes = Nodes(bench, seed)
 
-        def part(name, share, action):
+        def part(name, fraction, action):
             tally, started = Tally(f"DDS {name}"), time.perf_counter()
             tallies.append(tally)
             try:
-                action(max(1, round(share * count)), tally)
+                action(max(1, round(fraction * count)), tally)
             except Exception as error:
                 tally.failures += 1
                 tally.first["died"] = (

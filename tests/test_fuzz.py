@@ -48,6 +48,10 @@ def test_a_reader_takes_or_refuses_whatever_it_is_given(name):
     assert tally.accepted or name in INPUTS  # where nothing is read, nothing was checked
 
 
+def test_every_reader_has_a_weight_of_its_own():
+    assert all("weight" in vars(kind) for kind in command.readers().values())
+
+
 class Broken(reader.Reader):
     """A reader with every fault there is."""
 
