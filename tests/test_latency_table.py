@@ -111,7 +111,7 @@ def row(chain, median, missed):
 
 
 @pytest.mark.parametrize(
-    ("load", "median", "missed", "said"),
+    ("load", "median", "missed", "words"),
     [
         (0.2, 0.7, 0.04, ""),
         (3.0, 0.7, 0.04, "3.0 processes per CPU"),
@@ -119,10 +119,10 @@ def row(chain, median, missed):
         (0.2, 0.7, 0.45, "45 % of the relay's samples"),
     ],
 )
-def test_a_busy_machine_is_known_by_its_load_and_by_the_relay(load, median, missed, said):
+def test_a_busy_machine_is_known_by_its_load_and_by_the_relay(load, median, missed, words):
     everything = [{"rows": [row("relay", median, missed), row("three processes", 9.0, 0.9)]}]
     found = latency.too_busy(load, everything)
-    assert said in found and bool(found) == bool(said)
+    assert words in found and bool(found) == bool(words)
 
 
 def test_a_busy_machine_writes_no_table_unless_forced(tmp_path, monkeypatch, capsys):

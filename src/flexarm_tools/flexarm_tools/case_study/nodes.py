@@ -59,4 +59,4 @@ def run_nodes(run, directory, progress=lambda fraction: None):
     bag = directory / "bag"
     shutil.rmtree(bag, ignore_errors=True)
     recorder.write_bag(bag, samples, run.arm)
-    return recorder.to_record(recorder.decode(samples), start), timing
+    return recorder.to_record(samples, start), timing

@@ -225,11 +225,13 @@ def _bag(path):
     if path.is_dir() and not _is_bag(path):
         inside = sorted(p.parent for p in path.glob("**/metadata.yaml"))[:8]
         hint = f"; there are {', '.join(map(str, inside))}" if inside else ""
-        raise FlexarmError(f"{path}: no bag: neither metadata.yaml nor a .mcap file is in it{hint}")
+        raise FlexarmError(
+            f"is no bag: neither metadata.yaml nor a .mcap file is in it{hint}", field=str(path)
+        )
     if path.is_file() and path.name == "metadata.yaml":
         return path.parent
     if path.is_file() and path.suffix not in (".mcap", ".db3"):
-        raise FlexarmError(f"{path}: no bag: a folder, a .mcap or a .db3 file is wanted")
+        raise FlexarmError("is no bag", field=str(path), limit="a folder, a .mcap or a .db3 file")
     return path
 
 

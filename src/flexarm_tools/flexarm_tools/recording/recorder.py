@@ -116,16 +116,12 @@ class Recorder:
         return kept
 
 
-def decode(samples, topics=("arm_state", "arm_state_estimate", "controller/state")):
-    """Messages of `Recorder.samples`, topic to list, in order of their stamps."""
-    return {
+def to_record(samples, start_ns):
+    """A `Record` of `Recorder.samples`; time zero at `start_ns`."""
+    messages = {
         topic: [deserialize_message(raw, TOPICS[topic]) for raw in samples[topic].values()]
-        for topic in topics
+        for topic in ("arm_state", "arm_state_estimate", "controller/state")
     }
-
-
-def to_record(messages, start_ns):
-    """A `Record` from decoded messages; time zero at `start_ns`."""
 
     def table(topic, field):
         rows = [getattr(m, field) for m in messages[topic]]

@@ -15,7 +15,7 @@ from flexarm_dynamics.processes import step_back
 from flexarm_studies.loop import parameter_files
 
 #: Pictures per second, and the most of them.
-RATE, MOST = 30.0, 100.0
+RATE, MAX_RATE = 30.0, 100.0
 #: Points of the tip's way.
 TRAIL = 300
 #: The page's process, beside the nodes'.
@@ -96,15 +96,22 @@ def check(options):
     ------
     FlexarmError
     """
-    if not 0.1 <= options.rate <= MOST:
-        raise ParameterError(f"--rate {options.rate:g}: from 0.1 to {MOST:g} pictures per second")
+    if not 0.1 <= options.rate <= MAX_RATE:
+        raise ParameterError(
+            "is out of range",
+            field="--rate",
+            value=options.rate,
+            limit=f"from 0.1 to {MAX_RATE:g} pictures per second",
+        )
     if options.attach:
         for name in ("controller", "lockstep"):
             if getattr(options, name):
-                raise ParameterError(f"--{name}: not with --attach, where the nodes run already")
+                raise ParameterError(
+                    "is not possible with --attach, where the nodes run already", field=f"--{name}"
+                )
         return
     if options.namespace:
-        raise ParameterError("--namespace: only with --attach")
+        raise ParameterError("is possible only with --attach", field="--namespace")
     options.controller, options.arm = files(options.controller, options.arm)
     arm_file.load(options.arm)
 
