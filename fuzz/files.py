@@ -26,7 +26,7 @@ from flexarm_studies.commands import gauges
 from flexarm_studies.identification import recording
 from flexarm_studies.loop import parameter_files
 from flexarm_tools.check_driver import listening
-from flexarm_tools.check_driver.samples import Heard, Verdict, samples
+from flexarm_tools.check_driver.samples import Received, Verdict, samples
 from flexarm_tools.identification.recording import of_contents
 from flexarm_tools.recording import bag
 
@@ -347,7 +347,7 @@ class Driver(Reader):
     def read(self, given):
         found = listening.check_layout(self.arm, given)
         if given and not any(f.verdict is Verdict.FAIL for f in found):
-            received = [Heard(m, 0.001 * k, 10**9 + 10**6 * k) for k, m in enumerate(given)]
+            received = [Received(m, 0.001 * k, 10**9 + 10**6 * k) for k, m in enumerate(given)]
             found.append(listening.check_finite(self.arm, samples(self.arm, received)))
         return found
 

@@ -83,24 +83,22 @@ class ControllerNode(ArmNode):
         self._workers = ()
 
     def _make_topics(self):
-        options = {"qos_overriding_options": qos.overridable()}
-        self._torque_pub = self.make_publisher(JointTorque, "joint_torque", qos.LINE, **options)
+        options = qos.overridable()
+        self._torque_pub = self.make_publisher(
+            JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
+        )
         self._state_pub = self.make_publisher(
-            CompositeState, "controller/state", qos.LINE, **options
+            CompositeState, "controller/state", qos.LINE, qos_overriding_options=options
         )
-        self.make_line(
-            self.make_subscription(
-                ArmState, "arm_state_estimate", self._on_state, qos.LINE, **options
-            )
-        )
+        # fmt: off
+        self.make_line(self.make_subscription(
+            ArmState, "arm_state_estimate", self._on_state, qos.LINE, qos_overriding_options=options
+        ))
         self.make_subscription(
-            JointTrajectory,
-            "joint_trajectory",
-            self._inbox.receive,
-            qos.COMMAND,
-            raw=True,
-            **options,
+            JointTrajectory, "joint_trajectory", self._inbox.receive, qos.COMMAND, raw=True,
+            qos_overriding_options=options,
         )
+        # fmt: on
         self.make_service(Trigger, "~/stop", self._on_stop)
         self.make_service(Trigger, "~/recover", self._on_recover)
         self.make_service(SetBool, "~/enable_fast", self._on_enable_fast)
