@@ -115,7 +115,7 @@ REFUSALS = {
     "negative field": (
         "observer",
         {"arm": arm_file_with("mass_per_length: 0.2453384470152408", "mass_per_length: -0.2")},
-        r"links\[0\]\.mass_per_length: -0.2.* must be greater than 0",
+        r"links\[0\]\.mass_per_length: -0.2.* is too small",
     ),
     "misspelt field": (
         "controller",

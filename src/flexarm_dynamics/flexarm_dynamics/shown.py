@@ -9,7 +9,7 @@ _REPR.maxstring = _REPR.maxother = 80
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxset = _REPR.maxdict = _REPR.maxarray = 12
 _REPR.maxlevel = 3
 #: No value takes more room in a message [characters].
-LONGEST = 400
+MAX_LENGTH = 400
 
 
 def show(value):
@@ -18,7 +18,7 @@ def show(value):
         text = _REPR.repr(value)
     except Exception:  # a value's own repr may raise, and an int too long for one does
         return f"a {type(value).__name__}"
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+    return text if len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}…"
 
 
 def number(value):

@@ -258,7 +258,7 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_f):
     kp, kv : array_like, shape (n,)
         Slow gains [1/s^2], [1/s].
     B_inverse : ndarray, shape (n, n)
-        What the slow law multiplies by: the inverse of B, or 1/h11 as print has it [kg m^2].
+        What the slow law multiplies by: the inverse of B, or 1/h11 as published [kg m^2].
     K_f : ndarray, shape (n, 2m)
         Gain of (15), u_f = K_f z_f; zero for slow control alone.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arm files: what is read, and what every kind of malformed file is told."""
+"""Arm files: what is read, and how every kind of malformed file is refused."""
 
 import copy
 import math
@@ -91,7 +91,7 @@ def refused(text):
     """Message of the error that this text must give; it starts with the path."""
     with pytest.raises(ArmFileError) as error:
         arm_file.parse(text)
-    assert str(error.value) == f"{error.value.field}: {error.value.problem}"
+    assert str(error.value).startswith(f"{error.value.field}: ")
     return str(error.value)
 
 
@@ -340,7 +340,7 @@ def test_a_name_that_is_no_file_is_refused(name):
 def test_errors_of_a_file_name_the_file_first(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(changed(("links", 0, "length"), -1.0))
-    with pytest.raises(ArmFileError, match=r"^mine\.yaml: links\[0\]\.length: -1\.0 must be"):
+    with pytest.raises(ArmFileError, match=r"^mine\.yaml: links\[0\]\.length: -1\.0 is too small"):
         arm_file.load(path)
 
 
@@ -410,8 +410,10 @@ def test_a_negative_number_is_refused(path):
 
 @pytest.mark.parametrize("path", POSITIVE, ids=spelled)
 def test_zero_is_refused_where_it_has_no_meaning(path):
-    assert refused(changed(path, 0.0)).startswith(f"{spelled(path)}: 0.0 must be greater than 0 [")
-    assert refused(changed(path, 1e-200)).endswith("is too small")
+    assert refused(changed(path, 0.0)).startswith(
+        f"{spelled(path)}: 0.0 is too small (greater than 0"
+    )
+    assert refused(changed(path, 1e-200)).endswith("is too small (at least 1e-30)")
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -427,7 +429,7 @@ def test_a_number_that_is_not_finite_is_refused(path, value):
 def test_a_number_beyond_all_measure_is_refused(path, value):
     message = refused(changed(path, value))
     assert message.startswith(f"{spelled(path)}: ")
-    assert message.endswith("is too large")
+    assert message.endswith("is too large (at most 1e+30)")
 
 
 @pytest.mark.parametrize(
@@ -524,8 +526,8 @@ def test_a_field_given_twice_is_refused(text, start):
 @pytest.mark.parametrize(
     "path, value, words",
     [
-        (("units",), "metric", "'metric' is not one of si, imperial"),
-        (("units",), "imperail", "'imperial'?"),
+        (("units",), "metric", "'metric' is not one of the choices (si, imperial)"),
+        (("units",), "imperail", "did you mean 'imperial'?"),
         (("name",), 5, "5 is not text"),
         (("name",), "", "empty"),
         (("name",), ["a"], "a list is not text"),
@@ -538,39 +540,59 @@ def test_a_field_given_twice_is_refused(text, start):
         (("joints",), "a", "a list is wanted, not 'a'"),
         (("joints", 0), "a", "a mapping is wanted, not 'a'"),
         (("joints", 0), None, "a mapping is wanted, not nothing"),
-        (("joints", 0, "axis"), [0, 0, 0], "its length is zero"),
+        (("joints", 0, "axis"), [0, 0, 0], "is of length zero"),
         (("joints", 0, "axis"), [0, 1], "3 numbers is wanted, not 2 values"),
         (("joints", 0, "origin"), [0, 0, 0], "a mapping is wanted, not a list"),
         (("joints", 0, "limits", "position"), [1.0, -1.0], "low must be below high"),
         (("joints", 0, "limits", "position"), [1.0, 1.0], "low must be below high"),
-        (("joints", 0, "safe_action"), "stop", "'stop' is not one of brake, damp, zero"),
+        (
+            ("joints", 0, "safe_action"),
+            "stop",
+            "'stop' is not one of the choices (brake, damp, zero)",
+        ),
         (("joints", 0, "encoder_counts"), 1.5, "1.5 is not an integer"),
         (("joints", 0, "encoder_counts"), True, "True is not an integer"),
-        (("joints", 0, "encoder_counts"), -1, "-1 must be from 0 to"),
-        (("joints", 0, "encoder_counts"), 10**400, "more than 64 bits must be from 0 to"),
-        (("links",), [], "empty: an arm has at least one link"),
-        (("links", 0, "flexible", "y", "modes"), 0, "0 must be from 1 to 20"),
-        (("links", 0, "flexible", "y", "modes"), 21, "21 must be from 1 to 20"),
+        (("joints", 0, "encoder_counts"), -1, "-1 is out of range (0 to"),
+        (("joints", 0, "encoder_counts"), 10**400, "more than 64 bits is out of range (0 to"),
+        (("links",), [], "empty; an arm has at least one link"),
+        (("links", 0, "flexible", "y", "modes"), 0, "0 is out of range (1 to 20)"),
+        (("links", 0, "flexible", "y", "modes"), 21, "21 is out of range (1 to 20)"),
         (("links", 0, "flexible", "y", "modes"), 2.0, "2.0 is not an integer"),
-        (("links", 0, "flexible", "y", "shape"), "free", "is not one of clamped_free, loaded"),
-        (("links", 0, "flexible", "y", "damping"), [0.1, 1.0], "from 0 to 1"),
-        (("links", 0, "flexible", "y", "damping"), [-0.1], "from 0 to 1"),
+        (
+            ("links", 0, "flexible", "y", "shape"),
+            "free",
+            "is not one of the choices (clamped_free, loaded",
+        ),
+        (
+            ("links", 0, "flexible", "y", "damping"),
+            [0.1, 1.0],
+            "is out of range (from 0 to below 1)",
+        ),
+        (("links", 0, "flexible", "y", "damping"), [-0.1], "is out of range (from 0 to below 1)"),
         (("links", 0, "flexible", "z", "frequencies"), [11.0, 2.0], "positive and ascending"),
         (("links", 0, "flexible", "z", "frequencies"), [2.0, 2.0], "positive and ascending"),
         (("links", 0, "flexible", "z", "frequencies"), [0.0, 2.0], "positive and ascending"),
         (("links", 0, "flexible", "z", "frequencies"), [], "0 frequencies for 1 modes"),
         (("links", 0, "flexible", "z", "frequencies"), 2.0, "a list of 1 numbers is wanted"),
         (("links", 0, "flexible", "x"), {"modes": 1}, "no such field"),
-        (("links", 1, "section", "shape"), "disc", "'disc' is not one of rectangle, tube"),
-        (("links", 1, "EI_y"), 1.0, "give either a section or the stiffnesses, not both"),
+        (
+            ("links", 1, "section", "shape"),
+            "disc",
+            "'disc' is not one of the choices (rectangle, tube)",
+        ),
+        (("links", 1, "EI_y"), 1.0, "beside a section; give either a section or the stiffnesses"),
         (("links", 1, "mass_per_length"), 1.0, "give either a section or the stiffnesses"),
         (("payload", "inertia"), -1.0, "not positive semi-definite"),
         (("payload", "inertia"), [1.0, 1.0, 1.0], "a list of 6 numbers is wanted, not 3 values"),
         (("payload", "inertia"), [1, 1, 1, 2, 0, 0], "not positive semi-definite"),
-        (("gauges", 0, "link"), "uper", "'uper' is not one of upper, fore; 'upper'?"),
-        (("gauges", 0, "position"), 1.3, "1.3 m is outside upper, which is 1.2 m long"),
+        (
+            ("gauges", 0, "link"),
+            "uper",
+            "'uper' is not one of the choices (upper, fore); did you mean 'upper'?",
+        ),
+        (("gauges", 0, "position"), 1.3, "1.3 m is outside upper (0 to 1.2 m)"),
         (("gauges", 0, "position"), -0.1, "-0.1 m is outside upper"),
-        (("gauges", 0, "direction"), "x", "'x' is not one of y, z, twist"),
+        (("gauges", 0, "direction"), "x", "'x' is not one of the choices (y, z, twist)"),
         (("gauges", 0, "surface_distance"), 0.0, "a gauge on the neutral axis sees nothing"),
         (("gauges", 0, "gain"), 0.0, "such a gauge sees nothing"),
         (("observed_modes",), "upper_y_mode1", "a list of mode names is wanted"),
@@ -591,21 +613,25 @@ def test_a_value_without_meaning_is_refused(path, value, words):
 
 def test_names_must_differ():
     assert refused(changed(("joints", 1, "name"), "shoulder")) == (
-        "joints[1].name: 'shoulder' is joints[0]'s"
+        "joints[1].name: 'shoulder' is the name of joints[0], too"
     )
-    assert refused(changed(("links", 1, "name"), "upper")) == "links[1].name: 'upper' is links[0]'s"
-    assert refused(changed(("gauges", 2, "name"), "g1")) == "gauges[2].name: 'g1' is gauges[0]'s"
+    assert refused(changed(("links", 1, "name"), "upper")) == (
+        "links[1].name: 'upper' is the name of links[0], too"
+    )
+    assert refused(changed(("gauges", 2, "name"), "g1")) == (
+        "gauges[2].name: 'g1' is the name of gauges[0], too"
+    )
 
 
 def test_joints_and_links_come_in_pairs():
     assert refused(without(("joints", 1))) == (
-        "joints: 1 joints for 2 links: a serial arm has one joint each"
+        "joints: 1 joints for 2 links; a serial arm has one joint each"
     )
 
 
 def test_observed_modes_need_gauges_of_their_link_and_direction():
     assert refused(without(("gauges", 1))) == (
-        "gauges: 1 on upper in direction y for 2 observed modes: add gauges or list fewer"
+        "gauges: 1 on upper in direction y for 2 observed modes; add gauges or list fewer"
         " observed_modes"
     )
     assert refused(changed(("gauges", 2, "direction"), "z")).startswith("gauges: 0 on fore in")
@@ -764,7 +790,7 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
     try:
         arm = arm_file.parse(text)
     except ArmFileError as error:
-        assert str(error) == f"{error.field}: {error.problem}"
+        assert str(error).startswith(f"{error.field}: ")
         assert error.field and error.problem
     else:
         assert isinstance(arm, Arm)
@@ -809,17 +835,17 @@ def two_links():
     [
         (
             lambda d: d["links"][0].update(mass_per_length=0),
-            r"^links\[0\]\.mass_per_length: 0\.0 must",
+            r"^links\[0\]\.mass_per_length: 0\.0 is too small",
         ),
         (
             lambda d: d["links"][0].update(EI_y=-1),
-            r"^links\[0\]\.EI_y: -1\.0 must be greater than 0",
+            r"^links\[0\]\.EI_y: -1\.0 is too small",
         ),
-        (lambda d: d["links"][1].update(EI_y=0), r"^links\[1\]\.EI_y: 0\.0 must be greater than 0"),
-        (lambda d: d["links"][1].update(length=-1), r"^links\[1\]\.length: -1\.0 must be greater"),
+        (lambda d: d["links"][1].update(EI_y=0), r"^links\[1\]\.EI_y: 0\.0 is too small"),
+        (lambda d: d["links"][1].update(length=-1), r"^links\[1\]\.length: -1\.0 is too small"),
         (
             lambda d: d["joints"][1].update(axis=[0, 0, 0]),
-            r"^joints\[1\]\.axis: its length is zero",
+            r"^joints\[1\]\.axis: \[0\.0, 0\.0, 0\.0\] is of length zero",
         ),
         (
             lambda d: d["gauges"][3].update(position=0.6),
@@ -829,7 +855,7 @@ def two_links():
         (lambda d: d["joints"][1].update(parent="link2"), r"^joints\[1\]\.parent: no such field"),
         (
             lambda d: d["links"][1].update(name="link1"),
-            r"^links\[1\]\.name: 'link1' is links\[0\]'s",
+            r"^links\[1\]\.name: 'link1' is the name of links\[0\], too",
         ),
         (lambda d: d["joints"].append({"name": "joint3"}), r"^joints: 3 joints for 2 links"),
         (

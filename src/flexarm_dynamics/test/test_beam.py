@@ -127,7 +127,7 @@ def test_shapes_equal_the_textbook_form_where_it_has_digits():
     shapes = beam.clamped_free(3)
     for i, b in enumerate(shapes.beta):
         nu = -(np.sin(b) + np.sinh(b)) / (np.cos(b) + np.cosh(b))
-        assert nu < 0.0  # print has it positive
+        assert nu < 0.0  # published with a positive sign
         x = b * XI
         textbook = np.sin(x) - np.sinh(x) + nu * (np.cos(x) - np.cosh(x))  # (A1)
         np.testing.assert_allclose(shapes(XI)[:, i], textbook / -nu, atol=1e-11)

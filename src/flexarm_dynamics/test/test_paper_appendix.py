@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The printed model: every number of the case study, what print leaves out, and that it is a model of its own."""
+"""The printed model: every number of the case study, what the paper leaves out, and that it is a model of its own."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_open_loop_frequencies_are_those_of_the_case_study(name, shipped, errata
     np.testing.assert_allclose(arm_model.frequencies(), omega, rtol=1e-12)
 
 
-def test_fast_gains_of_P3_are_those_that_reproduce_print(shipped, errata, agrees):
+def test_fast_gains_of_P3_are_those_that_reproduce_the_paper(shipped, errata, agrees):
     k, closed = fast_design(shipped("P3"), errata)
     expected = errata["P3"]
     assert np.all(k < 0.0)  # as phi_1e > 0
@@ -104,7 +104,7 @@ def test_fast_gains_of_R_are_those_of_the_case_study(shipped, errata, agrees):
 
 
 def test_terms_are_those_of_the_corrected_A3_to_A6(name, shipped):
-    """k11 = M qd^2 phi_1e^2 and c1 = 2 M qd [...], the printed typos mended."""
+    """k11 = M qd^2 phi_1e^2 and c1 = 2 M qd [...], the misprints corrected."""
     arm_model = shipped(name)
     M, phi = arm_model.arm.payload.mass, arm_model.phi_tip
     delta, delta_d, qd = np.array([0.02, -0.01]), np.array([0.3, 0.7]), np.array([1.9])
@@ -210,8 +210,8 @@ def test_arm_without_the_printed_masses_is_refused():
         PaperAppendix(replace(arm_file.load("R"), model_options={}))
 
 
-def test_gravity_is_refused_as_print_has_none():
-    with pytest.raises(ModelError, match="print has no gravity; use model one_link"):
+def test_gravity_is_refused_as_the_published_model_has_none():
+    with pytest.raises(ModelError, match="the published model has no gravity; use model one_link"):
         model.build(replace(arm_file.load("R"), gravity=(0.0, -9.81, 0.0)))
 
 

@@ -174,7 +174,7 @@ def test_an_unknown_parameter_is_refused_with_what_there_is():
         check_all((), {"kd": 1.0})
 
 
-def test_a_checked_list_is_nobody_elses():
+def test_a_checked_list_is_a_copy():
     given_list = [1.0, 2.0]
     KP.check(given_list, {"joints": 2})[0] = 9.0
     NAMES.check(NAMES.default).append("x")

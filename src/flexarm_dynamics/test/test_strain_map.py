@@ -147,11 +147,11 @@ def test_a_gauge_without_stated_noise_weighs_as_the_quietest():
     some = StrainMap(
         model_with([replace(GAUGES[0], noise=3e-7), replace(GAUGES[1], noise=9e-7), GAUGES[2]])
     )
-    told = StrainMap(
+    wanted = StrainMap(
         model_with([replace(g, noise=n) for g, n in zip(GAUGES, (3e-7, 9e-7, 3e-7), strict=True)])
     )
-    np.testing.assert_array_equal(some.inverse, told.inverse)
-    assert some.condition == told.condition
+    np.testing.assert_array_equal(some.inverse, wanted.inverse)
+    assert some.condition == wanted.condition
 
 
 def test_a_third_mode_spills_over_into_the_two_observed():
@@ -249,12 +249,12 @@ def test_without_too_many_there_is_no_map_and_the_modes_are_named():
 
 def test_a_new_bias_is_the_maps_from_then_on():
     whole, fresh = StrainMap(model_with(GAUGES)), [1e-5, -2e-5, 3e-5]
-    told = StrainMap(model_with([replace(g, bias=b) for g, b in zip(GAUGES, fresh, strict=True)]))
+    wanted = StrainMap(model_with([replace(g, bias=b) for g, b in zip(GAUGES, fresh, strict=True)]))
     reading = np.array([1e-4, -5e-5, 7e-5])
     whole.bias = fresh
-    np.testing.assert_array_equal(whole.amplitudes(reading), told.amplitudes(reading))
+    np.testing.assert_array_equal(whole.amplitudes(reading), wanted.amplitudes(reading))
     np.testing.assert_array_equal(
-        whole.amplitudes_without((1,), reading), told.amplitudes_without((1,), reading)
+        whole.amplitudes_without((1,), reading), wanted.amplitudes_without((1,), reading)
     )
     with pytest.raises(ShapeError, match=r"\(2,\), wanted \(3,\)"):
         whole.bias = [0.0, 0.0]
@@ -285,7 +285,7 @@ def test_rounding_counts_as_noise_of_a_step_over_the_root_of_twelve():
     )
 
 
-def test_modes_that_cannot_be_told_apart_are_named():
+def test_indistinguishable_modes_are_named():
     names = ("a", "b", "c")
     rows = np.array([[1.0, 2.0, 0.0], [2.0, 4.0, 5.0], [3.0, 6.0, 1.0]])
     assert confused(rows, names) == ((), ("a", "b"))

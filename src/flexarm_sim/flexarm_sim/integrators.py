@@ -5,9 +5,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.models.fixed_step import METHODS, MOST_SUBSTEPS, PHASE_PER_STEP, substeps
+from flexarm_dynamics.models.fixed_step import MAX_SUBSTEPS, METHODS, PHASE_PER_STEP, substeps
 
-__all__ = ["METHODS", "MOST_SUBSTEPS", "PHASE_PER_STEP", "integrate", "substeps"]
+__all__ = ["MAX_SUBSTEPS", "METHODS", "PHASE_PER_STEP", "integrate", "substeps"]
 
 
 def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
-from flexarm_sim.integrators import METHODS, MOST_SUBSTEPS, PHASE_PER_STEP, integrate, substeps
+from flexarm_sim.integrators import MAX_SUBSTEPS, METHODS, PHASE_PER_STEP, integrate, substeps
 
 METHOD = METHODS["dop853"]
 TABLEAU, WEIGHTS = METHOD.A, METHOD.weights
@@ -73,7 +73,7 @@ def test_a_rigid_or_slow_arm_takes_one_substep(arm_r):
 
 def test_a_mode_too_fast_to_simulate_is_refused_saying_what_to_change():
     arm = model.build(arm_file.load("R").with_modes(5))
-    with pytest.raises(ModelError, match=rf"at most {MOST_SUBSTEPS}.*integrator implicit"):
+    with pytest.raises(ModelError, match=rf"at most {MAX_SUBSTEPS}.*integrator implicit"):
         substeps(arm, 10.0)
 
 

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arm files: YAML, validated; every error starts with the field's path, as ``links[0].length``.
+"""Arm files: YAML, validated; every error names its field by its path, as ``links[0].length``.
 
-Nothing is half read: a file gives an `Arm` or an `ArmFileError`.
+A file gives an `Arm` or an `ArmFileError`, never half an arm.
+
+PyYAML reads them, and `_check_keys` refuses a key that is given twice. ruamel.yaml refuses one too, but without its
+path, takes three times as long, and reads YAML 1.1 differently: `direction: y` would be `true`, `name: 1e3` a number.
 """
 
 import difflib
@@ -17,7 +20,7 @@ from ..errors import ArmFileError
 from ..shown import number, show
 from .description import (
     DIRECTIONS,
-    MOST_MODES,
+    MAX_MODES,
     SAFE_ACTIONS,
     SHAPES,
     Arm,
@@ -31,12 +34,12 @@ from .description import (
 )
 from .units import SI_UNIT, to_si
 
-#: No measure of an arm is larger than this in SI; powers and products of smaller ones are finite.
-LARGEST = 1e30
-#: No bridge converts to more.
-MOST_BITS = 32
-#: No arm strains by more [-].
-MOST_STRAIN = 0.1
+#: Largest number in a file, in SI; powers and products of smaller ones are finite.
+MAX_NUMBER = 1e30
+#: Largest resolution of a gauge's bridge [bit].
+MAX_BITS = 32
+#: Largest full scale of a gauge [-].
+MAX_STRAIN = 0.1
 
 
 def _read_yaml(text, where):
@@ -101,14 +104,14 @@ class _Section:
     def raw(self, key, default=None, required=False):
         if not self.has(key):
             if required:
-                raise ArmFileError(self.at(key), "missing" + self._near(key))
+                raise ArmFileError(self.at(key), "missing", hint=self._near(key))
             return default
         return self.data[key]
 
     def _near(self, key):
         """A hint when a key not yet read looks like the missing one."""
         close = difflib.get_close_matches(key, [k for k in self.data if k not in self.read], 1)
-        return f" (is {close[0]!r} meant to be it?)" if close else ""
+        return f"is {close[0]!r} meant to be it?" if close else ""
 
     def number(self, key, dimension="none", default=None, low=None, positive=False):
         """A finite number in SI; `default` None makes it required."""
@@ -116,14 +119,12 @@ class _Section:
         if not self.has(key):
             return value
         value = _number(value, self.at(key))
-        if positive and not value > 0.0:
-            raise ArmFileError(
-                self.at(key), f"{value} must be greater than 0 [{SI_UNIT[dimension]}]"
-            )
+        if positive and not value >= 1.0 / MAX_NUMBER:
+            unit = "" if SI_UNIT[dimension] == "-" else f" {SI_UNIT[dimension]}"
+            limit = f"at least {1.0 / MAX_NUMBER:g}" if value > 0.0 else f"greater than 0{unit}"
+            raise ArmFileError(self.at(key), "is too small", value=value, limit=limit)
         if low is not None and value < low:
-            raise ArmFileError(self.at(key), f"{value} must not be below {low}")
-        if positive and value < 1.0 / LARGEST:
-            raise ArmFileError(self.at(key), f"{value} is too small")
+            raise ArmFileError(self.at(key), "is too small", value=value, limit=f"at least {low:g}")
         return value * to_si(self.system, dimension)
 
     def vector(self, key, length, dimension="none", default=None):
@@ -140,27 +141,25 @@ class _Section:
     def integer(self, key, default=None, low=None, high=None):
         value = self.raw(key, default, required=default is None)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise ArmFileError(self.at(key), f"{_kind(value)} is not an integer")
+            raise _error(self.at(key), value, "is not an integer")
         if (low is not None and value < low) or (high is not None and value > high):
-            raise ArmFileError(self.at(key), f"{_kind(value)} must be from {low} to {high}")
+            raise _error(self.at(key), value, "is out of range", limit=f"{low} to {high}")
         return value
 
     def text(self, key, default=None, choices=None):
         value = self.raw(key, default, required=default is None)
         if not isinstance(value, str):
-            raise ArmFileError(self.at(key), f"{_kind(value)} is not text")
+            raise _error(self.at(key), value, "is not text")
         if choices and value not in choices:
-            close = difflib.get_close_matches(value, choices, 1)
-            hint = f"; {close[0]!r}?" if close else ""
-            raise ArmFileError(
-                self.at(key), f"{show(value)} is not one of {', '.join(choices)}{hint}"
-            )
+            limit, hint = ", ".join(choices), _meant(value, choices)
+            problem = "is not one of the choices"
+            raise ArmFileError(self.at(key), problem, value=value, limit=limit, hint=hint)
         return value
 
     def flag(self, key):
         value = self.raw(key, False)
         if not isinstance(value, bool):
-            raise ArmFileError(self.at(key), f"{_kind(value)} is neither true nor false")
+            raise _error(self.at(key), value, "is neither true nor false")
         return value
 
     def name(self):
@@ -179,13 +178,25 @@ class _Section:
         return [_Section(v, f"{self.at(key)}[{i}]", self.system) for i, v in enumerate(value)]
 
     def done(self):
-        """Refuse what nobody read: a misspelt field is an error, not a default."""
+        """Refuse a field that was not read: a misspelt one is an error, not a default."""
         for key in self.data:
             if key not in self.read:
-                close = difflib.get_close_matches(str(key), sorted(self.read), 1)
-                hint = f"; did you mean {close[0]!r}?" if close else ""
-                known = ", ".join(sorted(self.read))
-                raise ArmFileError(self.at(key), f"no such field{hint} (known here: {known})")
+                known = sorted(self.read)
+                limit, hint = f"known here: {', '.join(known)}", _meant(str(key), known)
+                raise ArmFileError(self.at(key), "no such field", limit=limit, hint=hint)
+
+
+def _meant(name, known):
+    """A hint at the known name that is spelt like this one."""
+    close = difflib.get_close_matches(name, known, 1)
+    return f"did you mean {close[0]!r}?" if close else ""
+
+
+def _error(path, value, problem, **more):
+    """The error for a value; a collection, or none at all, is shown by its kind."""
+    if isinstance(value, (str, bool, float)) or _kind(value) == show(value):
+        return ArmFileError(path, problem, value=value, **more)
+    return ArmFileError(path, f"{_kind(value)} {problem}", **more)
 
 
 def _kind(value):
@@ -204,13 +215,13 @@ def _number(value, path):
         try:
             value = float(value)
         except ValueError:
-            raise ArmFileError(path, f"{show(value)} is not a number") from None
+            raise ArmFileError(path, "is not a number", value=value) from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ArmFileError(path, f"{_kind(value)} is not a number")
+        raise _error(path, value, "is not a number")
     if isinstance(value, float) and not math.isfinite(value):
-        raise ArmFileError(path, f"{value} is not finite")
-    if abs(value) > LARGEST:
-        raise ArmFileError(path, f"{_kind(value)} is too large")
+        raise ArmFileError(path, "is not finite", value=value)
+    if abs(value) > MAX_NUMBER:
+        raise _error(path, value, "is too large", limit=f"at most {MAX_NUMBER:g}")
     return float(value)
 
 
@@ -238,7 +249,10 @@ def _limits(joint):
     )
     s.done()
     if not out.position[0] < out.position[1]:
-        raise ArmFileError(s.at("position"), f"{list(out.position)}: low must be below high")
+        low_high = list(out.position)
+        raise ArmFileError(
+            s.at("position"), "is empty", value=low_high, hint="low must be below high"
+        )
     return out
 
 
@@ -246,7 +260,7 @@ def _joint(s):
     axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
     norm = math.hypot(*axis)
     if norm == 0.0:
-        raise ArmFileError(s.at("axis"), "its length is zero")
+        raise ArmFileError(s.at("axis"), "is of length zero", value=list(axis))
     origin = {"xyz": (0.0,) * 3, "rpy": (0.0,) * 3}
     if s.has("origin"):
         o = s.section("origin")
@@ -281,20 +295,18 @@ def _joint(s):
 
 def _flexibility(s):
     shape = s.text("shape", "clamped_free", SHAPES)
-    modes = s.integer("modes", low=1, high=MOST_MODES)
+    modes = s.integer("modes", low=1, high=MAX_MODES)
     frequencies = ()
     if s.has("frequencies"):
         given = s.raw("frequencies")
         count = len(given) if isinstance(given, list) else modes
         frequencies = s.vector("frequencies", count, "frequency")
     if shape == "from_frequencies" and len(frequencies) < modes:
-        raise ArmFileError(
-            s.at("frequencies"), f"{len(frequencies)} frequencies for {modes} modes: give one each"
-        )
+        problem = f"{len(frequencies)} frequencies for {modes} modes"
+        raise ArmFileError(s.at("frequencies"), problem, hint="give one each")
     if any(f <= 0.0 for f in frequencies) or list(frequencies) != sorted(set(frequencies)):
-        raise ArmFileError(
-            s.at("frequencies"), f"{list(frequencies)} must be positive and ascending"
-        )
+        problem = "must be positive and ascending"
+        raise ArmFileError(s.at("frequencies"), problem, value=list(frequencies))
     damping = ()
     if s.has("damping"):
         given = s.raw("damping")
@@ -304,7 +316,8 @@ def _flexibility(s):
             else (s.number("damping", low=0.0),)
         )
     if any(not 0.0 <= z < 1.0 for z in damping):
-        raise ArmFileError(s.at("damping"), f"{list(damping)}: damping ratios are from 0 to 1")
+        limit = "from 0 to below 1"
+        raise ArmFileError(s.at("damping"), "is out of range", value=list(damping), limit=limit)
     s.done()
     return Flexibility(modes, shape, frequencies, damping)
 
@@ -327,7 +340,8 @@ def _section_properties(s):
         outer = s.number("outer_diameter", "length", positive=True)
         wall = s.number("wall", "length", positive=True)
         if 2.0 * wall > outer:
-            raise ArmFileError(s.at("wall"), f"{wall} m is more than the radius {outer / 2} m")
+            problem = "m is more than the radius"
+            raise ArmFileError(s.at("wall"), problem, value=wall, limit=f"{outer / 2} m")
         inner = outer - 2.0 * wall
         area = math.pi * (outer**2 - inner**2) / 4.0
         inertia_y = inertia_z = math.pi * (outer**4 - inner**4) / 64.0
@@ -343,7 +357,8 @@ def _link(s):
     if s.has("section"):
         for key in ("EI_y", "EI_z", "GJ", "mass_per_length"):
             if s.has(key):
-                raise ArmFileError(s.at(key), "give either a section or the stiffnesses, not both")
+                hint = "give either a section or the stiffnesses"
+                raise ArmFileError(s.at(key), "beside a section", hint=hint)
         per_length, stiffness, polar = _section_properties(s.section("section"))
     else:
         per_length = s.number("mass_per_length", "mass_per_length", positive=True)
@@ -360,12 +375,14 @@ def _link(s):
             if f.has(direction):
                 flexible[direction] = _flexibility(f.section(direction))
                 if direction not in stiffness:
-                    raise ArmFileError(s.at(key), f"missing: the link is flexible in {direction}")
+                    hint = f"the link is flexible in {direction}"
+                    raise ArmFileError(s.at(key), "missing", hint=hint)
         f.done()
     if "twist" in flexible and not polar > 0.0:
         raise ArmFileError(
             s.at("polar_inertia_per_length"),
-            "missing: a link that twists needs the polar inertia of its sections (rho I_p), or a section",
+            "missing",
+            hint="a link that twists needs the polar inertia of its sections (rho I_p), or a section",
         )
     s.done()
     return Link(name, length, per_length, stiffness, flexible, polar)
@@ -393,17 +410,19 @@ def _gauge(s, links):
     link = s.text("link", choices=tuple(links))
     position = s.number("position", "length")
     if not 0.0 <= position <= links[link].length:
-        raise ArmFileError(
-            s.at("position"),
-            f"{position:.6g} m is outside {link}, which is {links[link].length:.6g} m long",
-        )
+        limit = f"0 to {links[link].length:.6g} m"
+        raise ArmFileError(s.at("position"), f"m is outside {link}", value=position, limit=limit)
     distance = s.number("surface_distance", "length")
     if distance == 0.0:
-        raise ArmFileError(s.at("surface_distance"), "0: a gauge on the neutral axis sees nothing")
+        hint = "a gauge on the neutral axis sees nothing"
+        raise ArmFileError(s.at("surface_distance"), "is too small", value=distance, hint=hint)
     if abs(distance) > 0.5 * links[link].length:
         raise ArmFileError(
             s.at("surface_distance"),
-            f"{distance:.6g} m from the neutral axis of a link {links[link].length:.6g} m long: in mm?",
+            "m is too far from the neutral axis",
+            value=distance,
+            limit=f"at most half the length of {link}, {0.5 * links[link].length:.6g} m",
+            hint="in mm?",
         )
     gauge = Gauge(
         name=name,
@@ -414,22 +433,29 @@ def _gauge(s, links):
         gain=s.number("gain", "none", 1.0),
         bias=s.number("bias", "none", 0.0),
         noise=s.number("noise", "none", 0.0, low=0.0),
-        bits=s.integer("bits", 0, low=0, high=MOST_BITS),
+        bits=s.integer("bits", 0, low=0, high=MAX_BITS),
         full_scale=s.number("full_scale", "none", Gauge.full_scale, positive=True),
         drift=s.number("drift", "none", 0.0, low=0.0),
     )
     if gauge.gain == 0.0:
-        raise ArmFileError(s.at("gain"), "0: such a gauge sees nothing")
-    if gauge.full_scale > MOST_STRAIN:
+        hint = "such a gauge sees nothing"
+        raise ArmFileError(s.at("gain"), "is too small", value=gauge.gain, hint=hint)
+    if gauge.full_scale > MAX_STRAIN:
         raise ArmFileError(
             s.at("full_scale"),
-            f"{gauge.full_scale:g} strain is more than {MOST_STRAIN}: in microstrain?",
+            "is too large",
+            value=gauge.full_scale,
+            limit=f"at most {MAX_STRAIN}",
+            hint="in microstrain?",
         )
     for key in ("bias", "noise"):
         if not abs(getattr(gauge, key)) < gauge.full_scale:
             raise ArmFileError(
                 s.at(key),
-                f"{getattr(gauge, key):g} is not within full_scale, {gauge.full_scale:g} strain: in microstrain?",
+                "is not within full_scale",
+                value=getattr(gauge, key),
+                limit=f"{gauge.full_scale:g}",
+                hint="in microstrain?",
             )
     s.done()
     return gauge
@@ -439,9 +465,8 @@ def _unique(things, path):
     seen = {}
     for i, thing in enumerate(things):
         if thing.name in seen:
-            raise ArmFileError(
-                f"{path}[{i}].name", f"{thing.name!r} is {path}[{seen[thing.name]}]'s"
-            )
+            problem = f"is the name of {path}[{seen[thing.name]}], too"
+            raise ArmFileError(f"{path}[{i}].name", problem, value=thing.name)
         seen[thing.name] = i
 
 
@@ -452,20 +477,18 @@ def _observed(s, modes, gauges):
     known = {m.name: m for m in modes}
     for i, name in enumerate(names):
         if not isinstance(name, str) or name not in known:
-            raise ArmFileError(
-                f"observed_modes[{i}]",
-                f"{_kind(name)} is not a mode of this arm: {', '.join(known)}",
-            )
+            problem, limit = "is not a mode of this arm", ", ".join(known)
+            raise _error(f"observed_modes[{i}]", name, problem, limit=limit)
         if name in names[:i]:
-            raise ArmFileError(f"observed_modes[{i}]", f"{name!r} given twice")
+            raise ArmFileError(f"observed_modes[{i}]", "given twice", value=name)
     for key in {(known[n].link, known[n].direction) for n in names}:
         seen_by = sum((g.link, g.direction) == key for g in gauges)
         wanted = sum((known[n].link, known[n].direction) == key for n in names)
         if gauges and seen_by < wanted:
             raise ArmFileError(
                 "gauges",
-                f"{seen_by} on {key[0]} in direction {key[1]} for {wanted} observed modes: add gauges"
-                " or list fewer observed_modes",
+                f"{seen_by} on {key[0]} in direction {key[1]} for {wanted} observed modes",
+                hint="add gauges or list fewer observed_modes",
             )
     # The order of the modal coordinates is the arm's, whatever the file's.
     return tuple(m.name for m in modes if m.name in names)
@@ -495,11 +518,12 @@ def parse(text, where="arm"):
     joints = tuple(_joint(s) for s in top.sections("joints", required=True))
     links = tuple(_link(s) for s in top.sections("links", required=True))
     if not links:
-        raise ArmFileError("links", "empty: an arm has at least one link")
+        raise ArmFileError("links", "empty", hint="an arm has at least one link")
     if len(joints) != len(links):
         raise ArmFileError(
             "joints",
-            f"{len(joints)} joints for {len(links)} links: a serial arm has one joint each",
+            f"{len(joints)} joints for {len(links)} links",
+            hint="a serial arm has one joint each",
         )
     _unique(joints, "joints")
     _unique(links, "links")
@@ -542,7 +566,8 @@ def _model(top):
         }
         s.done()
     elif model == "paper_appendix":
-        raise ArmFileError("paper_appendix", "missing: model paper_appendix needs this section")
+        hint = "model paper_appendix needs this section"
+        raise ArmFileError("paper_appendix", "missing", hint=hint)
     return model, options
 
 
@@ -575,9 +600,8 @@ def find(name):
         if candidate.is_file():
             return candidate
     shipped = sorted({p.stem for d in arms_directories() for p in d.glob("*.yaml")})
-    raise ArmFileError(
-        "arm", f"{str(name)!r} is neither a file nor a shipped arm ({', '.join(shipped) or 'none'})"
-    )
+    problem, limit = "is neither a file nor a shipped arm", ", ".join(shipped) or "none"
+    raise ArmFileError("arm", problem, value=str(name), limit=limit)
 
 
 def load(name):
@@ -598,7 +622,7 @@ def load(name):
         Naming the file and the field.
     """
     if not str(name):
-        raise ArmFileError("arm", "no arm given: write a shipped name (R) or a path")
+        raise ArmFileError("arm", "no arm given", hint="write a shipped name (R) or a path")
     path = find(name)
     try:
         text = path.read_text(encoding="utf-8")
@@ -607,4 +631,5 @@ def load(name):
     try:
         return parse(text, path.name)
     except ArmFileError as error:
-        raise ArmFileError(f"{path.name}: {error.field}", error.problem) from None
+        error.field = f"{path.name}: {error.field}"
+        raise error from None

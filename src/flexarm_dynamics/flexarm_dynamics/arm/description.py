@@ -15,7 +15,7 @@ from ..errors import ModelError
 DIRECTIONS = ("y", "z", "twist")
 SAFE_ACTIONS = ("brake", "damp", "zero")
 #: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
-MOST_MODES = 20
+MAX_MODES = 20
 SHAPES = ("clamped_free", "loaded", "from_frequencies")
 
 
@@ -203,8 +203,8 @@ class Arm:
         Gauges and observed modes stay as they are: what a plant with more modes than its controller knows
         does to the gauges is spill-over.
         """
-        if not 1 <= count <= MOST_MODES:
-            raise ModelError(f"{self.name}: {count} modes; from 1 to {MOST_MODES} are possible")
+        if not 1 <= count <= MAX_MODES:
+            raise ModelError(f"{self.name}: {count} modes; from 1 to {MAX_MODES} are possible")
         for link in self.links:
             for direction, f in link.flexible.items():
                 if f.shape == "from_frequencies" and len(f.frequencies) < count:
@@ -228,7 +228,7 @@ class Arm:
 
 
 def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
-    """The same arm with another payload, stiffness or damping: what a controller that has not been told meets.
+    """The same arm with another payload, stiffness or damping: what a controller designed for the first one may meet.
 
     Gauges, observed modes and everything else stay. Where mode shapes depend on the payload (`loaded`), they
     change with it.

@@ -230,7 +230,7 @@ class StrainMap:
         return inverse
 
     def unobservable_without(self, lost):
-        """Names of the modes that the gauges not in `lost` can't give, each by itself or told from another."""
+        """Names of the modes that the gauges not in `lost` can't give, each by itself or apart from another."""
         left = np.setdiff1d(np.arange(len(self.gauge_names)), lost)
         unseen, alike = confused(self._weighted[left], self.mode_names)
         return tuple(n for n in self.mode_names if n in (*unseen, *alike))

@@ -358,7 +358,7 @@ def body_at_nodes(d, w, i, delta, delta_d, om):
         for k in range(K):
             w.M[i, j, k] = d.gram[i, j, k] if twist and d.direction[i, k] == TWIST else 0.0
         w.q[i, j] = 0.0
-    # So far J holds the hub and the sections' polar inertia: their share of N.
+    # So far J holds the hub and the sections' polar inertia: their part of N.
     apply(J, om, t[6])
     t[6, 0] += spin
     cross(om, t[6], t[7])

@@ -10,7 +10,7 @@ import numpy as np
 #: Floats that are written into the code; all others go to a table, so that arms of one structure share code.
 LITERALS = (1.0, 2.0, 0.5)
 #: Nested expressions longer than this are split.
-LONGEST = 24
+MAX_LENGTH = 24
 
 
 class Graph:
@@ -233,7 +233,7 @@ def emit(graph, outputs, scalars=False):
             expression = f"({words[0]} {op} {words[1]})"
         else:
             expression = f"{op}({words[0]})"
-        if uses[index] > 1 or length > LONGEST:
+        if uses[index] > 1 or length > MAX_LENGTH:
             lines.append(f"t{index} = {expression}")
             expression, length = f"t{index}", 1
         text[index], size[index] = expression, length

@@ -27,7 +27,7 @@ from ..errors import ModelError
 INTEGRAL_TOLERANCE = 1e-12
 
 #: Heaviest tip load, in masses and inertias of the beam: the lowest wave number stays where it has digits.
-HEAVIEST_LOAD = 1e10
+MAX_LOAD = 1e10
 
 
 @lru_cache(maxsize=32)
@@ -121,7 +121,7 @@ def _shapes(beta, c, d):
 def free_end_shapes(beta):
     r"""Shapes (A1) with the free end's :math:`\phi''(1) = 0` for given wave numbers.
 
-    This is (A1) with the sign of :math:`\nu_i` mended (print has :math:`\nu_i > 0`, which is no free end).
+    This is (A1) with the sign of :math:`\nu_i` corrected (published: :math:`\nu_i > 0`, which is no free end).
     The shear :math:`\phi'''(1)` vanishes too only at the clamped-free wave numbers.
 
     Parameters
@@ -244,17 +244,17 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     Raises
     ------
     ModelError
-        When the load is heavier than `HEAVIEST_LOAD`, or when the frequency equation has fewer roots than
+        When the load is heavier than `MAX_LOAD`, or when the frequency equation has fewer roots than
         asked for in the range searched.
     """
     mass = tip_mass / (mass_per_length * length)
     moment = tip_mass * tip_offset / (mass_per_length * length**2)
     inertia = (tip_inertia + tip_mass * tip_offset**2) / (mass_per_length * length**3)
 
-    if max(mass, inertia) > HEAVIEST_LOAD:
+    if max(mass, inertia) > MAX_LOAD:
         raise ModelError(
             f"loaded beam: its load is {mass:.3g} times its mass and {inertia:.3g} times m L^2; at most"
-            f" {HEAVIEST_LOAD:g}, or call the link rigid"
+            f" {MAX_LOAD:g}, or call the link rigid"
         )
 
     def determinant(beta):

@@ -32,7 +32,7 @@ METHODS = {
 #: Highest angular frequency times substep of the explicit methods.
 PHASE_PER_STEP = {"dop853": 0.5, "rk4": 0.1}
 #: More substeps than this per sample is no simulation any more.
-MOST_SUBSTEPS = 10_000
+MAX_SUBSTEPS = 10_000
 
 
 def substeps(model, period, method="dop853"):
@@ -53,15 +53,15 @@ def substeps(model, period, method="dop853"):
     Raises
     ------
     ModelError
-        When the highest mode would need more than `MOST_SUBSTEPS`.
+        When the highest mode would need more than `MAX_SUBSTEPS`.
     """
     if method not in PHASE_PER_STEP:
         return 1
     highest = float(model.frequencies()[-1]) if model.n_modes else 0.0
     count = max(1, int(np.ceil(highest * period / PHASE_PER_STEP[method])))
-    if count > MOST_SUBSTEPS:
+    if count > MAX_SUBSTEPS:
         raise ModelError(
             f"{model.arm.name}: its highest mode, {highest:.3g} rad/s, needs {count} substeps per sample"
-            f" of {period:g} s (at most {MOST_SUBSTEPS}): fewer modes, or integrator implicit"
+            f" of {period:g} s (at most {MAX_SUBSTEPS}): fewer modes, or integrator implicit"
         )
     return count

@@ -24,7 +24,7 @@ from .chain import Chain
 #: A tip nearer than this has arrived [m].
 TOLERANCE = 1e-10
 #: No joint turns farther in one step of the search [rad].
-LONGEST_STEP = 0.5
+MAX_STEP = 0.5
 _STEPS = 100
 #: How far from the start further searches begin [rad]: out of singular configurations, and around limits.
 _SPREADS = (0.05, 0.3, 1.0, 2.0, 3.0)
@@ -109,7 +109,7 @@ class TipKinematics:
             if size == 0.0:
                 break
             step = J.T @ np.linalg.solve(J @ J.T + damping * size * np.eye(3), error)
-            step *= min(1.0, LONGEST_STEP / max(np.abs(step).max(), 1e-300))
+            step *= min(1.0, MAX_STEP / max(np.abs(step).max(), 1e-300))
             there = np.clip(q + step, self.low, self.high)
             new = self.tip(there)
             if np.linalg.norm(target - new) < np.linalg.norm(error):

@@ -74,7 +74,7 @@ class Coefficients:
 class OneLinkEquations(ArmModel):
     """Evaluates the one-link equations for whatever coefficients a derivation gives.
 
-    Subclasses derive the coefficients: `OneLink` in full, `paper_appendix.PaperAppendix` as print does.
+    Subclasses derive the coefficients: `OneLink` in full, `paper_appendix.PaperAppendix` as published.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The one-link model that Siciliano & Book print in their appendix, typos mended, omissions kept.
+r"""The one-link model that Siciliano & Book publish in their appendix: misprints corrected, omissions kept.
 
-What is mended (print does not compute otherwise): the sign of :math:`\nu_i` in (A1); :math:`\phi_{ie}^2` in k11
-and k22; the factor :math:`\dot\theta` in (A5); :math:`\phi_e' = \frac1L d\phi/d\xi`; :math:`\int\phi^2 = 1`.
+What is corrected, since the published formulas do not give the published numbers: the sign of :math:`\nu_i` in (A1);
+:math:`\phi_{ie}^2` in k11 and k22; the factor :math:`\dot\theta` in (A5);
+:math:`\phi_e' = \frac1L d\phi/d\xi`; :math:`\int\phi^2 = 1`.
 
-What print leaves out of its own Lagrangian, and this class with it:
+What the paper leaves out of its own Lagrangian, and this class with it:
 
 =============================================  ==========================================================
 omitted                                        effect on arm R
@@ -39,7 +40,9 @@ class PaperAppendix(OneLinkEquations):
         if arm.model != "paper_appendix" or not arm.model_options:
             raise ModelError(f"{arm.name}: the arm file has no section paper_appendix")
         if any(arm.gravity):
-            raise ModelError("paper_appendix: print has no gravity; use model one_link")
+            raise ModelError(
+                "paper_appendix: the published model has no gravity; use model one_link"
+            )
         super().__init__(arm, shapes)
 
     def derive(self):
@@ -58,7 +61,7 @@ class PaperAppendix(OneLinkEquations):
             raise ModelError(
                 f"{self.arm.name}: paper_appendix.m23_fit needs two modes, not {count}"
             )
-        # k_ei, diagonal in print.
+        # k_ei, diagonal in the published model.
         K = link.stiffness["y"] / L**3 * np.diag(np.diag(shapes.gram(2)))
         w = link.mass_per_length * L**2 * shapes.integral(lambda xi: xi)
         return Coefficients(
