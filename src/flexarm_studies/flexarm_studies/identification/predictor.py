@@ -44,7 +44,7 @@ class Predictor:
         self.n, self.m = first.n_joints, first.n_modes
         bending = integrators.substeps(first, MARGIN / LONGER * recording.period, METHOD)
         friction = int(np.ceil(_friction_rate(first, recording) * recording.period / STABLE))
-        self.substeps = max(bending, min(friction, integrators.MOST_SUBSTEPS))
+        self.substeps = max(bending, min(friction, integrators.MAX_SUBSTEPS))
         # Row k of a recording has the torque that brought the arm there.
         self.torque = np.ascontiguousarray(recording.torque[1:])
 
