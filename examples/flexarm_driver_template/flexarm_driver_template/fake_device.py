@@ -23,7 +23,7 @@ POSITION, STRAIN, TORQUE = 2.0 * np.pi / 2**20, 1e-9, 1e-3  # [rad], [-], [N m] 
 #: It takes the safe action by itself when it has heard nothing for so long [s].
 DEAF = 0.5
 #: Samples that it makes up for after the machine had no time for it; more are lost [-].
-MOST_BEHIND = 200
+MAX_BEHIND = 200
 
 
 class FakeDevice:
@@ -81,7 +81,7 @@ def serve(device, line, stopped):
         if ready:
             device.hear(os.read(line, 65_536))
         now = time.monotonic()
-        due = max(due, now - MOST_BEHIND * device.period)
+        due = max(due, now - MAX_BEHIND * device.period)
         while due <= now:
             with contextlib.suppress(BlockingIOError):  # nobody reads: the sample is lost
                 os.write(line, device.sample())
