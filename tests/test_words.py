@@ -57,12 +57,7 @@ FOLDERS = (
     *sorted(f"src/{path.name}" for path in (ROOT / "src").iterdir() if path.is_dir()),
 )  # fmt: skip
 #: Folders and files that still have such words: take yours out when it is clean.
-OPEN = (
-    "docs/architecture.md", "examples", "fuzz/files.py",
-    "src/flexarm_control/flexarm_control/loop", "src/flexarm_control/flexarm_control/nodes",
-    "src/flexarm_control/test/test_arm_controller.py",
-    "src/flexarm_msgs", "src/flexarm_studies", "src/flexarm_tools",
-)  # fmt: skip
+OPEN = ("docs/architecture.md", "src/flexarm_msgs")
 #: Plain text beside the folders.
 LOOSE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.rst", "Makefile", "flexarm", "pyproject.toml")
 

@@ -20,14 +20,14 @@ from . import protocol
 
 #: Scales of its electronics: a 20 bit encoder, a bridge of 1 nanostrain and a drive of 1 mN m a count.
 POSITION, STRAIN, TORQUE = 2.0 * np.pi / 2**20, 1e-9, 1e-3  # [rad], [-], [N m] per count
-#: It takes the safe action by itself when it has heard nothing for so long [s].
+#: It takes the safe action by itself when it has received nothing for this time [s].
 DEAF = 0.5
 #: Samples that it makes up for after the machine had no time for it; more are lost [-].
 MAX_BEHIND = 200
 
 
 class FakeDevice:
-    """The simulated arm, and what it says and hears.
+    """The simulated arm, and what it sends and receives.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class FakeDevice:
     rate : float
         Samples per second [Hz].
     ignore_torque : bool
-        A drive whose power is off: nothing of what it is told happens.
+        A drive whose power is off: it ignores torques.
     """
 
     def __init__(self, arm, rate, ignore_torque=False):
@@ -46,21 +46,21 @@ class FakeDevice:
         self.sim = simulator.Simulator(settings)
         self.period = 1e-9 * self.sim.period_ns
         self.ignore_torque = ignore_torque
-        self._torque, self._heard, self._lines = None, 0, protocol.Lines()
+        self._torque, self._received, self._lines = None, 0, protocol.Lines()
 
-    def hear(self, data):
-        """Take what came on the line."""
+    def receive(self, data):
+        """Take received bytes."""
         for line in self._lines.feed(data):
             word, numbers = protocol.unseal(line) or ("", [])
             if word == "T" and len(numbers) == self.sim.torque.size:
-                self._torque, self._heard = TORQUE * np.array(numbers), self.sim.sequence
+                self._torque, self._received = TORQUE * np.array(numbers), self.sim.sequence
             elif word == "X":
                 self._torque = None
 
     def sample(self):
         """Live for one period; the line that tells the next sample."""
         sim = self.sim
-        if (sim.sequence - self._heard) * self.period > DEAF:
+        if (sim.sequence - self._received) * self.period > DEAF:
             self._torque = None
         sim.advance(None if self.ignore_torque else self._torque)
         return protocol.seal(
@@ -79,11 +79,11 @@ def serve(device, line, stopped):
     while not stopped:
         ready, _, _ = select.select([line], [], [], max(0.0, due - time.monotonic()))
         if ready:
-            device.hear(os.read(line, 65_536))
+            device.receive(os.read(line, 65_536))
         now = time.monotonic()
         due = max(due, now - MAX_BEHIND * device.period)
         while due <= now:
-            with contextlib.suppress(BlockingIOError):  # nobody reads: the sample is lost
+            with contextlib.suppress(BlockingIOError):  # no reader: the sample is lost
                 os.write(line, device.sample())
             due += device.period
 

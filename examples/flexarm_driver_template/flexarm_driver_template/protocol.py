@@ -6,7 +6,7 @@ From the device, one line a sample, all whole numbers, then the checksum (exclus
     S <number> <microseconds> <encoder counts ...> <bridge counts ...> <drive counts ...>*5A
 
 To the device: ``T <drive counts ...>*5A`` applies torque until the next line, ``X*58`` takes the safe action.
-The device takes it by itself when it hears nothing for a while.
+The device takes it by itself when it receives nothing for a while.
 """
 
 from dataclasses import dataclass

@@ -86,7 +86,7 @@ def test_two_soft_links_come_to_rest_with_the_trajectory():
 
 
 @pytest.mark.parametrize("payload", [0.0, 2.0, 3.0])
-def test_a_payload_that_it_was_not_told_of(payload):
+def test_an_unknown_payload(payload):
     """Stays stable and settles, on the paper's arm."""
     _, found = run(
         Scenario(
@@ -102,7 +102,7 @@ def test_a_payload_that_it_was_not_told_of(payload):
     assert np.isfinite(found["settling_time_s"])
 
 
-def test_a_plan_that_the_torque_does_not_allow_is_said_and_done_without():
+def test_a_plan_that_the_torque_does_not_allow_is_reported_and_skipped():
     loop = ClosedLoop(
         "R", SLOW, FAST, {"type": "true_rates"}, {"publish_rates": True},
         {"feedforward": "preview", "torque_limit": [2.0]}, MANIFOLD,

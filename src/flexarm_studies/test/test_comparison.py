@@ -176,7 +176,7 @@ def test_what_can_be_judged_without_simulation_is_judged_first():
 
 
 def test_the_screen_of_pid_is_the_sampled_loop():
-    """A damping that the sampled elbow does not stand is told from one that it does."""
+    """A damping that makes the sampled elbow unstable is distinguished from one that does not."""
     screen = controllers.CONTROLLERS[controllers.PID].screen
     soft, hard = (screen(TWO, [1.5, z, 0.0, 0.0, 1.0, 1.0, 1.0]) for z in (0.01, 5.0))
     assert soft < 0.0 < hard

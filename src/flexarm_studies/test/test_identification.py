@@ -143,7 +143,7 @@ def test_held_quantities_stay_and_unknown_names_are_refused(given, shaken):
         Problem(given, measured, ["payload.mas"])
 
 
-def test_a_model_that_does_not_explain_the_motion_is_said(given, shaken):
+def test_a_model_that_does_not_explain_the_motion_is_reported(given, shaken):
     _, measured, _ = shaken
     backwards = replace(measured, torque=-measured.torque)
     problem = Problem(given, backwards, ["*friction*", "links*", "*gain", "payload*"])
@@ -272,7 +272,7 @@ def test_excite_asks_before_it_moves_the_arm(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["nothing.csv", "one_link"], "no such file or bag"),
         (["one_link"], "either a bag or CSV file"),
@@ -282,7 +282,7 @@ def test_excite_asks_before_it_moves_the_arm(tmp_path):
         (["nan.csv", "one_link"], "joint_torque is unknown"),
     ],
 )
-def test_what_can_not_be_used_is_said(words, said, tmp_path, monkeypatch, capsys):
+def test_what_can_not_be_used_is_reported(words, message, tmp_path, monkeypatch, capsys):
     head = "t,joint1_position,joint1_torque,root_strain,middle_strain\n"
     (tmp_path / "short.csv").write_text(head + "0,0,0,0,0\n")
     (tmp_path / "wrong.csv").write_text("t,joint1_torque\n0,0\n")
@@ -293,7 +293,7 @@ def test_what_can_not_be_used_is_said(words, said, tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit) as caught:
         cli.main(["identify", *words])
     assert caught.value.code == 1
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_only_the_stretch_under_enabled_torque_counts(given):

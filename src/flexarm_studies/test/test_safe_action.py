@@ -64,7 +64,7 @@ def test_damping_stops_every_joint_within_a_second_and_energy_only_falls(name, t
 @pytest.mark.slow
 def test_under_gravity_the_brakes_stop_every_joint_within_a_second_and_the_arm_does_not_drop():
     speed, energy, turned, period = broken_off("long_reach", 1.5)
-    # Gravity's share of the energy is of the shape the arm stops in: the sum falls all the same.
+    # The energy of gravity depends on where the arm stops; the sum falls all the same.
     assert np.diff(energy).max() < 1e-6 * np.ptp(energy)
     assert np.rad2deg(np.abs(speed[round(1.0 / period) :])).max() < 1.0
     assert np.rad2deg(np.abs(turned)).max() < 8.0
