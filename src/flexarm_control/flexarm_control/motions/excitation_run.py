@@ -14,17 +14,17 @@ from .excitation_torque import ExcitationTorque
 
 LIMITS = (
     parameter("travel", 1.0, "rad", 0.001, 100.0).described(
-        "The excitation stops when a joint is further from where it started; the arm file's limits hold too."
+        "The excitation stops when a joint is farther from its start; the arm file's limits apply too."
     ),
     parameter("strain_limit", 0.0, "-", 0.0, 0.1).described(
-        "The excitation stops when a gauge reads more, its bias aside; 0: four fifths of its full scale."
+        "The excitation stops when a gauge reads more, without its bias; 0: four fifths of its full scale."
     ),
     parameter("hold_frequency", 0.2, "Hz", 0.0, 10.0).described(
-        "Frequency of the soft, damped spring that keeps the joints about where they started; 0: none. Keep it well"
+        "Frequency of the soft, damped spring that keeps the joints near their start; 0: none. Keep it well"
         " below the first bending frequency."
     ),
     parameter("settle", 0.2, "s", 0.0, 60.0).described(
-        "The arm must have been at rest for so long before it is shaken."
+        "Time for which the arm must be at rest before the excitation begins."
     ),
 )
 PARAMETERS = (*excitation_torque.PARAMETERS, *LIMITS)

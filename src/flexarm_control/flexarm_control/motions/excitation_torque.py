@@ -23,24 +23,24 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 KINDS = ("ring_down", "sweep", "pulse")
 PARAMETERS = (
     parameter("kind", "sweep", choices=KINDS).described(
-        "What the torque is over time: a sweep of frequencies, a pulse forth and back, or some periods at the first"
+        "Shape of the torque over time: a sweep of frequencies, a pulse forth and back, or some periods at the first"
         " bending frequency."
     ),
-    parameter("joint", "").described("Joint that is shaken; empty: one after the other."),
+    parameter("joint", "").described("Excited joint; empty: all, one after the other."),
     parameter("amplitude", 0.0, "N m", 0.0, 1e6).described(
-        "Amplitude of the torque; at most the joint's limit. 0: a fifth of that."
+        "Amplitude of the torque, at most the joint's limit; 0: a fifth of the limit."
     ),
     parameter("duration", 0.0, "s", 0.0, 600.0).described(
-        "Of the shaking of one joint; 0: by the kind and the slowest mode."
+        "Duration of the excitation of one joint; 0: from the kind and the slowest mode."
     ),
     parameter("rest", 2.0, "s", 0.0, 600.0).described(
-        "Time in which the arm rings freely, after each joint."
+        "Time after each joint in which the arm vibrates freely."
     ),
     parameter("frequency_low", 0.0, "Hz", 0.0, 10000.0).described(
-        "Where a sweep begins; 0: at a quarter of the lowest bending frequency."
+        "Start of a sweep; 0: a quarter of the lowest bending frequency."
     ),
     parameter("frequency_high", 0.0, "Hz", 0.0, 10000.0).described(
-        "Where a sweep ends; 0: at 1.3 times the highest bending frequency of the arm file."
+        "End of a sweep; 0: 1.3 times the highest bending frequency of the arm file."
     ),
 )
 #: Fraction of a sweep over which it fades in, and out [-].

@@ -21,13 +21,13 @@ from ..motions.excitation_run import ExcitationRun, Stage
 
 PARAMETERS = (
     parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
-        "Without a state for so long the excitation stops."
+        "The excitation stops after this time without a state."
     ),
     parameter("readers", 1, "-", 0, 100, read_only=True).described(
-        "No state is answered before so many read joint_torque: the driver, and a recorder."
+        "Number of subscribers to joint_torque to wait for before answering: the driver, and a recorder."
     ),
     parameter("recorder", "", read_only=True).described(
-        "Name of a node that is to read joint_torque before a state is answered; empty: none is waited for."
+        "Node that must subscribe to joint_torque before a state is answered; empty: none."
     ),
 )
 

@@ -21,10 +21,10 @@ PARAMETERS = (
         "Corner of the filtered derivative of the joint positions, for a source without joint velocities."
     ),
     parameter("delay", 0.0, "s", 0.0, 0.1).described(
-        "From a sample's stamp to when the torque that answers it acts: the estimate is predicted ahead by it."
+        "Time from a sample's stamp until its torque acts; the estimate is predicted ahead by it."
     ),
     parameter("smooth_position", True).described(
-        "Pass on the observer's joint positions, where it estimates them, in place of the encoders'."
+        "Use the observer's joint positions, if it estimates them, instead of the encoders'."
     ),
     *gauge_health.PARAMETERS,
 )

@@ -61,15 +61,15 @@ class ExtendedKalman(Kalman):
         _flag("estimate_payload", True, "the scale of the payload's mass and inertia"),
         _flag("estimate_viscous", True, "viscous friction of the joints"),
         _flag("estimate_coulomb", False, "Coulomb friction of the joints"),
-        _size("payload_deviation", 1.0, "-", "Of the payload's scale from 1 at the start, rms."),
-        _size("viscous_deviation", 0.5, "N m s/rad", "Of viscous friction from the file's, rms."),
-        _size("coulomb_deviation", 0.2, "N m", "Of Coulomb friction from the file's, rms."),
+        _size("payload_deviation", 1.0, "-", "Initial deviation of the payload's scale from 1, rms."),
+        _size("viscous_deviation", 0.5, "N m s/rad", "Initial deviation of viscous friction from the file's, rms."),
+        _size("coulomb_deviation", 0.2, "N m", "Initial deviation of Coulomb friction from the file's, rms."),
         _size("payload_drift", 1e-3, "s^-0.5", "Random walk of the payload's scale, per root of a second."),
         _size("viscous_drift", 1e-3, "N m s^0.5/rad", "Random walk of viscous friction."),
         _size("coulomb_drift", 1e-3, "N m s^-0.5", "Random walk of Coulomb friction."),
         parameter("relinearise", 0.01, "s", 0.0, 1.0).described(
-"Jacobians are taken anew after this time; 0.0: at every sample."
-),
+            "Time between computations of the Jacobians; 0.0: at every sample."
+        ),
     )  # fmt: skip
 
     def _prepare(self):

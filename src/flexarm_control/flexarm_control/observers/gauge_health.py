@@ -36,11 +36,11 @@ WORDS = ("good", "missing", "stuck", "saturated", "suspect")
 
 PARAMETERS = (
     parameter("calibration_samples", 200, "-", 2, 100_000, read_only=True).described(
-        "Samples at rest of which ~/calibrate_gauges takes the mean."
+        "Number of samples at rest that ~/calibrate_gauges averages."
     ),
     parameter("stuck_samples", 50, "-", 2, 100_000, read_only=True).described(
-        "A gauge that reads the same for so many samples while the others move is stuck; one that was bad is"
-        " taken back after as many good ones."
+        "A gauge is stuck after this many equal readings while the others move; a bad gauge is used again"
+        " after as many good readings."
     ),
 )
 

@@ -38,10 +38,10 @@ from .motion import Motion
 
 NOISE = (
     parameter("strain_noise", 0.0, "strain", 0.0, 1e-2).described(
-        "Noise of every gauge, rms; 0: each as in the arm file, bits included, 1e-6 where it states none."
+        "Noise of every gauge, rms; 0: from the arm file, bits included, or 1e-6 if it has none."
     ),
     parameter("position_noise", 0.0, "rad", 0.0, 1.0).described(
-        "Noise of the joint positions, rms; 0: that of the arm file's encoder_counts, 1e-5 rad where there are none."
+        "Noise of the joint positions, rms; 0: from the arm file's encoder_counts, or 1e-5 rad if it has none."
     ),
     parameter("amplitude_noise", 1e-5, "m, rad", 1e-12, 1.0).described(
         "Noise of the modal amplitudes, rms, of an arm whose file has no gauges."

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories: what a `trajectory_msgs/JointTrajectory` asks for, and the reference it makes.
+"""Trajectories: checks a `trajectory_msgs/JointTrajectory` and makes the reference from it.
 
-Read as the joint_trajectory_controller of ros2_controllers (Jazzy) reads it. The fields that the
-points have choose the interpolation (with x the time since the segment's start, T its length):
+Trajectories mean the same as for the joint_trajectory_controller of ros2_controllers (Jazzy). The
+fields of the points select the interpolation:
 
 ===================================== ===================================================
 positions                             linear: the velocity steps at the points
@@ -11,13 +11,14 @@ positions, velocities, accelerations  quintic Hermite: acceleration continuous t
 ===================================== ===================================================
 
 The first segment leads from the reference at the start to the first point, at its
-`time_from_start`, with the same interpolation: the reference's own velocity (and acceleration)
-begin it, so a new trajectory takes over smoothly. After the last point the reference holds it.
+`time_from_start`, with the same interpolation. It begins with the reference's own velocity (and
+acceleration), so that a new trajectory takes over smoothly. After the last point the reference
+holds its position.
 
-Where this is stricter than the joint_trajectory_controller: partial joint goals, velocities
-without positions, fields that not every point has, and a start in the past are refused.
+This package is stricter than the joint_trajectory_controller: it refuses partial joint goals,
+velocities without positions, fields that some points lack, and a start in the past.
 
-Time is the stamp of the samples, in integer nanoseconds; nothing here reads a clock.
+Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 """
 
 from .reference import ReferenceGenerator, Verdict

@@ -50,9 +50,9 @@ class Path:
     """A piecewise polynomial from the reference at its start to its last point.
 
     Knot 0 is the start, knot i the i-th point; segment i leads from knot i to knot i + 1. The
-    coefficients of all segments but the first are made here, those of the first in `begin`,
-    when the reference at the start is known. A first point at time 0 leaves segment 0 with no
-    length, and it is never evaluated.
+    coefficients of the first segment are computed in `begin`, when the reference at the start is
+    known, those of all others here. With a first point at time 0, segment 0 has no length and is
+    never evaluated.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class Path:
     derivatives : sequence of m (k, n) arrays
         Positions, then velocities, then accelerations.
     trajectory_id : int
-        Whose path it is; 0: a stop's.
+        The trajectory of the path; 0: a stop.
     """
 
     def __init__(self, times_ns, derivatives, trajectory_id=0):
@@ -82,14 +82,14 @@ class Path:
             after = [values[1:] for values in derivatives]
             for i, values in enumerate(hermite(lengths, before, after)):
                 self._coefficients[1:, i] = values
-        # The current segment's, for position, velocity and acceleration side by side: one
-        # Horner scheme then serves the three. d/dx of sum c_i x^i has (i + 1) c_{i+1}.
+        # Coefficients of the current segment, for position, velocity and acceleration side by side,
+        # so that one Horner scheme evaluates all three. d/dx of sum c_i x^i has (i + 1) c_{i+1}.
         self._stack = np.zeros((order, 3, n))
         self._rows = tuple(self._stack[::-1])
         self._once = np.arange(1.0, order)[:, None]
         self._twice = self._once[:-1] * self._once[1:]
         self._x = np.zeros(())
-        # What was evaluated last: a stamp is looked up ahead first, then sampled.
+        # The last evaluated state: most stamps are evaluated twice, ahead of time and when sampled.
         self._last = np.zeros((3, n))
         self._forget_segment()
 
@@ -112,7 +112,7 @@ class Path:
         """Fill `out` (3, n) with the state at a stamp; return whether it is before the end."""
         elapsed_ns = stamp_ns - self.start_ns
         if elapsed_ns < 0:
-            elapsed_ns = 0  # before the start nothing is known but the state at the start
+            elapsed_ns = 0  # before the start: the state at the start
         if elapsed_ns >= self.duration_ns:
             np.copyto(out, self._end)
             return False

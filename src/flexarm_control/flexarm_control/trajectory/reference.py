@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference that the joints follow: holds, trajectories, stops."""
+"""Generates the reference of the joints: holds, trajectories and stops."""
 
 from dataclasses import dataclass
 
@@ -31,11 +31,11 @@ class Verdict:
     accepted : bool
         Whether it will be followed.
     reason : str
-        Why it is refused, or when it starts and what it replaces.
+        Why it is refused, or when it starts and which trajectory it replaces.
     trajectory_id : int
-        Its number, counted from 1; of a repeat, the number of what it repeats; 0 if refused.
+        Its number, counted from 1; the number of the repeated trajectory for a repeat; 0 if refused.
     repeat : bool
-        Whether it is the last accepted one again: no error, and no new start.
+        Whether it is the last accepted one again, which is neither an error nor a new start.
     """
 
     accepted: bool
@@ -45,11 +45,11 @@ class Verdict:
 
 
 class ReferenceGenerator:
-    """The joints' reference: holds, follows trajectories, stops.
+    """Generates the joints' reference: holds, follows trajectories, stops.
 
-    The newest accepted trajectory wins: from its start on it replaces what is followed, and at
-    once what was accepted before and has not begun, except that a trajectory which only waits
-    for the next sample is still begun when the newer one starts later.
+    The newest accepted trajectory wins. From its start on it replaces the one that is followed.
+    A trajectory that was accepted earlier and has not begun is replaced at once, except that one
+    which only waits for the next sample still begins if the newer one starts later.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class ReferenceGenerator:
         self.reset()
 
     def reset(self):
-        """Forget everything: the state, the trajectories, their numbers, what is a repeat."""
+        """Forget everything: the state, the trajectories and their numbers."""
         self._state[:] = 0.0
         self._last_ns = None
         self.accepted_id = 0
@@ -110,7 +110,7 @@ class ReferenceGenerator:
         self.active = self.finished = self.stopping = False
 
     def start(self, position, stamp_ns):
-        """Hold a measured position from a stamp on; trajectories before it are forgotten.
+        """Hold a measured position from a stamp on; earlier trajectories are forgotten.
 
         Parameters
         ----------
@@ -255,8 +255,8 @@ class ReferenceGenerator:
     def sample(self, stamp_ns):
         """Fill `position`, `velocity`, `acceleration` and the flags for a stamp [ns].
 
-        The same stamps after the same calls give the same bits. An earlier stamp than the last
-        is allowed; before the start of what is followed, the state at that start is given.
+        The same stamps after the same calls give the same bits. A stamp may be earlier than the last;
+        before the start of the followed trajectory, the reference is the state at that start.
 
         `stamp_ns` is on the arm's clock [ns].
 
@@ -271,7 +271,7 @@ class ReferenceGenerator:
             )
         pending = self._pending
         if pending is not None and stamp_ns >= pending.start_ns:
-            # One that still waits for its first sample would begin after this: it never does.
+            # A trajectory that still waits for its first sample would begin later: it is dropped.
             self._starting = self._pending = None
             self._follow(pending, pending.start_ns)
         elif self._starting is not None:
@@ -290,8 +290,8 @@ class ReferenceGenerator:
     def near(self, offset):
         """State (position, velocity, acceleration), (3, n), at an offset [s] from the last sampled stamp.
 
-        On the polynomial that is followed there, continued beyond its ends: what derivatives of the reference
-        are taken from. Overwritten by the next call.
+        It is on the polynomial of that stamp, continued beyond its ends, so that derivatives of the reference can be
+        computed. Overwritten by the next call.
         """
         if self._path is None:
             np.copyto(self._near, self._state)
@@ -300,7 +300,7 @@ class ReferenceGenerator:
         return self._near
 
     def _follow(self, path, start_ns):
-        """Leave what is followed for a path, from the reference at that moment."""
+        """Change to a path, from the reference at its start."""
         self._reference_at(self._path, start_ns)
         path.begin(start_ns, self._scratch)
         self._path = path
