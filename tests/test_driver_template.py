@@ -127,7 +127,7 @@ def test_two_controllers_in_turn_bring_the_safe_action_and_a_torque_is_clipped(l
     apply([1], 1000.0, lambda u: abs(u - limit) < 1e-3)
     apply([1], -1000.0, lambda u: abs(u + limit) < 1e-3)
     apply([1, 2], 1.0, lambda u: u == 0.0)
-    line.wait_for("a word of it", lambda: "several controllers" in line.log("driver"))
+    line.wait_for("the warning", lambda: "several controllers" in line.log("driver"))
     apply([1], 0.5, lambda u: abs(u - 0.5) < 1e-6)
 
 

@@ -33,7 +33,7 @@ class Arm:
         words = {
             k: str(v).replace("'", '"') if isinstance(v, list) else v for k, v in PARAMETERS.items()
         }
-        file = bench.directory.parent / "adapter.yaml"
+        file = bench.processes.logs.parent / "adapter.yaml"
         lines = "".join(f"    {k}: {v}\n" for k, v in words.items())
         file.write_text(f"driver:\n  ros__parameters:\n{lines}")
         command = [executable("flexarm_bringup", "ros2_control_adapter"), *arguments(file=file)]
@@ -44,7 +44,7 @@ class Arm:
         self._strain = bench.publisher(Float64MultiArray, "strain")
         self.torques = bench.publisher(JointTorque, "joint_torque")
 
-    def tell(self, velocity=(0.0, 0.0), strain=(3e-6, 4e-6, 1e-6, 2e-6)):
+    def sample(self, velocity=(0.0, 0.0), strain=(3e-6, 4e-6, 1e-6, 2e-6)):
         """Publish samples until one comes back as a state; that state."""
         seen = len(self.states.messages)
 
@@ -62,11 +62,11 @@ class Arm:
 
         return self.bench.wait_for("the state", received)
 
-    def efforts_are(self, *expected, **sample):
+    def efforts_are(self, *expected, **measured):
         """Wait until the effort controller receives this."""
 
         def right():
-            self.tell(**sample)
+            self.sample(**measured)
             return list(self.efforts.newest.data) == pytest.approx(list(expected))
 
         self.bench.wait_for(f"efforts {expected}", right)
@@ -85,14 +85,14 @@ def answer(state, torque, **changes):
 
 
 def test_a_state_has_the_arm_files_names_and_order(arm):
-    state = arm.tell(velocity=(0.3, -0.4))
+    state = arm.sample(velocity=(0.3, -0.4))
     assert list(state.joint_names) == ["joint1", "joint2"]
     assert list(state.joint_position) == [0.1, 0.2]
     assert list(state.joint_velocity) == [0.3, -0.4]
     assert list(state.strain) == [1e-6, 2e-6, 3e-6, 4e-6]
     assert list(state.modal_amplitude) == []
     assert stamp_ns(state.header.stamp) % TICK == 0
-    later = arm.tell()
+    later = arm.sample()
     assert later.session == state.session and later.sequence > state.sequence
 
 
@@ -104,28 +104,28 @@ def test_without_torque_the_efforts_damp_each_joint_and_go_back_to_zero_at_rest(
 
 def test_a_torque_becomes_efforts_in_the_controllers_order_until_it_is_late(arm):
     def right():
-        arm.torques.publish(answer(arm.tell(velocity=(0.1, 0.0)), [1.5, -100.0]))
+        arm.torques.publish(answer(arm.sample(velocity=(0.1, 0.0)), [1.5, -100.0]))
         return list(arm.efforts.newest.data) == pytest.approx([-2.0, 1.5])
 
     arm.bench.wait_for("the torque, clipped", right)
-    assert arm.tell().joint_torque[0] == pytest.approx(1.5)
+    assert arm.sample().joint_torque[0] == pytest.approx(1.5)
     arm.efforts_are(0.0, -0.2, velocity=(0.1, 0.0))  # no more torque: the safe action
     arm.bench.wait_for("a refusal", lambda: _refuse(arm))
 
 
 def _refuse(arm):
-    arm.torques.publish(answer(arm.tell(), [math.nan, 0.0]))
+    arm.torques.publish(answer(arm.sample(), [math.nan, 0.0]))
     return "torque of joint1 is nan" in arm.bench.log("adapter")
 
 
 def test_strains_that_stop_are_missing_and_not_the_last_ones(arm):
-    arm.tell()
-    arm.bench.wait_for("NaN", lambda: np.isnan(arm.tell(strain=None).strain).all())
+    arm.sample()
+    arm.bench.wait_for("NaN", lambda: np.isnan(arm.sample(strain=None).strain).all())
 
 
 def test_the_last_efforts_of_an_adapter_that_is_stopped_are_zero(arm):
     arm.efforts_are(0.0, -0.6, velocity=(0.3, 0.0))
     seen = len(arm.efforts.messages)
     assert arm.bench.stop("adapter", 2) == 0
-    arm.bench.wait_for("the last word", lambda: len(arm.efforts.messages) > seen)
+    arm.bench.wait_for("the last efforts", lambda: len(arm.efforts.messages) > seen)
     arm.bench.wait_for("zero", lambda: list(arm.efforts.newest.data) == [0.0, 0.0])

@@ -88,7 +88,7 @@ class MeasurementTime:
     """Moves times of the device's clock to this machine's clock.
 
     A frame takes at least as long to arrive as the quickest one: the smallest difference between arrival and
-    measurement is the offset of the clocks. A frame that was late on the wire keeps its time of measurement, so
+    measurement is the offset of the clocks. A frame that was delayed keeps its time of measurement, so
     that stamps have no jitter. A device clock that goes back has restarted, and is measured anew.
     """
 

@@ -47,7 +47,7 @@ class DriverNode(driver.Driver):
             arrival = self.get_clock().now().nanoseconds
             s = self.scale
             yield driver.Sample(
-                number=frame.number,  # a gap: frames were lost on the wire
+                number=frame.number,  # a gap: frames were lost
                 stamp_ns=self.time.stamp(1000 * frame.microseconds, arrival),  # of measurement
                 position=s["position_per_count"] * (frame.encoder - s["encoder_zero"]),
                 torque=s["torque_per_count"] * frame.drive,  # as applied, not as sent

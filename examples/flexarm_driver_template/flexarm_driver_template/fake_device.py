@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A device that is not there: a simulated arm in real time behind a pseudo-terminal, counts and lines and all."""
+"""Fake device: a simulated arm in real time behind a pseudo-terminal, with counts and lines as a real device."""
 
 import argparse
 import contextlib
@@ -18,25 +18,25 @@ from flexarm_sim import simulator
 
 from . import protocol
 
-#: Scales of its electronics: a 20 bit encoder, a bridge of 1 nanostrain and a drive of 1 mN m a count.
+#: Scales of its electronics per count: a 20 bit encoder, a bridge of 1 nanostrain, a drive of 1 mN m.
 POSITION, STRAIN, TORQUE = 2.0 * np.pi / 2**20, 1e-9, 1e-3  # [rad], [-], [N m] per count
-#: It takes the safe action by itself when it has received nothing for this time [s].
-DEAF = 0.5
-#: Samples that it makes up for after the machine had no time for it; more are lost [-].
+#: Its own watchdog takes the safe action after this time without a torque [s].
+WATCHDOG = 0.5
+#: Samples that it catches up with after the machine was busy; more are lost [-].
 MAX_BEHIND = 200
 
 
 class FakeDevice:
-    """The simulated arm, and what it sends and receives.
+    """The simulated arm, and the lines that it sends and receives.
 
     Parameters
     ----------
     arm : str
-        Arm file, which takes the place of the real arm.
+        Arm file of the arm to simulate.
     rate : float
         Samples per second [Hz].
     ignore_torque : bool
-        A drive whose power is off: it ignores torques.
+        Simulate a drive without power: torques have no effect.
     """
 
     def __init__(self, arm, rate, ignore_torque=False):
@@ -46,21 +46,21 @@ class FakeDevice:
         self.sim = simulator.Simulator(settings)
         self.period = 1e-9 * self.sim.period_ns
         self.ignore_torque = ignore_torque
-        self._torque, self._received, self._lines = None, 0, protocol.Lines()
+        self._torque, self._commanded, self._lines = None, 0, protocol.Lines()
 
     def receive(self, data):
-        """Take received bytes."""
+        """Process received bytes."""
         for line in self._lines.feed(data):
             word, numbers = protocol.unseal(line) or ("", [])
             if word == "T" and len(numbers) == self.sim.torque.size:
-                self._torque, self._received = TORQUE * np.array(numbers), self.sim.sequence
+                self._torque, self._commanded = TORQUE * np.array(numbers), self.sim.sequence
             elif word == "X":
                 self._torque = None
 
     def sample(self):
-        """Live for one period; the line that tells the next sample."""
+        """Advance by one period; the line of the next sample."""
         sim = self.sim
-        if (sim.sequence - self._received) * self.period > DEAF:
+        if (sim.sequence - self._commanded) * self.period > WATCHDOG:
             self._torque = None
         sim.advance(None if self.ignore_torque else self._torque)
         return protocol.seal(
@@ -74,7 +74,7 @@ class FakeDevice:
 
 
 def serve(device, line, stopped):
-    """Samples on the grid of real time, until `stopped` holds something."""
+    """Send samples on the grid of real time, until `stopped` is not empty."""
     due = time.monotonic()
     while not stopped:
         ready, _, _ = select.select([line], [], [], max(0.0, due - time.monotonic()))
@@ -83,7 +83,7 @@ def serve(device, line, stopped):
         now = time.monotonic()
         due = max(due, now - MAX_BEHIND * device.period)
         while due <= now:
-            with contextlib.suppress(BlockingIOError):  # no reader: the sample is lost
+            with contextlib.suppress(BlockingIOError):  # without a reader the sample is lost
                 os.write(line, device.sample())
             due += device.period
 
@@ -91,10 +91,12 @@ def serve(device, line, stopped):
 def main(args=None):
     """Entry point of ``ros2 run flexarm_driver_template fake_device``."""
     parser = argparse.ArgumentParser(prog="fake_device", description=__doc__)
-    parser.add_argument("--arm", default="R", help="arm file that takes the real arm's place")
-    parser.add_argument("--port", required=True, help="where the serial line is to appear")
+    parser.add_argument("--arm", default="R", help="arm file of the arm to simulate")
+    parser.add_argument("--port", required=True, help="path of the serial line to create")
     parser.add_argument("--rate", type=float, default=200.0, help="samples per second [Hz]")
-    parser.add_argument("--ignore-torque", action="store_true", help="its drive has no power")
+    parser.add_argument(
+        "--ignore-torque", action="store_true", help="simulate a drive without power"
+    )
     options = parser.parse_args(args)
     stopped = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -107,7 +109,7 @@ def main(args=None):
     line, other = os.openpty()
     tty.setraw(other)
     os.set_blocking(line, False)
-    # `other` stays open: a line whose last reader closes it would be gone.
+    # `other` stays open: without any reader the line would be closed.
     with contextlib.suppress(FileNotFoundError):
         os.unlink(options.port)
     os.symlink(os.ttyname(other), options.port)

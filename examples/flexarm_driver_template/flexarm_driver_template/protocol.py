@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The line protocol of the fake device; yours has its own, and this file is what you replace first.
+"""The protocol of the fake device, lines with a checksum: **replace it with that of your device**.
 
-From the device, one line a sample, all whole numbers, then the checksum (exclusive or of the bytes, in hex)::
+The device sends one line per sample: integers, then the checksum (exclusive or of the bytes, in hex)::
 
     S <number> <microseconds> <encoder counts ...> <bridge counts ...> <drive counts ...>*5A
 
-To the device: ``T <drive counts ...>*5A`` applies torque until the next line, ``X*58`` takes the safe action.
-The device takes it by itself when it receives nothing for a while.
+The device receives ``T <drive counts ...>*5A``, and applies that torque until the next line; or ``X*58``, and takes the
+safe action. It also takes the safe action after it has received nothing for a while.
 """
 
 from dataclasses import dataclass
@@ -16,23 +16,23 @@ from operator import xor
 
 @dataclass(frozen=True)
 class Frame:
-    """One sample, as the device counts."""
+    """One sample, in counts of the device."""
 
-    number: int  # [-] of the sample, since the device was switched on
+    number: int  # [-] of the sample since power-on
     microseconds: int  # [us] of the device's own clock at the measurement
-    encoder: list  # [counts] a joint each
-    bridge: list  # [counts] a gauge each
-    drive: list  # [counts] torque applied until now, a joint each
+    encoder: list  # [counts] one per joint
+    bridge: list  # [counts] one per gauge
+    drive: list  # [counts] torque applied until now, one per joint
 
 
 def seal(word, *numbers):
-    """A line with its checksum, as bytes."""
+    """A line of a word and numbers with its checksum, as bytes."""
     text = " ".join([word, *map(str, numbers)]).encode()
     return text + b"*%02X\n" % reduce(xor, text)
 
 
 def unseal(line):
-    """The word and the numbers of a line; None where it was damaged on its way."""
+    """The word and the numbers of a line; None if it was damaged in transit."""
     text, star, check = line.rpartition(b"*")
     try:
         if not star or int(check, 16) != reduce(xor, text, 0):
@@ -43,18 +43,18 @@ def unseal(line):
         return None
 
 
-#: A larger number is a damaged one: a double holds each count up to here [-].
-MOST = 2**53
+#: A larger number must be damaged: up to here a double holds every integer [-].
+MAX_COUNT = 2**53
 
 
 def frame(line, joints, gauges):
-    """The `Frame` of a line; None where it is not one of `joints` and `gauges`."""
+    """The `Frame` of a line; None if it is not one with these numbers of `joints` and `gauges`."""
     word, numbers = unseal(line) or ("", [])
     if word != "S" or len(numbers) != 2 + 2 * joints + gauges:
         return None
     if (
-        min(numbers[:2]) < 0 or max(map(abs, numbers)) > MOST
-    ):  # one checksum in 256 is right by chance
+        min(numbers[:2]) < 0 or max(map(abs, numbers)) > MAX_COUNT
+    ):  # a damaged line has the right checksum in one of 256 cases
         return None
     values = numbers[2:]
     return Frame(
@@ -63,15 +63,15 @@ def frame(line, joints, gauges):
 
 
 class Lines:
-    """Whole lines from pieces as they come."""
+    """Whole lines from the pieces that arrive."""
 
-    LONGEST = 65_536  # [bytes] what grows beyond has no line in it
+    MAX_LENGTH = 65_536  # [bytes] a longer piece is not a line
 
     def __init__(self):
         self._rest = b""
 
     def feed(self, data):
-        """The lines that end in `data`, without their line ends."""
+        """The lines that end in `data`, without line ends."""
         *whole, self._rest = (self._rest + data).split(b"\n")
-        self._rest = self._rest[-self.LONGEST :]
+        self._rest = self._rest[-self.MAX_LENGTH :]
         return whole
