@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from flexarm_control.composite import full_order
 from flexarm_control.composite.design import design
-from flexarm_dynamics import singular_perturbation
+from flexarm_dynamics import linear, singular_perturbation
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models.model import build
 
@@ -83,7 +82,7 @@ def names(arm):
     found |= {"max": np.max, "min": np.min, "expm": expm, "riccati": riccati}
     for name in ("slow_subsystem", "fast_subsystem", "quasi_steady_state", "slow_torque"):
         found[name] = getattr(singular_perturbation, name)
-    found |= {"time_scales": singular_perturbation.time_scales, "full_order": full_order}
+    found |= {"time_scales": singular_perturbation.time_scales, "linear": linear}
     found |= {name: getattr(terms, name) for name in ("f1", "f2", "C1", "C2", "K1", "K2")}
     M11, M12, M21, M22 = M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:]
     S = np.linalg.inv(M22 - M21 @ np.linalg.inv(M11) @ M12)
