@@ -157,7 +157,10 @@ class Supervisor:
         strain = settings["strain_limit"]
         if strain > 0.0 and not arm.gauges:
             raise ParameterError(
-                f"strain_limit is {strain:g}, but {arm.name} has no gauges: limit deflection_limit, or write 0.0"
+                f"can't be watched: {arm.name} has no gauges",
+                field="strain_limit",
+                value=strain,
+                hint="set deflection_limit, or write 0.0",
             )
         n = self.model.n_joints
         able = _deceleration(self.model, torque_limit)
