@@ -87,7 +87,7 @@ def draw(spec, number):
 
 
 def sample(spec, number):
-    """Run sample `number` of a specification; also called in other processes.
+    """Run sample `number` of the specification `spec`; also called in other processes.
 
     Returns
     -------

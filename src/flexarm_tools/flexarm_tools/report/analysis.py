@@ -180,7 +180,7 @@ def _vibration(run, moves):
 def residual_windows(run, moves):
     """Where residual vibration is judged: see `flexarm_studies.loop.metrics.residual_window`.
 
-    Rests that are too short to leave out the slow settling count only in a run that has no longer one.
+    Rests too short to leave out the slow settling count only if none of the motions `moves` has a longer one.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def residual_windows(run, moves):
 def tip_bending(run, window):
     """Displacement of the tip by bending over a rest, shape (known samples, 3) [m].
 
-    By the tip's Jacobian with respect to the amplitudes at the mean joint angles.
+    By the tip's Jacobian with respect to the amplitudes, at the mean joint angles over the `window`.
     """
     bent = run.deflections(window)
     bent = bent[np.isfinite(bent).all(axis=1)]
