@@ -52,7 +52,7 @@ def overridable():
 
 
 def made(create, topic, profile):
-    """Call ``create(profile)`` for a publisher or subscription with a profile of its own.
+    """Call ``create(profile)`` for a publisher or subscription of `topic` with a profile of its own.
 
     rclpy writes overrides into the profile that it is given: of a shared one, other topics would get them too.
 

@@ -178,7 +178,7 @@ def _vibration(run, moves):
 
 
 def residual_windows(run, moves):
-    """Where residual vibration is judged: see `flexarm_studies.loop.metrics.residual_window`.
+    """Where residual vibration is judged after `moves`: see `flexarm_studies.loop.metrics.residual_window`.
 
     Rests too short to leave out the slow settling count only if none of the motions `moves` has a longer one.
 
@@ -205,7 +205,7 @@ def residual_windows(run, moves):
 
 
 def tip_bending(run, window):
-    """Displacement of the tip by bending over a rest, shape (known samples, 3) [m].
+    """Displacement of the tip by bending over `window`, a rest, shape (known samples, 3) [m].
 
     By the tip's Jacobian with respect to the amplitudes, at the mean joint angles over the `window`.
     """
