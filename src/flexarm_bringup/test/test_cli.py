@@ -83,7 +83,7 @@ def test_a_recording_is_described_as_json(capsys):
     taken = Taken(Bag(), "R")
     taken.take({"arm_state": [b"a", b"b"]}, 1_000_000_000)
     taken.take({"joint_torque": [b"c"]}, 3_500_000_000)
-    taken.tell("there", as_json=True)
+    taken.report("there", as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert (printed["out"], printed["arm"], printed["seconds"]) == ("there", "R", 2.5)
     assert (printed["messages"]["arm_state"], printed["messages"]["joint_torque"]) == (2, 1)

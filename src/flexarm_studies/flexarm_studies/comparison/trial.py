@@ -121,8 +121,8 @@ _PREPARED = {}
 def _reuse_plan(case, kind, controller):
     """Prepare a motion only once: its plan depends on arm, motion and rate, not on the tuned gains."""
 
-    def prepare(trajectory, law):
-        start = controller.reference.resting
+    def prepare(trajectory):
+        start, law = controller.reference.resting, controller.law
         if start is None:
             return None
         key = (case, kind, start.tobytes())
