@@ -9,7 +9,6 @@ import signal
 import numpy as np
 import pytest
 from harness import PATIENT, SHM, Arm, Bench, Drive, Source, abandoned, segments, trajectory
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
