@@ -11,12 +11,12 @@ PRINT = {
 
 
 def linear_table(summaries):
-    """Lines of the table of gains, frequencies and damping: print | P3 | R."""
+    """Lines of the table of gains, frequencies and damping: published | P3 | R."""
     composite = {s["model"]: s for s in summaries if s["control"] == "composite"}
     p3, r = composite["P3_m11"], composite["R_m11"]
     lines = [
         "Fast subsystem at the end of the motion: open loop, and closed by the optimal fast control",
-        f"{'':34}{'print':>12}{'P3':>12}{'R':>12}",
+        f"{'':34}{'published':>12}{'P3':>12}{'R':>12}",
     ]
     labels = {
         "open_loop_frequencies_rad_s": ("open loop, mode {} [rad/s]", "~{:.0f}"),
