@@ -14,7 +14,8 @@ def test_the_simulator_in_real_time_passes(bench):
     assert code == 0, output
     assert "mode" in output and "on a separate clock" in output
     bench.publisher(JointTorque, "joint_torque")
-    code, output = check_driver(bench, "--duration", "0.5")
+    # Long enough for this publisher to be discovered before the arm would be pushed.
+    code, output = check_driver(bench, "--duration", "3")
     assert code == 1 and "joint_torque: a controller sends it; stop it" in output
 
 
