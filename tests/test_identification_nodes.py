@@ -100,7 +100,9 @@ def test_nothing_moves_before_the_recorder_is_connected(bench):
     assert not torques.messages
     late = Node("late_recorder", context=bench.node.context)
     try:
-        late.create_subscription(JointTorque, "joint_torque", lambda message: None, qos.LINE)
+        late.create_subscription(
+            JointTorque, "joint_torque", lambda message: None, qos.CONTROL_PATH
+        )
         bench.wait_for("a torque", lambda: torques.messages)
     finally:
         late.destroy_node()

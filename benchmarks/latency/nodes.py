@@ -39,18 +39,19 @@ class TimedSimulator(simulator.SimulatorNode):
         super()._on_torque(msg)
 
     def pause(self, paused):
+        path = self.control_path
         if paused:
-            late = sum(wait > self.line.period for wait in self._latencies) if self.line else 0
+            late = sum(wait > path.period for wait in self._latencies) if path else 0
             found = {
                 "latencies": self._latencies,
                 "enabled": self._latencies_enabled,
                 # No torque when the next period began: late, or never (the one under way aside).
                 "missed": late + max(len(self._pending) - 1, 0),
-                "lost": self.line.lost - self._lost_before if self.line else 0,
+                "lost": path.lost - self._lost_before if path else 0,
             }
             print(json.dumps(found), flush=True)
         self._pending, self._latencies, self._latencies_enabled = {}, [], 0
-        self._lost_before = self.line.lost if self.line else 0
+        self._lost_before = path.lost if path else 0
         return super().pause(paused)
 
 

@@ -156,7 +156,9 @@ class Driver(ArmNode):
         self.gate.begin(new_session())
         self.writer = StateWriter(self.arm)
         options = {"qos_overriding_options": qos.overridable()}
-        self.state_publisher = self.make_publisher(ArmState, "arm_state", qos.LINE, **options)
+        self.state_publisher = self.make_publisher(
+            ArmState, "arm_state", qos.CONTROL_PATH, **options
+        )
         self._joint_state = JointState(name=list(self.arm.joint_names))
         rate = parameters.group("").get("joint_states_rate")
         self._joint_publisher = rate and self.make_publisher(
@@ -165,7 +167,7 @@ class Driver(ArmNode):
         self._joint_period, self._joint_due = rate and round(SECOND / rate), 0  # [ns]
         self.connect(
             self.make_subscription(
-                JointTorque, "joint_torque", self._on_torque, qos.LINE, **options
+                JointTorque, "joint_torque", self._on_torque, qos.CONTROL_PATH, **options
             )
         )
 
@@ -175,7 +177,7 @@ class Driver(ArmNode):
 
     def connect(self, torques):
         """Make the subscription of `joint_torque` the control path, and watch over its timeout."""
-        self.make_line(torques)
+        self.make_control_path(torques)
         # If the samples stop as well, the torque still ends.
         self.make_timer(self.gate.timeout / 2.0, self.watch)
 

@@ -21,7 +21,7 @@ from flexarm_dynamics.parameters import parameter
 
 from . import qos, scheduling
 from .parameters import NodeParameters
-from .spin import Line, spin
+from .spin import ControlPath, spin
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -61,8 +61,8 @@ class ArmNode(LifecycleNode):
             given["cpu_affinity"], given["realtime_priority"], self.get_logger().warning
         )
         self.active = False
-        self.line = None  # the control path, while active
-        self._line = None
+        self.control_path = None  # while active
+        self._control_path = None
         self._made = []
         self._reported = {}
         self._handed = deque()
@@ -114,9 +114,9 @@ class ArmNode(LifecycleNode):
             self.destroy_timer, self.create_timer(period, callback, clock=self._steady)
         )
 
-    def make_line(self, subscription, period=None, on_period=None):
-        """Name the subscription that is the control path, see `spin.Line`."""
-        self._line = Line(subscription, period, on_period)
+    def make_control_path(self, subscription, period=None, on_period=None):
+        """Name the subscription that is the control path, see `spin.ControlPath`."""
+        self._control_path = ControlPath(subscription, period, on_period)
 
     def _publisher(self, kind, topic, profile, **kwargs):
         events, take = self._mismatches.callbacks(True, "qos_overriding_options" in kwargs)
@@ -155,7 +155,7 @@ class ArmNode(LifecycleNode):
 
     def on_activate(self, state):
         """Let the node answer."""
-        self.active, self.line = True, self._line
+        self.active, self.control_path = True, self._control_path
         self.start()
         # The objects made so far stay for good: the collector need not look at them on the control path.
         gc.collect()
@@ -170,7 +170,7 @@ class ArmNode(LifecycleNode):
     def on_cleanup(self, state):
         """Drop what was built."""
         self._unmake()
-        self._line = None
+        self._control_path = None
         return super().on_cleanup(state)
 
     def on_shutdown(self, state):
@@ -182,7 +182,7 @@ class ArmNode(LifecycleNode):
 
     def _halt(self):
         self.stop()
-        self.active, self.line = False, None
+        self.active, self.control_path = False, None
 
     def autostart(self):
         """Configure and activate; False when that failed."""

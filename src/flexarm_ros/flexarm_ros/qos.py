@@ -20,7 +20,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 
 from flexarm_dynamics.errors import ParameterError
 
-LINE = QoSProfile(
+CONTROL_PATH = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
     depth=1,
     reliability=QoSReliabilityPolicy.RELIABLE,

@@ -18,7 +18,7 @@ HOUSEKEEPING = 0.02
 AT_ONCE = 2
 
 
-class Line:
+class ControlPath:
     """The control path of a node.
 
     Parameters
@@ -48,7 +48,7 @@ def spin(nodes, stopped):
     Parameters
     ----------
     nodes : sequence of ArmNode
-        At most one of them with a `line` while it is active, None otherwise; they share the executor.
+        At most one of them with a `control_path` while it is active, None otherwise; they share the executor.
     stopped : list
         Filled by a signal handler.
     """
@@ -58,39 +58,39 @@ def spin(nodes, stopped):
         executor.add_node(node)
     try:
         while not stopped and context.ok():
-            node = next((n for n in nodes if n.line is not None), None)
+            node = next((n for n in nodes if n.control_path is not None), None)
             if node is None:
                 executor.spin_once(timeout_sec=0.1)
             else:
-                _spin_line(node, node.line, executor, AT_ONCE * len(nodes), stopped)
+                _spin_control_path(node, node.control_path, executor, AT_ONCE * len(nodes), stopped)
     finally:
         executor.shutdown()
 
 
-def _spin_line(node, line, executor, at_once, stopped):
-    handle, kind = line.subscription.handle, line.subscription.msg_type
-    callback = line.subscription.callback
+def _spin_control_path(node, path, executor, at_once, stopped):
+    handle, kind = path.subscription.handle, path.subscription.msg_type
+    callback = path.subscription.callback
     waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
     clock = time.monotonic
     others = clock()
-    due = clock() + line.period if line.period else None
-    while node.line is line and not stopped:
+    due = clock() + path.period if path.period else None
+    while node.control_path is path and not stopped:
         now = clock()
         if now >= others:
             for _ in range(at_once):
                 executor.spin_once(timeout_sec=0.0)
-            if node.line is not line or not node.context.ok():
+            if node.control_path is not path or not node.context.ok():
                 return
             now = clock()
             others = now + HOUSEKEEPING
         if due is not None and now >= due:
-            line.on_period()
+            path.on_period()
             # On the grid of whole periods: a late one is followed by a short one, one missed whole is lost.
-            due += line.period
-            missed = int((clock() - due) / line.period)
+            due += path.period
+            missed = int((clock() - due) / path.period)
             if missed > 0:
-                line.lost += missed
-                due += missed * line.period
+                path.lost += missed
+                due += missed * path.period
         until = others if due is None else min(others, due)
         waiting.clear_entities()
         with handle:

@@ -36,7 +36,7 @@ def publisher():
             options = qos.overridable()
             return node.create_publisher(Empty, "t", profile, qos_overriding_options=options)
 
-        return qos.made(create, "t", qos.LINE)
+        return qos.made(create, "t", qos.CONTROL_PATH)
 
     yield publisher
     for node in nodes:
@@ -48,9 +48,9 @@ def test_an_override_is_taken_and_the_shared_profile_stays(publisher):
     made = publisher(reliability="best_effort", depth=7, durability="transient_local")
     profile = made.qos_profile
     assert (profile.reliability, profile.depth) == (BEST_EFFORT, 7)
-    assert profile.durability != qos.LINE.durability
-    assert (qos.LINE.reliability, qos.LINE.depth) == (RELIABLE, 1)
-    assert publisher().qos_profile == qos.LINE
+    assert profile.durability != qos.CONTROL_PATH.durability
+    assert (qos.CONTROL_PATH.reliability, qos.CONTROL_PATH.depth) == (RELIABLE, 1)
+    assert publisher().qos_profile == qos.CONTROL_PATH
 
 
 @pytest.mark.parametrize(

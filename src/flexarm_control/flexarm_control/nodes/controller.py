@@ -85,14 +85,14 @@ class ControllerNode(ArmNode):
     def _make_topics(self):
         options = qos.overridable()
         self._torque_pub = self.make_publisher(
-            JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
+            JointTorque, "joint_torque", qos.CONTROL_PATH, qos_overriding_options=options
         )
         self._state_pub = self.make_publisher(
-            CompositeState, "controller/state", qos.LINE, qos_overriding_options=options
+            CompositeState, "controller/state", qos.CONTROL_PATH, qos_overriding_options=options
         )
         # fmt: off
-        self.make_line(self.make_subscription(
-            ArmState, "arm_state_estimate", self._on_state, qos.LINE, qos_overriding_options=options
+        self.make_control_path(self.make_subscription(
+            ArmState, "arm_state_estimate", self._on_state, qos.CONTROL_PATH, qos_overriding_options=options
         ))
         self.make_subscription(
             JointTrajectory, "joint_trajectory", self._inbox.receive, qos.COMMAND, raw=True,

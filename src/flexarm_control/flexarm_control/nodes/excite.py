@@ -57,11 +57,15 @@ class ExciteNode(ArmNode):
         self._connected = False
         options = qos.overridable()
         self._torque_pub = self.make_publisher(
-            JointTorque, "joint_torque", qos.LINE, qos_overriding_options=options
+            JointTorque, "joint_torque", qos.CONTROL_PATH, qos_overriding_options=options
         )
-        self.make_line(
+        self.make_control_path(
             self.make_subscription(
-                ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+                ArmState,
+                "arm_state",
+                self._on_state,
+                qos.CONTROL_PATH,
+                qos_overriding_options=options,
             )
         )
         self.make_timer(parameters["state_timeout"] / 5.0, self._watch)

@@ -48,15 +48,19 @@ class ObserverNode(ArmNode):
         self._statistics = ObserverStatistics(len(arm.modes))
         options = qos.overridable()
         self._estimate_pub = self.make_publisher(
-            ArmState, "arm_state_estimate", qos.LINE, qos_overriding_options=options
+            ArmState, "arm_state_estimate", qos.CONTROL_PATH, qos_overriding_options=options
         )
         self._state_pub = self.make_publisher(
-            ObserverState, "observer/state", qos.LINE, qos_overriding_options=options
+            ObserverState, "observer/state", qos.CONTROL_PATH, qos_overriding_options=options
         )
         self.make_service(Trigger, "~/calibrate_gauges", self._on_calibrate)
-        self.make_line(
+        self.make_control_path(
             self.make_subscription(
-                ArmState, "arm_state", self._on_state, qos.LINE, qos_overriding_options=options
+                ArmState,
+                "arm_state",
+                self._on_state,
+                qos.CONTROL_PATH,
+                qos_overriding_options=options,
             )
         )
 

@@ -23,10 +23,10 @@ class CalledController(ControllerNode):
             return None
         return super().make_subscription(kind, topic, callback, *args, **kwargs)
 
-    def make_line(self, subscription, *args, **kwargs):
+    def make_control_path(self, subscription, *args, **kwargs):
         # The control path of this process is the observer's subscription.
         if subscription is not None:
-            super().make_line(subscription, *args, **kwargs)
+            super().make_control_path(subscription, *args, **kwargs)
 
     def take(self, message):
         """An estimate; replaced by the control path once the node is configured."""

@@ -61,7 +61,7 @@ class RealTime:
         """Make the grid of periods, and `joint_torque` between them, the control path."""
         node = self._node
         period = node.period / node.parameters["real_time_factor"]
-        node.make_line(torques, period, self._on_period)
+        node.make_control_path(torques, period, self._on_period)
 
     def _on_period(self):
         node = self._node
@@ -113,7 +113,7 @@ class Lockstep:
 
     def connect(self, torques):
         """Make `joint_torque` the control path."""
-        self._node.make_line(torques)
+        self._node.make_control_path(torques)
 
     def pauses_at(self, sequence):
         """Whether a pause begins at this sample."""

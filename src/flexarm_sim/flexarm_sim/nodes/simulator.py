@@ -161,8 +161,8 @@ class SimulatorNode(Driver):
             "periods without a fresh torque": self.pacing.late,
             "controllers seen": len(self.gate.controllers.ids),
         }
-        if self.line is not None and self.line.period:
-            values["periods lost"] = self.line.lost
+        if self.control_path is not None and self.control_path.period:
+            values["periods lost"] = self.control_path.lost
         return values | ({"faults": str(self.faults)} if str(self.faults) else {})
 
     def judge(self, samples):

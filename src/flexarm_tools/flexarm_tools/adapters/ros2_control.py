@@ -182,7 +182,9 @@ class AdapterNode(Driver):
     def connect(self, torques):
         # All topics are served alike: none of them is the control path alone.
         topic = self.parameters
-        self._efforts = self.make_publisher(Float64MultiArray, topic["effort_topic"], qos.LINE)
+        self._efforts = self.make_publisher(
+            Float64MultiArray, topic["effort_topic"], qos.CONTROL_PATH
+        )
         # Best effort: compatible with any publisher.
         self.make_subscription(
             Float64MultiArray, topic["strain_topic"], self._on_strain, qos_profile_sensor_data

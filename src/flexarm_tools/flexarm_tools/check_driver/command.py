@@ -88,8 +88,10 @@ class Conversation:
         self.session = Session("check_driver", namespace=namespace, period=0.05)
         self.node = self.session.node
         self.received, self._answer = [], None
-        self._publisher = self.session.publisher(JointTorque, "joint_torque", profile=qos.LINE)
-        self.node.create_subscription(ArmState, "arm_state", self._on_state, qos.LINE)
+        self._publisher = self.session.publisher(
+            JointTorque, "joint_torque", profile=qos.CONTROL_PATH
+        )
+        self.node.create_subscription(ArmState, "arm_state", self._on_state, qos.CONTROL_PATH)
 
     def _on_state(self, message):
         now = self.node.get_clock().now().nanoseconds

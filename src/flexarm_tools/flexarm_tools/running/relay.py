@@ -25,7 +25,7 @@ from flexarm_ros.messages import (
     TorqueWriter,
     set_stamp,
 )
-from flexarm_ros.spin import Line, spin
+from flexarm_ros.spin import ControlPath, spin
 from flexarm_sim.simulator import Simulator
 
 from .processes import Processes, own_domain
@@ -53,8 +53,8 @@ def observer(arm):
     node = Node("relay_observer")
     estimate, state = filled_state(arm), ObserverStateWriter(arm).message
     state.gauge_health = bytes(len(arm.gauges))
-    estimate_pub = node.create_publisher(ArmState, "arm_state_estimate", qos.LINE)
-    state_pub = node.create_publisher(ObserverState, "observer/state", qos.LINE)
+    estimate_pub = node.create_publisher(ArmState, "arm_state_estimate", qos.CONTROL_PATH)
+    state_pub = node.create_publisher(ObserverState, "observer/state", qos.CONTROL_PATH)
 
     def relay(msg):
         _answer(msg, estimate)
@@ -63,7 +63,9 @@ def observer(arm):
             _answer(msg, state)
             state_pub.publish(state)
 
-    node.line = Line(node.create_subscription(ArmState, "arm_state", relay, qos.LINE))
+    node.control_path = ControlPath(
+        node.create_subscription(ArmState, "arm_state", relay, qos.CONTROL_PATH)
+    )
     return node
 
 
@@ -71,8 +73,8 @@ def controller(arm):
     """Node in the controller's place."""
     node = Node("relay_controller")
     torque, state = TorqueWriter(arm, 0).message, CompositeStateWriter(model.build(arm)).message
-    torque_pub = node.create_publisher(JointTorque, "joint_torque", qos.LINE)
-    state_pub = node.create_publisher(CompositeState, "controller/state", qos.LINE)
+    torque_pub = node.create_publisher(JointTorque, "joint_torque", qos.CONTROL_PATH)
+    state_pub = node.create_publisher(CompositeState, "controller/state", qos.CONTROL_PATH)
 
     def relay(msg):
         _answer(msg, torque)
@@ -81,7 +83,9 @@ def controller(arm):
             _answer(msg, state)
             state_pub.publish(state)
 
-    node.line = Line(node.create_subscription(ArmState, "arm_state_estimate", relay, qos.LINE))
+    node.control_path = ControlPath(
+        node.create_subscription(ArmState, "arm_state_estimate", relay, qos.CONTROL_PATH)
+    )
     return node
 
 
@@ -93,8 +97,8 @@ class Source(Node):
         self.count, self.times = count, []
         self.state = filled_state(arm)
         self._ns = Simulator.START_NS
-        self.pub = self.create_publisher(ArmState, "arm_state", qos.LINE)
-        self.create_subscription(JointTorque, "joint_torque", self.relay, qos.LINE)
+        self.pub = self.create_publisher(ArmState, "arm_state", qos.CONTROL_PATH)
+        self.create_subscription(JointTorque, "joint_torque", self.relay, qos.CONTROL_PATH)
         self.create_timer(0.1, self.resend)
 
     def resend(self):
