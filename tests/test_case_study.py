@@ -41,7 +41,7 @@ def follows_the_loop_without_ros(bag, run, duration):
             samples.setdefault(topic, {})[stamp] = raw
     assert set(samples) == set(recorder.TOPICS)
     assert {len(s) for s in samples.values()} == {round(1000 * duration) + 101}
-    found = recorder.to_record(samples, TRAJECTORY_START_NS)
+    found = recorder.to_record(samples, TRAJECTORY_START_NS, run.arm)
     alone = case_study.run_without_ros(run)
     common = alone.time >= found.time[0] - 1e-9
     for name in ("time", "reference", "position", "velocity", "amplitude", "rate", "torque"):

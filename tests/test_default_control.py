@@ -33,7 +33,7 @@ def test_nodes_track_like_a_rigid_arm_and_do_not_ring(tmp_path, feedforward, err
             samples, _ = line.run(message, 8.0, lambda fraction: None)
         codes = processes.stop()
     assert not any(codes.values())
-    record = recorder.to_record(samples, start)
+    record = recorder.to_record(samples, start, "R")
     found = metrics.case_study_metrics(record, build(arm_file.load("R")), until=8.0)
     assert found["peak_joint_error_deg"] <= error
     assert found["residual_tip_rms_ft"] <= residual

@@ -88,7 +88,7 @@ def test_the_composite_controller_moves_the_two_link_arm_and_damps_it(tmp_path):
             message = lockstep.trajectory_message(("joint1", "joint2"), quintic(), 41, start)
             samples, _ = line.run(message, DURATION)
         assert set(processes.stop().values()) == {0}
-    nodes = recorder.to_record(samples, start)
+    nodes = recorder.to_record(samples, start, "two_link")
     alone = without_ros()
     assert nodes.time.size == alone.time.size
     for name in ("position", "amplitude", "torque", "fast_torque"):

@@ -26,7 +26,6 @@ from flexarm_tools.recording import record as recording
 from flexarm_tools.recording.loop_bag import LoopBag
 from flexarm_tools.recording.recorder import BagWriter
 from flexarm_tools.recording.serialised import Decoder
-from flexarm_tools.recording.types import typestore
 from flexarm_tools.report import analysis, animation, command, figures, page, timeline
 from flexarm_tools.report import run as run_module
 from flexarm_tools.report.run import HOLDING, TRACKING
@@ -682,7 +681,7 @@ def test_columns_are_what_the_middleware_reads():
         message.compute_time = float(random.normal())
         messages.append(message)
     raw = [bytes(serialize_message(m)) for m in messages]
-    decoder = Decoder("flexarm_msgs/msg/CompositeState", typestore())
+    decoder = Decoder("flexarm_msgs/msg/CompositeState")
     seen = []
     for rows, layout, block in decoder.groups(raw):
         seen += rows.tolist()

@@ -48,15 +48,16 @@ def run_nodes(run, directory, progress=lambda fraction: None):
     """
     with own_domain() as domain, Processes(domain, directory / "log") as processes:
         start_nodes(processes, run)
-        with lockstep.LockstepRun(processes) as line:
+        with lockstep.LockstepRun(processes) as session:
             joints = arm_file.load(run.arm).joint_names
             start = closed_loop.TRAJECTORY_START_NS
             message = lockstep.trajectory_message(joints, profiles.paper_profile(), 101, start)
-            samples, timing = line.run(message, DURATION, progress)
+            samples, timing = session.run(message, DURATION, progress)
         codes = processes.stop()
         if any(codes.values()):
-            raise FlexarmError(f"{run.name}: exit codes {codes}; logs in {directory / 'log'}")
+            hint = f"see the logs in {directory / 'log'}"
+            raise FlexarmError(f"exit codes {codes}", field=run.name, hint=hint)
     bag = directory / "bag"
     shutil.rmtree(bag, ignore_errors=True)
     recorder.write_bag(bag, samples, run.arm)
-    return recorder.to_record(samples, start), timing
+    return recorder.to_record(samples, start, run.arm), timing

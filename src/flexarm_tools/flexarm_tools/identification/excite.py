@@ -60,6 +60,10 @@ def excite(options):
     FlexarmError
         When the arm must not move, no driver answers, or the excitation was stopped; what came before is kept.
     """
+    from rclpy.serialization import deserialize_message
+
+    from flexarm_msgs.msg import JointTorque
+    from flexarm_ros.messages import stamp_ns
     from flexarm_ros.session import Session
 
     from ..recording.recorder import Recorder, write_bag
@@ -80,16 +84,16 @@ def excite(options):
         progress.step(f"shake {options.arm}")
         output = _run(options, session)
         progress.done()
-        kept = between(recorder.messages(), recorder.raw)
-    if not kept["joint_torque"]:
-        raise FlexarmError(f"no torque was sent:\n{output}")
+        torques = [deserialize_message(raw, JointTorque) for raw in recorder.raw["joint_torque"]]
+        enabled = [stamp_ns(m.header.stamp) for m in torques if m.mode == m.ENABLED]
+        if not enabled:
+            raise FlexarmError(f"no torque was sent:\n{output}")
+        # Before and after these the safe action moves the arm, and no message holds its torque.
+        kept = recorder.between(min(enabled), max(enabled))
     write_bag(out, kept, options.arm)
     count = len(kept["arm_state"])
-    print(
-        json.dumps({"out": str(out), "states": count})
-        if options.json
-        else f"{count} states in {out}"
-    )
+    said = {"out": str(out), "states": count}
+    print(json.dumps(said) if options.json else f"{count} states in {out}")
     if "excitation complete" not in output:
         raise FlexarmError(f"{_ending(output) or output}; what came before is in {out}")
     return out
@@ -149,22 +153,3 @@ def _ending(output):
     """The line that gives the reason why it was stopped."""
     lines = [x for x in output.splitlines() if "excitation stopped" in x or "not configured" in x]
     return lines[0].split("]: ")[-1] if lines else ""
-
-
-def between(messages, raw):
-    """The raw messages from the first enabled torque to the last, topic to {stamp [ns]: bytes}.
-
-    Before and after them the safe action moves the arm, and no message holds its torque.
-    """
-    from flexarm_ros.messages import stamp_ns
-
-    enabled = [stamp_ns(m.header.stamp) for m in messages["joint_torque"] if m.mode == m.ENABLED]
-    if not enabled:
-        return {topic: {} for topic in raw}
-    begin, end = min(enabled), max(enabled)
-    kept = {topic: {} for topic in raw}
-    for topic, rows in messages.items():
-        for message, data in zip(rows, raw[topic], strict=True):
-            if begin <= stamp_ns(message.header.stamp) <= end:
-                kept[topic][stamp_ns(message.header.stamp)] = data
-    return {topic: dict(sorted(rows.items())) for topic, rows in kept.items()}

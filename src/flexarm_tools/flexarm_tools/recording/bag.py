@@ -15,11 +15,11 @@ import yaml
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.shown import listed, show
+from flexarm_dynamics.shown import listed
 
 from . import mcap
 from .serialised import Decoder
-from .types import ARM_NAME, ARM_TEXT, typestore
+from .types import ARM_NAME, ARM_TEXT
 
 #: Fields of each topic, and whose names give their order; None: a single number.
 _STATE = {
@@ -54,6 +54,8 @@ KINDS = {
     "controller/state": "flexarm_msgs/msg/CompositeState",
     "observer/state": "flexarm_msgs/msg/ObserverState",
 }
+#: What every table has beside its fields, and as what.
+_HEAD = {"stamp": np.int64, "session": np.int64, "sequence": np.int64, "reason": np.int32}
 #: So many messages, or bytes, are read before they are put into columns.
 BLOCK, BLOCK_BYTES = 40_000, 32_000_000
 #: Different reasons of refusal that are kept.
@@ -113,21 +115,20 @@ class Contents:
     reasons: list
     notes: list = field(default_factory=list)
     unknown: dict = field(default_factory=dict)
-    _folder: object = None  # keeps the files while the arrays are used
 
 
 class _Columns:
-    """Files that columns are appended to."""
+    """Columns that are appended to, each in a file without a name, which is gone when nothing refers to it."""
 
-    def __init__(self, folder):
-        self._folder, self._files = Path(folder), {}
+    def __init__(self):
+        self._files = {}
 
     def __contains__(self, name):
         return name in self._files
 
     def append(self, name, values):
         if name not in self._files:
-            file = open(self._folder / str(len(self._files)), "w+b")  # noqa: SIM115
+            file = tempfile.TemporaryFile(prefix="flexarm-")  # noqa: SIM115
             self._files[name] = file, values.dtype
         self._files[name][0].write(np.ascontiguousarray(values).tobytes())
 
@@ -139,14 +140,12 @@ class _Columns:
     def array(self, name, width):
         """What was appended under a name, shape (k, width), or (k,) for no width."""
         file, kind = self._files[name]
-        file.flush()
-        size = file.tell()
         shape = (-1,) if width is None else (-1, width)
-        if not size:
-            return np.zeros(0, kind).reshape(shape) if width else np.zeros((0, 0))
-        values = np.memmap(file.name, kind, "r").reshape(shape)
-        file.close()
-        return values
+        with file:  # a memory map stays when its file is closed
+            file.flush()
+            if file.tell():
+                return np.memmap(file, kind, "r").reshape(shape)
+        return np.zeros(0, kind).reshape(shape) if width else np.zeros((0, 0))
 
 
 def read(path, arm=None, namespace=None, progress=lambda fraction: None):
@@ -178,20 +177,18 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
         arm = arm_file.load(arm) if arm else None
     known = arm_of(path, notes) if arm is None else arm
     source = _Source(path, notes)
-    store, readers, block, size = typestore(), {}, {}, 0
-    folder = tempfile.TemporaryDirectory(prefix="flexarm-report-")
-    count = 0
+    readers, block, count, size = {}, {}, 0, 0
     for topic, kind, raw in source.messages(lambda t, k: _wanted(t, k, namespace)):
         block.setdefault((topic, kind), []).append(raw)
         count, size = count + 1, size + len(raw)
         if count % BLOCK == 0 or size > BLOCK_BYTES:
-            _flush(block, readers, known, folder, store, path)
+            _flush(block, readers, known)
             size = 0
             progress(count / max(source.count, count))
-    _flush(block, readers, known, folder, store, path)
+    _flush(block, readers, known)
     if not count:
-        raise FlexarmError(_nothing(path, source, namespace))
-    found = [r.contents(path, notes) for _, r in sorted(readers.items())]
+        raise _nothing(path, source, namespace)
+    found = [readers[space].contents(path, space, notes) for space in sorted(readers)]
     return [c for c in found if _enough(c, len(found))]
 
 
@@ -208,12 +205,11 @@ def from_messages(raw, arm):
     -------
     Contents
     """
-    folder = tempfile.TemporaryDirectory(prefix="flexarm-report-")
-    reader = _Reader("", arm, Path(folder.name), folder, typestore(), "the recording")
+    reader = _Reader(arm)
     for topic, messages in raw.items():
         if messages:
             reader.take(topic, messages)
-    return reader.contents(Path(), [])
+    return reader.contents("the recording", "", [])
 
 
 def _bag(path):
@@ -224,10 +220,9 @@ def _bag(path):
         return path / "bag"
     if path.is_dir() and not _is_bag(path):
         inside = sorted(p.parent for p in path.glob("**/metadata.yaml"))[:8]
-        hint = f"; there are {', '.join(map(str, inside))}" if inside else ""
-        raise FlexarmError(
-            f"is no bag: neither metadata.yaml nor a .mcap file is in it{hint}", field=str(path)
-        )
+        hint = f"there are {', '.join(map(str, inside))}" if inside else ""
+        problem = "is no bag: neither metadata.yaml nor a .mcap file is in it"
+        raise FlexarmError(problem, field=str(path), hint=hint)
     if path.is_file() and path.name == "metadata.yaml":
         return path.parent
     if path.is_file() and path.suffix not in (".mcap", ".db3"):
@@ -258,7 +253,7 @@ def arm_of(path, notes):
 
 
 def _wanted(topic, kind, namespace):
-    """(namespace, topic of the line) of a bag's topic, None for any other."""
+    """(namespace, topic of the control path) of a bag's topic, None for any other."""
     for name, wanted in KINDS.items():
         if topic.endswith(f"/{name}") and kind == wanted:
             before = topic[: -len(name) - 1]
@@ -304,8 +299,9 @@ class _Source:
     def _up_to_the_break(self, wanted, given, problem):
         files = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
         if not files or files[0].suffix != ".mcap":
+            hint = "`ros2 bag reindex` may repair it"
             raise FlexarmError(
-                f"{self.path}: can't be read as a bag: {problem}; `ros2 bag reindex` may repair it"
+                f"can't be read as a bag: {problem}", field=str(self.path), hint=hint
             )
         count = 0
         for file in files:
@@ -320,13 +316,17 @@ class _Source:
 
 
 def _nothing(path, source, namespace):
-    there = ", ".join(sorted(source.topics)) or "none"
+    """The error where a bag holds no message that is wanted."""
     if any(_wanted(t, k, None) for t, k in source.topics.items()) and namespace is None:
-        return f"{path}: the bag is empty: record while the nodes run, with `flexarm record`"
+        hint = "record while the nodes run, with `flexarm record`"
+        return FlexarmError("the bag is empty", field=str(path), hint=hint)
     where = "" if namespace is None else f" in namespace {namespace}"
-    return (
-        f"{path}: no topic of an arm{where} in the bag ({', '.join(FIELDS)}, in messages of flexarm_msgs);"
-        f" topics in it: {there}. Record with `flexarm record`"
+    there = ", ".join(sorted(source.topics)) or "none"
+    return FlexarmError(
+        f"no topic of an arm{where} in the bag ({', '.join(FIELDS)}, in messages of flexarm_msgs);"
+        f" topics in it: {there}",
+        field=str(path),
+        hint="record with `flexarm record`",
     )
 
 
@@ -336,33 +336,32 @@ def _enough(contents, others):
         return True
     if others > 1:
         return False
+    there = ", ".join(contents.tables) or "none that can be read"
     raise FlexarmError(
-        f"{contents.path}: neither arm_state nor arm_state_estimate has a message, only"
-        f" {', '.join(contents.tables) or 'none that can be read'}: record them as well, with `flexarm record`"
+        f"neither arm_state nor arm_state_estimate has a message, only {there}",
+        field=str(contents.path),
+        hint="record them as well, with `flexarm record`",
     )
 
 
-def _flush(block, readers, arm, folder, store, path):
+def _flush(block, readers, arm):
+    """Put messages, by topic and type, into the columns of their arms, by namespace."""
     for (topic, kind), messages in block.items():
-        before, name = _wanted(topic, kind, None)
-        if before not in readers:
-            place = Path(folder.name) / str(len(readers))
-            place.mkdir()
-            readers[before] = _Reader(before, arm, place, folder, store, path)
-        readers[before].take(name, messages)
+        namespace, name = _wanted(topic, kind, None)
+        if namespace not in readers:
+            readers[namespace] = _Reader(arm)
+        readers[namespace].take(name, messages)
     block.clear()
 
 
 class _Reader:
     """Columns of one arm."""
 
-    def __init__(self, namespace, arm, place, folder, store, path):
-        self.namespace, self.arm, self._folder = namespace, arm, folder
-        self._store, self._columns, self._decoders = store, _Columns(place), {}
-        self._path, self._others = path, ()
+    def __init__(self, arm):
+        self.arm, self.names = arm, {}
+        self._columns, self._decoders, self._others = _Columns(), {}, ()
         self._known, self._reasons, self._foreign, self._rows = {}, {}, {}, {}
         self._unknown = {}
-        self.names = {}
         if arm is not None:
             from flexarm_dynamics.models import model
 
@@ -375,7 +374,7 @@ class _Reader:
     def take(self, topic, messages):
         """Put some messages of a topic into columns."""
         if topic not in self._decoders:
-            self._decoders[topic] = Decoder(KINDS[topic], self._store)
+            self._decoders[topic] = Decoder(KINDS[topic])
         groups = [
             g for g in self._decoders[topic].groups(messages) if self._ours(topic, g[1], len(g[0]))
         ]
@@ -386,8 +385,7 @@ class _Reader:
                 )
         k = len(messages)
         read = np.zeros(k, bool)
-        head = {"stamp": np.int64, "session": np.int64, "sequence": np.int64, "reason": np.int32}
-        head = {name: np.full(k, -1, kind) for name, kind in head.items()}
+        head = {name: np.full(k, -1, kind) for name, kind in _HEAD.items()}
         fields = {f: self._room(k, names) for f, names in FIELDS[topic].items()}
         for rows, layout, block in groups:
             read[rows] = True
@@ -449,9 +447,9 @@ class _Reader:
         self._foreign[topic] = self._foreign.get(topic, 0) + count
         return False
 
-    def contents(self, path, notes):
+    def contents(self, path, namespace, notes):
         """What was read, as `Contents`."""
-        tables, notes = {}, list(notes)
+        tables, notes, get = {}, list(notes), self._columns.array
         for topic, decoder in self._decoders.items():
             if decoder.broken:
                 notes.append(f"{topic}: {decoder.broken} messages can't be read, and are left out")
@@ -459,38 +457,23 @@ class _Reader:
                 notes.append(
                     f"{topic}: {self._foreign[topic]} messages have other joint_names, and are left out"
                 )
-            get = self._columns.array
-            stamp = get((topic, "stamp"), None)
-            if not stamp.size:
+            head = {name: get((topic, name), None) for name in _HEAD}
+            if not head["stamp"].size:
                 continue
             columns = {
                 f: get((topic, f), None if names is None else len(self.names[names]))
                 for f, names in FIELDS[topic].items()
                 if (topic, f) in self._columns
             }
-            tables[topic] = Table(
-                stamp,
-                get((topic, "session"), None),
-                get((topic, "sequence"), None),
-                columns,
-                self._known.get(topic, set()),
-                get((topic, "reason"), None),
-            )
+            tables[topic] = Table(columns=columns, known=self._known.get(topic, set()), **head)
         if self._foreign and not {"arm_state", "arm_state_estimate"} & set(tables):
             raise FlexarmError(
-                f"{self._path}: joint_names {show(list(self._others))} are not those of arm"
-                f" {self.arm.name}: {listed(self.names['joint_names'])}; give the right one with --arm"
+                f"are not those of arm {self.arm.name}",
+                field=f"{path}: joint_names",
+                value=list(self._others),
+                limit=listed(self.names["joint_names"]),
+                hint="give the right one with --arm",
             )
         unknown = {names: sorted(found) for names, found in self._unknown.items()}
         reasons = list(self._reasons)
-        return Contents(
-            path,
-            self.namespace,
-            self.arm,
-            self.names,
-            tables,
-            reasons,
-            notes,
-            unknown,
-            self._folder,
-        )
+        return Contents(path, namespace, self.arm, self.names, tables, reasons, notes, unknown)

@@ -5,12 +5,13 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from rclpy.serialization import deserialize_message
 
+from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 from flexarm_studies.loop.metrics import Record
 
 from ..running.processes import ProcessError
+from . import bag
 from .types import ARM_NAME, ARM_TEXT, typestore
 
 TOPICS = {
@@ -67,13 +68,6 @@ class Recorder:
         """Topic to the list of serialised messages, in the order of arrival."""
         return {topic: tap.messages for topic, tap in self._taps.items()}
 
-    def messages(self):
-        """Topic to the list of messages."""
-        return {
-            topic: [deserialize_message(raw, TOPICS[topic]) for raw in tap.messages]
-            for topic, tap in self._taps.items()
-        }
-
     def complete(self):
         """Whether every topic has a message."""
         return all(self.raw.values())
@@ -84,66 +78,62 @@ class Recorder:
         newest = self._taps["joint_torque"].newest
         return raw_stamp_ns(newest) if newest else 0
 
-    def samples(self, begin_ns, end_ns):
-        """One serialised message per stamp and topic; of one that was sent again, the last.
-
-        Parameters
-        ----------
-        begin_ns, end_ns : int
-            First and last stamp.
+    def between(self, begin_ns, end_ns):
+        """One message per stamp, from the first to the last stamp; of one that was sent again, the last.
 
         Returns
         -------
         dict
             Topic to {stamp_ns: bytes}, in order.
+        """
+        kept = {}
+        for topic, messages in self.raw.items():
+            by_stamp = {raw_stamp_ns(raw): raw for raw in messages}
+            kept[topic] = {s: r for s, r in sorted(by_stamp.items()) if begin_ns <= s <= end_ns}
+        return kept
+
+    def samples(self, begin_ns, end_ns):
+        """As `between`, of all topics the same samples.
 
         Raises
         ------
         ProcessError
             When a topic lacks a sample that another one has.
         """
-        kept = {}
-        for topic, messages in self.raw.items():
-            by_stamp = {raw_stamp_ns(raw): raw for raw in messages}
-            kept[topic] = {s: r for s, r in sorted(by_stamp.items()) if begin_ns <= s <= end_ns}
+        kept = self.between(begin_ns, end_ns)
         stamps = set().union(*kept.values())
         for topic, messages in kept.items():
             if len(messages) != len(stamps):
                 raise ProcessError(
-                    f"recording: {len(stamps) - len(messages)} of {len(stamps)} samples of {topic} were"
-                    " lost: is the machine out of memory or shared memory (df /dev/shm)?"
+                    "samples were lost",
+                    field=f"recording of {topic}",
+                    value=len(stamps) - len(messages),
+                    limit=f"of {len(stamps)}",
+                    hint="is the machine out of memory or shared memory (df /dev/shm)?",
                 )
         return kept
 
 
-def to_record(samples, start_ns):
-    """A `Record` of `Recorder.samples`; time zero at `start_ns`."""
-    messages = {
-        topic: [deserialize_message(raw, TOPICS[topic]) for raw in samples[topic].values()]
+def to_record(samples, start_ns, arm):
+    """A `Record` of `Recorder.samples`, time zero at `start_ns`; `arm` is its file's shipped name or path."""
+    raw = {topic: list(rows.values()) for topic, rows in samples.items()}
+    tables = bag.from_messages(raw, arm_file.load(arm)).tables
+    measured, estimate, control = (
+        {name: np.array(values) for name, values in tables[topic].columns.items()}
         for topic in ("arm_state", "arm_state_estimate", "controller/state")
-    }
-
-    def table(topic, field):
-        rows = [getattr(m, field) for m in messages[topic]]
-        width = max(map(len, rows))
-        # Rates are empty until the observer has converged.
-        return np.array([r if len(r) else [np.nan] * width for r in rows])
-
-    stamps = [m.header.stamp for m in messages["arm_state"]]
-    time = np.array([(s.sec * 10**9 + s.nanosec - start_ns) * 1e-9 for s in stamps])
-    control, estimate = "controller/state", "arm_state_estimate"
+    )
     return Record(
-        time=time,
-        reference=table(control, "reference_position"),
-        reference_velocity=table(control, "reference_velocity"),
-        position=table("arm_state", "joint_position"),
-        velocity=table(estimate, "joint_velocity"),
-        amplitude=table(estimate, "modal_amplitude"),
-        rate=table(estimate, "modal_rate"),
-        quasi_steady=table(control, "quasi_steady_amplitude"),
-        slow_torque=table(control, "slow_torque"),
-        fast_torque=table(control, "fast_torque"),
-        torque=table(control, "torque"),
+        time=(tables["arm_state"].stamp - start_ns) * 1e-9,
+        reference=control["reference_position"],
+        reference_velocity=control["reference_velocity"],
+        position=measured["joint_position"],
+        velocity=estimate["joint_velocity"],
+        amplitude=estimate["modal_amplitude"],
+        rate=estimate["modal_rate"],  # NaN until the observer has converged
+        quasi_steady=control["quasi_steady_amplitude"],
+        slow_torque=control["slow_torque"],
+        fast_torque=control["fast_torque"],
+        torque=control["torque"],
     )
 
 
@@ -174,8 +164,6 @@ class BagWriter:
 
     def put_arm(self, arm):
         """Put the arm file into the metadata; possible until the bag is closed."""
-        from flexarm_dynamics.arm import arm_file
-
         path = arm_file.find(arm)
         self._writer.set_custom_data(ARM_NAME, path.stem)
         self._writer.set_custom_data(ARM_TEXT, path.read_text(encoding="utf-8"))
@@ -189,7 +177,7 @@ class BagWriter:
     def write(self, topic, time_ns, raw):
         """Write a serialised message."""
         if topic not in self._connections:
-            self.add(topic, f"flexarm_msgs/msg/{TOPICS[topic].__name__}")
+            self.add(topic, bag.KINDS[topic])
         self._writer.write(self._connections[topic], time_ns, raw)
 
     def close(self):
@@ -215,11 +203,11 @@ def write_bag(path, samples, arm=""):
     arm : str, optional
         See `BagWriter`.
     """
-    with BagWriter(path, arm) as bag:
+    with BagWriter(path, arm) as writer:
         rows = sorted(
             ((stamp, i, topic) for i, topic in enumerate(samples) for stamp in samples[topic]),
         )
         for topic in samples:
-            bag.add(topic, f"flexarm_msgs/msg/{TOPICS[topic].__name__}")
+            writer.add(topic, bag.KINDS[topic])
         for stamp, _, topic in rows:
-            bag.write(topic, stamp, samples[topic][stamp])
+            writer.write(topic, stamp, samples[topic][stamp])

@@ -18,6 +18,8 @@ import numpy as np
 
 from flexarm_dynamics.errors import MessageError
 
+from .types import typestore
+
 _SIZES = {"bool": 1, "uint8": 1, "int8": 1, "byte": 1, "char": 1, "uint16": 2, "int16": 2}
 _SIZES |= {"uint32": 4, "int32": 4, "float32": 4, "uint64": 8, "int64": 8, "float64": 8}
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2"}
@@ -83,13 +85,13 @@ def readable(raw):
 
 
 class _Walker:
-    def __init__(self, raw, store):
-        self.raw, self.store = raw, store
+    def __init__(self, raw):
+        self.raw = raw
         self.order = "<" if raw[1] & 1 else ">"
         self.at, self.numbers, self.texts, self.names, self.moving = 4, {}, {}, {}, []
 
     def message(self, kind, prefix=""):
-        for name, field in self.store.fielddefs[kind][1]:
+        for name, field in typestore().fielddefs[kind][1]:
             self.field(prefix + name, *field)
 
     def field(self, path, node, what):
@@ -107,7 +109,7 @@ class _Walker:
             (node, what), size = what
             count = size if kind == "ARRAY" else self.length()
             if count > MAX_COUNT:
-                raise MessageError(f"{path} has {count} entries")
+                raise MessageError("entries", field=path, value=count, limit=MAX_COUNT)
             if node.name == "BASE" and what[0] != "string":
                 self.number(path, what[0], count)
             elif node.name == "BASE":
@@ -141,13 +143,13 @@ class _Walker:
             self.align(size)
         end = self.at + size * (1 if count is None else count)
         if end > len(self.raw):
-            raise MessageError(f"{path} goes beyond the message's end")
+            raise MessageError("goes beyond the message's end", field=path)
         self.numbers[path] = (self.at, np.dtype(self.order + _CODES[kind]), count)
         self.moving.append((self.at, end))
         self.at = end
 
 
-def layout_of(raw, kind, store):
+def layout_of(raw, kind):
     """The layout of one serialised message.
 
     Parameters
@@ -155,7 +157,6 @@ def layout_of(raw, kind, store):
     raw : bytes
     kind : str
         Such as ``flexarm_msgs/msg/ArmState``.
-    store : rosbags.typesys.store.Typestore
 
     Raises
     ------
@@ -163,12 +164,12 @@ def layout_of(raw, kind, store):
         When these bytes are no such message.
     """
     if len(raw) < 4:
-        raise MessageError(f"no {kind}: {len(raw)} bytes")
-    walker = _Walker(raw, store)
+        raise MessageError(f"is no {kind}", value=raw)
+    walker = _Walker(raw)
     try:
         walker.message(kind)
     except (struct.error, IndexError, KeyError) as error:
-        raise MessageError(f"no {kind}: {error}") from None
+        raise MessageError(f"is no {kind}: {error}", value=raw) from None
     fixed = np.ones(len(raw), bool)
     for start, end in walker.moving:
         fixed[start:end] = False
@@ -185,12 +186,10 @@ class Decoder:
     Parameters
     ----------
     kind : str
-    store : Typestore
     """
 
-    def __init__(self, kind, store):
-        self.kind, self.store, self._layouts = kind, store, {}
-        self.broken = 0
+    def __init__(self, kind):
+        self.kind, self._layouts, self.broken = kind, {}, 0
 
     def groups(self, messages):
         """Yield (rows, layout, block) for messages that are alike; what can't be read is counted in `broken`.
@@ -229,7 +228,7 @@ class Decoder:
 
     def _new(self, raw):
         try:
-            layout = layout_of(raw, self.kind, self.store)
+            layout = layout_of(raw, self.kind)
         except MessageError:
             return None
         known = self._layouts.setdefault(len(raw), [])
