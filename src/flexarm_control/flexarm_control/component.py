@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What slow laws, fast laws, manifolds, feed-forwards and observers have in common, and how one is made by name."""
 
+from types import SimpleNamespace
+
+import numpy as np
+
 from flexarm_dynamics import registry
 from flexarm_dynamics.parameters import check_all, sizes
 
@@ -52,26 +56,23 @@ class Law(Component):
         """
 
 
+def at_rest(q):
+    """A reference that rests at the joint position q, shape (n,) [rad]."""
+    q = np.array(q, float)
+    state = np.stack([q, np.zeros_like(q), np.zeros_like(q)])
+    return SimpleNamespace(
+        position=state[0],
+        velocity=state[1],
+        acceleration=state[2],
+        near=lambda offset: state.copy(),
+    )
+
+
 def make(group, name, model, values, prefix, *known):
-    """Find a component by name, check its parameters and design it.
+    """Find a component by its `name` in an entry-point `group`, check its parameters and design it.
 
-    Parameters
-    ----------
-    group : str
-        Entry-point group, such as ``flexarm.slow_laws``.
-    name : str
-        As registered there.
-    model : ArmModel
-    values : mapping
-        Parameter values without prefix, of this component alone.
-    prefix : str
-        Put before parameter names in errors.
-    *known
-        What the component is designed for besides the model: the slow law, for a manifold.
-
-    Returns
-    -------
-    Component
+    `values` are those of this component alone, without `prefix`, which errors put before their names. `known` is
+    what it is designed for besides the model: the slow law, for a manifold.
 
     Raises
     ------

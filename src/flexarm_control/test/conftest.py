@@ -23,6 +23,12 @@ def arm_p3():
 
 
 @pytest.fixture(scope="session")
+def lab():
+    """Model of arm R with four gauges for its two modes."""
+    return model.build(arm_file.load("R_lab"))
+
+
+@pytest.fixture(scope="session")
 def heavy_arm():
     """Fully derived arm in a vertical plane, with joint friction."""
     arm = arm_file.load("one_link")

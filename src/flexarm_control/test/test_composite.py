@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from flexarm_control.component import at_rest
 from flexarm_control.composite.design import FAST, SLOW, design, design_law
 from flexarm_control.observers.arm_observer import design_observer
 from flexarm_control.trajectory import validate
 from flexarm_dynamics.errors import (
+    NOT_GIVEN,
     DesignError,
-    FlexarmError,
     ParameterError,
     UnknownComponentError,
 )
@@ -56,20 +57,14 @@ def test_on_the_manifold_9_the_fast_control_is_exactly_zero(arm_r, heavy_arm):
         assert_array_equal(law.torque, law.slow_torque)
 
 
-def test_slow_alone_ignores_the_deflections(arm_r):
+def test_slow_alone_ignores_the_deflections_and_fast_alone_damps_about_the_undriven_manifold(arm_r):
     bent, straight = (stepped(arm_r, fast=NONE, delta=d) for d in (DELTA, np.zeros(2)))
     assert_array_equal(bent.torque, straight.torque)
     assert_array_equal(bent.fast_torque, [0.0])
-
-
-def test_fast_alone_damps_around_the_undriven_manifold(arm_r):
-    law = stepped(arm_r, slow=NONE)
-    assert_array_equal(law.slow_torque, [0.0])
-    assert_array_equal(law.quasi_steady, [0.0, 0.0])
-    assert_allclose(law.torque, law.fast.K_f @ [*DELTA, *DELTA_D], rtol=1e-14)
-
-
-def test_without_any_law_there_is_no_torque(arm_r):
+    fast = stepped(arm_r, slow=NONE)
+    assert_array_equal(fast.slow_torque, [0.0])
+    assert_array_equal(fast.quasi_steady, [0.0, 0.0])
+    assert_allclose(fast.torque, fast.fast.K_f @ [*DELTA, *DELTA_D], rtol=1e-14)
     assert_array_equal(stepped(arm_r, NONE, NONE).torque, [0.0])
 
 
@@ -87,8 +82,7 @@ def test_the_quasi_steady_state_has_the_centrifugal_stiffness_of_the_present_spe
 
 def test_under_gravity_the_quasi_steady_state_is_the_arms_sag(heavy_arm):
     law = design(heavy_arm, {"type": "model_following"}, FAST_LAW)
-    rest = SimpleNamespace(position=np.zeros(1), velocity=np.zeros(1), acceleration=np.zeros(1))
-    law.step(np.zeros(1), np.zeros(1), np.zeros(2), np.zeros(2), rest)
+    law.step(np.zeros(1), np.zeros(1), np.zeros(2), np.zeros(2), at_rest([0.0]))
     sag = law.quasi_steady
     state = np.concatenate([[0.0], sag, np.zeros(3)])
     assert_allclose(heavy_arm.derivative(state, law.slow_torque), 0.0, atol=1e-9)
@@ -110,59 +104,32 @@ def test_an_unknown_law_is_refused_with_what_there_is_and_a_guess(arm_r):
 
 
 @pytest.mark.parametrize(
-    ("slow", "fast", "message"),
+    ("slow", "fast", "field", "value"),
     [
-        ({"kq": [1.0]}, {}, r"slow\.kq: no such parameter; there are gain, kp, kv"),
-        ({"kp": [1.0, 2.0]}, {}, r"slow\.kp: 2 values where 1 \(joints\) are needed"),
-        ({"kp": [6]}, {}, r"slow\.kp: .*write \[6\.0\]"),
-        ({"kp": 6.25}, {}, r"slow\.kp: 6\.25 is not a list of numbers"),
-        ({"kp": "6.25"}, {}, r"slow\.kp: '6\.25' is not a list of numbers"),
-        ({"kp": [-1.0]}, {}, r"slow\.kp\[0\]: -1\.0 1/s\^2 is below its lower limit \(0\.0\)"),
-        ({"kv": [np.nan]}, {}, r"slow\.kv\[0\]: nan is not finite"),
-        ({"gain": "h22"}, {}, r"slow\.gain: 'h22' is not one of the choices \(m11, h11\)"),
-        ({}, {"alpha": 5}, r"fast\.alpha: 5 is an integer .* write 5\.0"),
-        ({}, {"alpha": 1e9}, r"fast\.alpha: .* above its upper limit"),
-        ({}, {"q": [1.0, 2.0]}, r"fast\.q: 2 values where 4 \(z\) are needed"),
-        ({}, {"q": [1.0, 1.0, True, 1.0]}, r"fast\.q\[2\]: True is not a number"),
-        ({}, {"r": [0.0]}, r"fast\.r\[0\]: 0\.0 .*is below"),
-        ({}, {"beta": 1.0}, r"fast\.beta: no such parameter; there are alpha"),
-        ({"type": 5}, {}, r"slow\.type: 5 is not a name"),
-        ({"type": None}, {}, r"slow\.type: missing"),
+        ({"kq": [1.0]}, {}, "slow.kq", NOT_GIVEN),
+        ({"kp": [1.0, 2.0]}, {}, "slow.kp", NOT_GIVEN),
+        ({"kp": [-1.0]}, {}, "slow.kp[0]", -1.0),
+        ({"gain": "h22"}, {}, "slow.gain", "h22"),
+        ({}, {"alpha": 5}, "fast.alpha", 5),
+        ({}, {"q": [1.0, 2.0]}, "fast.q", NOT_GIVEN),
+        ({}, {"beta": 1.0}, "fast.beta", NOT_GIVEN),
+        ({"type": 5}, {}, "slow.type", 5),
+        ({"type": None}, {}, "slow.type", NOT_GIVEN),
     ],
 )
-def test_an_unusable_parameter_is_refused_naming_it_the_value_and_the_limit(
-    arm_r, slow, fast, message
-):
-    with pytest.raises(ParameterError, match=message):
+def test_an_unusable_parameter_is_refused_naming_it_and_the_value(arm_r, slow, fast, field, value):
+    with pytest.raises(ParameterError) as refused:
         design(arm_r, SLOW_LAW | slow, FAST_LAW | fast)
-
-
-def test_a_law_without_type_is_refused(arm_r):
-    with pytest.raises(ParameterError, match=r"fast\.type: missing"):
-        design(arm_r, SLOW_LAW, {"alpha": 5.0})
+    assert (refused.value.field, refused.value.value) == (field, value)
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "message"),
-    [
-        (
-            "luenberger",
-            {"pole": 0.0},
-            r"observer\.pole: 0\.0 1/s is below its lower limit \(1\.0\)",
-        ),
-        ("filtered_derivative", {"pole": 9.0}, r"observer\.pole: no such parameter.*bandwidth"),
-        ("true_rates", {"bandwidth": 9.0}, r"observer\.bandwidth: no such parameter.*none"),
-    ],
+    ("name", "values"), [("luenberger", {"pole": 0.0}), ("filtered_derivative", {"pole": 9.0})]
 )
-def test_an_unusable_observer_parameter_is_refused(arm_r, name, values, message):
-    with pytest.raises(ParameterError, match=message):
+def test_an_unusable_observer_parameter_is_refused(arm_r, name, values):
+    with pytest.raises(ParameterError) as refused:
         design_observer(name, arm_r, values)
-
-
-def test_every_refusal_is_a_flexarm_error(arm_r):
-    for slow in ({"type": "?"}, {"type": "none", "kp": [1.0]}, {}):
-        with pytest.raises(FlexarmError):
-            design(arm_r, slow, NONE)
+    assert refused.value.field == "observer.pole"
 
 
 def test_one_value_stands_for_all_and_defaults_fill_in(arm_r):

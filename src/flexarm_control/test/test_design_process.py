@@ -38,8 +38,10 @@ def torques(control, n, m):
     return np.array(out)
 
 
-@pytest.mark.parametrize("slow", ["linear_model_following", "model_following", "sliding_mode"])
-@pytest.mark.parametrize("kind", ["none", "model", "preview"])
+@pytest.mark.parametrize(
+    ("slow", "kind"),
+    [("linear_model_following", "none"), ("model_following", "model"), ("sliding_mode", "preview")],
+)
 def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
     made = design(arm_r, {"type": slow}, FAST, CORRECTED, {"feedforward": kind})
     data = design_process.dumps(made, arm_r.arm)
@@ -64,16 +66,12 @@ def scheduled(model):
 
 def test_it_leaves_the_cpus_of_the_control_path(monkeypatch):
     asked = []
-    for name, refused in (
-        ("sched_setaffinity", OSError),
-        ("sched_setscheduler", None),
-        ("nice", None),
-    ):
+    for name in ("sched_setaffinity", "sched_setscheduler", "nice"):
 
-        def record(*values, name=name, refused=refused):
+        def record(*values, name=name):
             asked.append((name, values[-1]))
-            if refused:
-                raise refused
+            if name == "sched_setaffinity":
+                raise OSError
 
         monkeypatch.setattr(os, name, record)
     processes.step_back(5)

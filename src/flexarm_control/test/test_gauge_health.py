@@ -29,12 +29,6 @@ NOISE, COUNT = 0.5e-6, 2e-3 / 4096  # [strain], of R_lab
 NAN, INF = np.nan, np.inf
 
 
-@pytest.fixture(scope="module")
-def lab():
-    """Model of arm R with four gauges."""
-    return model.build(arm_file.load("R_lab"))
-
-
 def health_of(arm, stuck_samples=20):
     return GaugeHealth(arm, StrainMap(arm), stuck_samples)
 
@@ -87,16 +81,11 @@ def test_a_gauge_that_reads_nonsense_is_named_and_left_out(lab, which, value, st
 
 
 def test_readings_just_inside_the_range_are_good(lab):
-    for which in range(4):
-        # the converter's last counts, and the ones before
-        for value, bad in (
-            (1e-3 - 2 * COUNT, 0),
-            (1e-3 - COUNT, 1),
-            (-1e-3 + COUNT, 0),
-            (-1e-3, 1),
-        ):
-            health, strain = health_of(lab), np.zeros(4)
-            strain[which] = value
+    health = health_of(lab)
+    # the converter's last counts, and the ones before
+    for value, bad in ((1e-3 - 2 * COUNT, 0), (1e-3 - COUNT, 1), (-1e-3 + COUNT, 0), (-1e-3, 1)):
+        for strain in value * np.eye(4):
+            health.reset()
             health.update(strain)
             assert (health.health == SATURATED).sum() == bad
 
@@ -195,25 +184,19 @@ def test_the_arm_at_rest_is_not_taken_for_stuck_gauges(lab):
     assert not states.any()
 
 
-def test_one_gauge_that_jumps_does_not_make_the_others_stuck(lab):
-    """At rest, quiet: its wire breaks, or something in mid-range does."""
-    for value in (1e-3, 0.4e-3, NAN, INF):
-        health = health_of(lab)
-        for k in range(200):
-            strain = np.full(4, 5 * COUNT)
-            if k > 100:
-                strain[2] = value if k % 2 else -value
-            health.update(strain)
-            assert not np.delete(health.health, 2).any()
-
-
-def test_two_gauges_at_the_ends_of_their_range_are_no_witnesses_of_motion(lab):
+@pytest.mark.parametrize(
+    ("which", "value"), [([2], 1e-3), ([2], 0.4e-3), ([2], NAN), ([2], INF), ([0, 2], 1e-3)]
+)
+def test_gauges_that_jump_do_not_make_the_others_stuck(lab, which, value):
+    """At rest, quiet: a wire breaks, or something in mid-range does; the ends of two ranges witness no motion."""
     health = health_of(lab)
     for k in range(200):
         strain = np.full(4, 5 * COUNT)
-        strain[[0, 2]] = 1e-3 if k % 2 else -1e-3
+        if k > 100:
+            strain[which] = value if k % 2 else -value
         health.update(strain)
-        assert_array_equal(health.health, [SATURATED, GOOD, SATURATED, GOOD])
+        assert not np.delete(health.health, which).any()
+    assert (health.health[which] == SATURATED).all() == (value == 1e-3)
 
 
 def test_slow_motion_within_counts_is_not_stuck(lab):
@@ -305,7 +288,6 @@ def test_the_bias_is_the_mean_reading_of_an_arm_at_rest(lab):
         row[:] = wanted + NOISE * random.standard_normal(4)
     assert_allclose(c.bias(), c._strain.mean(axis=0), rtol=1e-12)
     assert_allclose(c.bias(), wanted, atol=4.0 * NOISE / np.sqrt(400))
-    assert_allclose(c.error(), np.hypot(NOISE, COUNT / np.sqrt(12.0)) / 20.0)
 
 
 def test_the_strain_of_the_arms_own_weight_is_no_bias(heavy_arm):
@@ -334,8 +316,9 @@ def test_gains_stay_in_the_expected_strain(heavy_arm):
 def test_too_few_samples_are_counted(lab):
     c = calibration_of(lab, 100)
     push(c, lab, 57)
-    with pytest.raises(MessageError, match=r"57 are not enough samples yet \(100\); call again"):
+    with pytest.raises(MessageError, match="not enough samples yet") as refused:
         c.bias()
+    assert (refused.value.value, refused.value.limit) == (57, 100)
     push(c, lab, 43)
     c.bias()
     c.reset()
@@ -368,14 +351,8 @@ def test_an_arm_that_is_not_at_rest_is_not_calibrated(lab, field, value, limit, 
 
 def test_an_unknown_torque_and_an_encoders_flicker_are_rest(lab):
     c, step = calibration_of(lab), 2.0 * np.pi / 4096
-    push(
-        c,
-        lab,
-        100,
-        torque=NAN,
-        position=lambda k: step * (k % 2),
-        velocity=lambda k: 0.77 * (-1) ** k,
-    )
+    flicker = {"position": lambda k: step * (k % 2), "velocity": lambda k: 0.77 * (-1) ** k}
+    push(c, lab, 100, torque=NAN, **flicker)
     c.bias()
 
 

@@ -4,10 +4,13 @@
 Parameters are flat, as in ROS (``{"slow.type": "model_following", "slow.kp": [6.25], "rate": 500.0}``); `flat` makes
 them so from nested ones. Parameters of components that are not chosen are left out: one file may hold those of several
 laws. A name that no component of the group knows is refused.
+
+Below, `name` is a key of `COMPONENTS`, and `values` are flat parameters: what is missing takes the node's default.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from flexarm_dynamics import registry
 from flexarm_dynamics.errors import ParameterError
@@ -17,8 +20,7 @@ from ..observers import arm_observer
 from .design import FAST, MANIFOLD, PARAMETERS, SLOW, design, typed
 
 
-@dataclass(frozen=True)
-class Slot:
+class Slot(NamedTuple):
     """A place in the control that one component of a group fills.
 
     Attributes
@@ -36,35 +38,33 @@ class Slot:
     common: tuple = ()
 
 
-def _slot(group, default, description, common=(), read_only=False):
-    kind = parameter("type", default, read_only=read_only).described(description)
-    return Slot(group, kind, common)
-
-
 #: By the prefix of their parameters.
 COMPONENTS = {
-    "slow": _slot(
+    "slow": Slot(
         SLOW,
-        "linear_model_following",
-        "Slow law, by its name in the entry-point group flexarm.slow_laws; none: fast control alone.",
+        parameter("type", "linear_model_following").described(
+            "Slow law, by its name in the entry-point group flexarm.slow_laws; none: fast control alone."
+        ),
     ),
-    "fast": _slot(
+    "fast": Slot(
         FAST,
-        "lqr",
-        "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone.",
+        parameter("type", "lqr").described(
+            "Fast law, by its name in the entry-point group flexarm.fast_laws; none: slow control alone."
+        ),
     ),
-    "manifold": _slot(
+    "manifold": Slot(
         MANIFOLD,
-        "corrected",
-        "Slow manifold that the fast control holds the deflections to, by its name in the entry-point group"
-        " flexarm.manifolds; quasi_steady: the paper's.",
+        parameter("type", "corrected").described(
+            "Slow manifold that the fast control holds the deflections to, by its name in the entry-point group"
+            " flexarm.manifolds; quasi_steady: the paper's."
+        ),
     ),
-    "observer": _slot(
+    "observer": Slot(
         arm_observer.OBSERVERS,
-        "filtered_derivative",
-        "Observer, by its name in the entry-point group flexarm.observers.",
+        parameter("type", "filtered_derivative", read_only=True).described(
+            "Observer, by its name in the entry-point group flexarm.observers."
+        ),
         arm_observer.PARAMETERS,
-        read_only=True,
     ),
 }
 #: Those that the controller is made of.
@@ -72,19 +72,7 @@ CONTROL = ("slow", "fast", "manifold")
 
 
 def flat(values, prefix=""):
-    """Flat parameters from nested ones, or from a mixture of both.
-
-    Parameters
-    ----------
-    values : mapping
-        ``{"slow": {"type": …, "kp": …}}`` or ``{"slow.type": …, "slow.kp": …}``.
-    prefix : str
-        Put before every name.
-
-    Returns
-    -------
-    dict
-    """
+    """Flat parameters from nested ones, ``{"slow": {"type": …}}``, or from a mixture; `prefix` before every name."""
     out = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
@@ -111,24 +99,7 @@ def _of_all(group):
 
 
 def type_of(name, values):
-    """Name of the chosen component; the node's default where `values` make no choice.
-
-    Parameters
-    ----------
-    name : str
-        A key of `COMPONENTS`.
-    values : mapping
-        Flat parameters.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    ParameterError
-        For a type that is not a string.
-    """
+    """Name of the chosen component; a `ParameterError` for a type that is not a string."""
     kind = values.get(f"{name}.type", COMPONENTS[name].type.default)
     if not isinstance(kind, str):
         raise ParameterError("is not a name", field=f"{name}.type", value=kind)
@@ -136,14 +107,7 @@ def type_of(name, values):
 
 
 def declared(name, values):
-    """Parameters of the chosen component, the common ones of its group among them.
-
-    Parameters and errors as for `type_of`.
-
-    Returns
-    -------
-    tuple of Parameter
-    """
+    """Parameters of the chosen component, the common ones of its group among them, as a tuple of `Parameter`."""
     slot = COMPONENTS[name]
     return (*slot.common, *registry.find(slot.group, type_of(name, values)).PARAMETERS)
 
@@ -152,17 +116,6 @@ def chosen(name, values):
     """The chosen component: ``{"type": …, its parameters}``, without those of the others of its group.
 
     Names that belong to no component of the group stay: the design refuses them.
-
-    Parameters
-    ----------
-    name : str
-        A key of `COMPONENTS`.
-    values : mapping
-        Flat parameters.
-
-    Returns
-    -------
-    dict
     """
     given = under(values, name) | {"type": type_of(name, values)}
     own = {p.name for p in declared(name, values)} | {"type"}
@@ -180,39 +133,10 @@ def choices(values):
 
 
 def control(model, values):
-    """The composite control that parameters describe, checked.
-
-    Parameters
-    ----------
-    model : ArmModel
-    values : mapping
-        Flat parameters; what is missing takes the node's default.
-
-    Returns
-    -------
-    CompositeControl
-
-    Raises
-    ------
-    UnknownComponentError, ParameterError, DesignError
-    """
+    """The `CompositeControl` that parameters describe, checked; errors as for `design`."""
     return design(model, **choices(values))
 
 
 def observer(model, given):
-    """The `ArmObserver` that ``{"type": …, parameters}`` describes; see `chosen`.
-
-    Parameters
-    ----------
-    model : ArmModel
-    given : mapping
-
-    Returns
-    -------
-    ArmObserver
-
-    Raises
-    ------
-    UnknownComponentError, ParameterError, DesignError, ModelError
-    """
+    """The `ArmObserver` that `given`, as `chosen` returns it, describes; errors as for `arm_observer.observe`."""
     return arm_observer.observe(model, *typed(given, "observer"))

@@ -2,7 +2,7 @@
 """The design of the composite control: its components by name, their parameters, and the checks of the whole."""
 
 from flexarm_dynamics import registry
-from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.errors import NOT_GIVEN, ParameterError
 from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
@@ -33,28 +33,7 @@ PARAMETERS = (
 
 
 def design_law(group, name, model, values, *known):
-    """Find a law by name, check its parameters and design it.
-
-    Parameters
-    ----------
-    group : str
-        `SLOW`, `FAST` or `MANIFOLD`.
-    name : str
-        As registered.
-    model : ArmModel
-    values : mapping
-        Parameter values without prefix; those of other laws are ignored by the caller, not here.
-    *known
-        What the component is designed for beside the model: the slow law, for a manifold.
-
-    Returns
-    -------
-    SlowLaw, FastLaw or Manifold
-
-    Raises
-    ------
-    UnknownComponentError, ParameterError, DesignError
-    """
+    """As `component.make`, of a law of the `group` `SLOW`, `FAST` or `MANIFOLD`; what is `known`: for a manifold."""
     return make(group, name, model, values, PREFIX[group], *known)
 
 
@@ -85,40 +64,31 @@ def design(model, slow, fast, manifold=None, settings=None):
 
     slow_law, fast_law = law(SLOW, slow), law(FAST, fast)
     surface = law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law)
+    control = CompositeControl(model, slow_law, fast_law, surface)
     if settings is None:
-        return CompositeControl(model, slow_law, fast_law, surface)
+        return control
     chosen = check_all(PARAMETERS, settings)
     wanted = chosen["feedforward"]
     kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
+    if slow_law.drifts:  # joints that nothing holds have no pole left of zero
+        return control
     q = fast_law.configuration
-    control = CompositeControl(model, slow_law, fast_law, surface)
-    free = slow_law.drifts  # joints that nothing holds have no pole left of zero
-    if not free:
-        full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
-    if kind is None or free or slow_law.learns:
+    full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
+    if kind is None or slow_law.learns:
         return control
     motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
     return CompositeControl(model, slow_law, fast_law, surface, motion)
 
 
 def typed(given, prefix):
-    """Split a mapping into its `type` and the parameters.
-
-    `given` is ``{"type": ..., parameters...}``, `prefix` that of its parameters, for the message.
-
-    Raises
-    ------
-    ParameterError
-        Without a type.
-    """
+    """The `type` and the parameters of `given`; `prefix` is that of the parameters, for a `ParameterError`."""
     values = dict(given)
     name = values.pop("type", None)
-    if not isinstance(name, str):
-        found = {} if name is None else {"value": name}
-        raise ParameterError(
-            "is not a name" if found else "missing",
-            field=f"{prefix}.type",
-            hint="write the name of a law, none for no control",
-            **found,
-        )
-    return name, values
+    if isinstance(name, str):
+        return name, values
+    raise ParameterError(
+        "missing" if name is None else "is not a name",
+        field=f"{prefix}.type",
+        value=NOT_GIVEN if name is None else name,
+        hint="write the name of a law, none for no control",
+    )

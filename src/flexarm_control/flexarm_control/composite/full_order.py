@@ -11,37 +11,20 @@ fast law there is counts. A fast law with states of its own brings them along, a
 under way. Poles are given as those of continuous time, s = ln(z) / T.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import jacobian, linear_plant, sampled, state_at_rest
 
+from ..component import at_rest
+from ..fast.none import NoFastLaw
+
 #: A pole may grow this fast [1/s] before a design counts as unstable where no margin is asked for: rounding.
 ROUNDING = 1e-6
 
 
-def at_rest(q):
-    """A reference that rests at q."""
-    q = np.array(q, float)
-    state = np.zeros((3, q.size))
-    state[0] = q
-    return SimpleNamespace(
-        position=q,
-        velocity=np.zeros_like(q),
-        acceleration=np.zeros_like(q),
-        near=lambda offset: state.copy(),
-    )
-
-
 def linear_law(law, q):
-    """A composite control linearised at rest: what the slow part does, and what the fast part sees.
-
-    Parameters
-    ----------
-    law : CompositeControl
-    q : ndarray, shape (n,)
+    """A composite control `law` linearised at rest: what the slow part does, and what the fast part sees.
 
     Returns
     -------
@@ -52,7 +35,8 @@ def linear_law(law, q):
     """
     model = law.model
     n, m = model.n_joints, model.n_modes
-    reference, plain = at_rest(q), type(law)(model, law.slow, _NoFast(n), law.manifold)
+    # The fast law's gain is known.
+    reference, plain = at_rest(q), type(law)(model, law.slow, NoFastLaw(model, {}), law.manifold)
 
     def response(s):
         a, delta, ad, delta_d = np.split(s, [n, n + m, 2 * n + m])
@@ -61,18 +45,6 @@ def linear_law(law, q):
 
     both = jacobian(response, state_at_rest(model, q))
     return both[:n], both[n:]
-
-
-class _NoFast:
-    """Stands in for the fast law, whose gain is known."""
-
-    needs_rates = True
-
-    def __init__(self, n):
-        self._zero = np.zeros(n)
-
-    def torque(self, z_f, q):
-        return self._zero
 
 
 def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
@@ -103,38 +75,31 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     n = B.shape[1]
     U, Z = linear_law(law, q)
     compensator = law.fast.state_space(period)
-    K = law.fast.gain(np.asarray(q, float)) if compensator is None else compensator[3]
-    out = U + K @ Z  # u = out s + C w
-    w = 0 if compensator is None else compensator[0].shape[0]
-    size, whole = A.shape[0], int(delay / period + 1e-9)
+    if compensator is None:
+        K = law.fast.gain(np.asarray(q, float))
+        compensator = np.zeros((0, 0)), np.zeros((0, len(Z))), np.zeros((n, 0)), K
+    Ac, Bc, Cc, Dc = compensator
+    size, w, whole = A.shape[0], len(Ac), int(delay / period + 1e-9)
     late = delay - whole * period
     # u_{k-whole-1} acts until `late`, then u_{k-whole}.
     later, end = sampled(A, B, period - late)
-    begin = later @ sampled(A, B, late)[1] if late > 1e-12 else 0.0 * B
-    under_way = whole + (1 if late > 1e-12 else 0)
+    split = late > 1e-12
+    under_way = whole + split
     total = size + w + n * under_way
     F = np.zeros((total, total))
     F[:size, :size] = sampled(A, B, period)[0]
+    F[size : size + w, : size + w] = np.hstack([Bc @ Z, Ac])
     command = np.zeros((n, total))
-    command[:, :size] = out
-    if w:
-        Ac, Bc, Cc, _ = compensator
-        command[:, size : size + w] = Cc
-        F[size : size + w, :size] = Bc @ Z
-        F[size : size + w, size : size + w] = Ac
+    command[:, : size + w] = np.hstack([U + Dc @ Z, Cc])
 
     def torque(age):
         """Rows of u_{k - age} in the state."""
-        if age == 0:
-            return command
-        row = np.zeros((n, total))
         at = total - n * age
-        row[:, at : at + n] = np.eye(n)
-        return row
+        return np.eye(total)[at : at + n] if age else command
 
     F[:size] += end @ torque(whole)
-    if late > 1e-12:
-        F[:size] += begin @ torque(whole + 1)
+    if split:
+        F[:size] += later @ sampled(A, B, late)[1] @ torque(whole + 1)
     for age in range(under_way, 0, -1):  # oldest first
         at = total - n * age
         F[at : at + n] = torque(age - 1)
@@ -150,22 +115,12 @@ def poles(law, q, period, delay=0.0, plant=None, gain=1.0):
 
 
 def check(law, q, rate, margin=0.0):
-    """Refuse a design whose full-order sampled poles are not left of -margin.
-
-    Parameters
-    ----------
-    law : CompositeControl
-    q : ndarray, shape (n,)
-        Configuration of the design [rad].
-    rate : float
-        Samples per second [Hz].
-    margin : float
-        [1/s]
+    """Refuse a design whose full-order poles, sampled at a `rate` [Hz], are not left of -margin [1/s].
 
     Raises
     ------
     DesignError
-        Naming the pole.
+        Naming the pole of the `law` in the configuration q of its design.
     """
     try:
         slowest = poles(law, q, 1.0 / rate)[0]

@@ -2,13 +2,12 @@
 """Base class of slow manifolds."""
 
 from abc import ABC, abstractmethod
-from types import SimpleNamespace
 
 import numpy as np
 
 from flexarm_dynamics.linear import jacobian
 
-from ..component import Component
+from ..component import Component, at_rest
 from .expansion import Point, expand, reach, step
 
 #: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
@@ -107,12 +106,7 @@ class Manifold(Component, ABC):
             Feed-forward by (q, qd).
         """
         n, m = self.model.n_joints, self.model.n_modes
-        q = np.asarray(q, float)
-        state = np.zeros((3, n))
-        state[0] = q
-        reference = SimpleNamespace(
-            position=q, velocity=np.zeros(n), acceleration=np.zeros(n), near=lambda _: state.copy()
-        )
+        reference = at_rest(q)
 
         def response(x):
             terms = self.model.terms(x[:n], x[n:])

@@ -46,19 +46,14 @@ PARAMETERS = (
 
 
 def resolution(gauges):
-    """Resolution of each gauge, shape (gauges,) [strain].
-
-    Its noise and rounding; a thousandth of full scale if the arm file states neither.
-    """
+    """Noise and rounding of each gauge, (gauges,) [strain]; without either in the arm file, 1/1000 of full scale."""
     return np.array([g.uncertainty or 1e-3 * g.full_scale for g in gauges])
 
 
 def min_travel(rows, gauges):
     """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
 
-    Zero for gauges of different links or directions, and on the diagonal.
-
-    `rows` are the gauges' rows of the strain map, (gauges, modes).
+    Zero for gauges of different links or directions, and on the diagonal; `rows` are the strain map's.
     """
     count = len(gauges)
     least = np.zeros((count, count))
@@ -114,24 +109,19 @@ class GaugeHealth:
             redundant, 1.0 / (self._resolution**2 * np.maximum(free, 1e-6)), 0.0
         )
         self._redundant = bool(redundant.any())
-        count = len(gauges)
-        self.health = np.zeros(count, np.uint8)
         self._mapped = np.zeros(len(strain_map.mode_names))
-        self._last, self._same = np.zeros(count), np.zeros(count, int)
-        self._hold = np.zeros(count, int)
-        self._min_seen, self._max_seen = np.zeros((2, count, count))
-        self._square = np.zeros(count)
+        self.health = np.zeros(len(gauges), np.uint8)
         self.reset()
 
     def reset(self):
         """Forget the past, for a new session of the source."""
+        count = self.health.size
         self.health[:] = GOOD
         self.lost = ()
-        self._last[:] = np.nan
-        self._same[:] = 0
-        self._hold[:], self._holding = 0, False
-        self._min_seen[:], self._max_seen[:] = np.nan, np.nan
-        self._square[:] = 0.0
+        self._last, self._same = np.full(count, np.nan), np.zeros(count, int)
+        self._hold, self._holding = np.zeros(count, int), False
+        self._min_seen, self._max_seen = np.full((2, count, count), np.nan)
+        self._square = np.zeros(count)
 
     def update(self, strain):
         """Judge the readings, shape (gauges,), of a new sample, on the control path."""
@@ -202,7 +192,7 @@ class GaugeHealth:
         held = tuple(np.flatnonzero(self._hold).tolist())
         if self.strain_map.possible_without(held):
             return held
-        bad = tuple(np.flatnonzero(self._bad()).tolist())
+        bad = tuple(np.flatnonzero((self.health != GOOD) & (self.health != SUSPECT)).tolist())
         if self.strain_map.possible_without(bad):
             return bad
         lost = ", ".join(f"{self.names[i]} ({WORDS[self.health[i]]})" for i in bad)
@@ -213,9 +203,6 @@ class GaugeHealth:
             field=f"strain of {self.names[bad[0]]}",
             value=float(strain[bad[0]]),
         )
-
-    def _bad(self):
-        return (self.health != GOOD) & (self.health != SUSPECT)
 
     def warnings(self):
         """One sentence for every gauge that is not good."""
@@ -255,15 +242,10 @@ class BiasCalibration:
     def __init__(self, model, strain_map, samples=200):
         arm = model.arm
         self.model, self.strain_map, self.samples = model, strain_map, samples
-        n = len(arm.joints)
-        self._rows = np.zeros((samples, 3 * n + len(arm.gauges)))
-        split = np.cumsum([n, n, n])
-        self._position, self._velocity, self._torque, self._strain = np.split(
-            self._rows, split, axis=1
-        )
-        counts = np.array([j.encoder_counts for j in arm.joints], float)
-        step = np.where(counts > 0, 2.0 * np.pi / np.where(counts > 0, counts, 1.0), 0.0)
-        self._span = self.REST_ANGLE + 2.0 * step
+        self._position, self._velocity, self._torque = np.zeros((3, samples, len(arm.joints)))
+        self._strain = np.zeros((samples, len(arm.gauges)))
+        counts = np.array([j.encoder_counts or np.inf for j in arm.joints])
+        self._span = self.REST_ANGLE + 4.0 * np.pi / counts
         self._resolution = resolution(arm.gauges)
         self._ranges = np.array([g.range for g in arm.gauges]).reshape(-1, 2).T
         self.reset()
@@ -329,20 +311,15 @@ class BiasCalibration:
         return np.array([delta[names.index(n)] for n in self.strain_map.mode_names])
 
     def _check_gauges(self):
-        low, high = self._ranges
-        for i, name in enumerate(self.model.arm.gauge_names):
-            values = self._strain[:, i]
+        for name, values, low, high in zip(
+            self.model.arm.gauge_names, self._strain.T, *self._ranges, strict=True
+        ):
+            field = f"strain of {name}"
             if not np.isfinite(values).all():
-                raise MessageError(
-                    "is missing", field=f"strain of {name}", hint="check the wires of the gauge"
-                )
-            if values.min() <= low[i] or values.max() >= high[i]:
-                raise MessageError(
-                    "microstrain is at the end of the range",
-                    field=f"strain of {name}",
-                    value=float(1e6 * values[-1]),
-                    hint="balance the bridge first",
-                )
+                raise MessageError("is missing", field=field, hint="check the wires of the gauge")
+            if values.min() <= low or values.max() >= high:
+                problem, hint = "microstrain is at the end of the range", "balance the bridge first"
+                raise MessageError(problem, field=field, value=float(1e6 * values[-1]), hint=hint)
 
     def _check_rest(self):
         arm = self.model.arm
@@ -367,10 +344,6 @@ class BiasCalibration:
                     limit=float(f"{limits[i]:.3g}"),
                     hint="call again at rest",
                 )
-
-    def error(self):
-        """Rms error of each bias by noise and rounding alone, shape (gauges,) [strain]."""
-        return self._resolution / np.sqrt(self.samples)
 
 
 def calibration_text(names, old, new, samples):

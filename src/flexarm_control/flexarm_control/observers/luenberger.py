@@ -23,6 +23,8 @@ The joint torque is the applied one, from the sample. Friction and gravity, whic
 stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from flexarm_dynamics.linear import sampled
@@ -48,7 +50,8 @@ class Luenberger(Observer):
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
         self.pole = self.parameters["pole"]
-        self._designs = {}
+        # One design per time step and configuration rounded to 0.1 rad, so that it does not depend on the past.
+        self._kept = lru_cache(self.KEPT)(lambda dt, *q: self.design(dt, np.array(q)))
         self.innovation = np.zeros(model.n_modes)
         # Beyond a quarter period of the fastest mode its rate can't be found from the amplitudes: Phi12 gets singular.
         self._max_step = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
@@ -74,18 +77,6 @@ class Luenberger(Observer):
         L = np.linalg.solve(Phi[:m, m:].T, (Phi[m:, m:] - decay * np.eye(m)).T).T
         return Phi, Gamma, L
 
-    def _design_for(self, dt, sample):
-        # One design per time step and configuration rounded to 0.1 rad, so that it does not depend on the past.
-        q = np.round(sample.position, 1)
-        key = (dt, *q.tolist())
-        found = self._designs.get(key)
-        if found is None:
-            if len(self._designs) >= self.KEPT:
-                self._designs.clear()
-            found = self.design(dt, q)
-            self._designs[key] = found
-        return found
-
     def update(self, sample, dt):
         if self._elapsed < 0.0:
             self.amplitude[:] = sample.amplitude
@@ -95,7 +86,7 @@ class Luenberger(Observer):
             return
         need_torque(sample.torque, "observer.type luenberger", "use filtered_derivative")
         m = self.amplitude.size
-        Phi, Gamma, L = self._design_for(dt, sample)
+        Phi, Gamma, L = self._kept(dt, *np.round(sample.position, 1).tolist())
         terms = self.model.terms(sample.position, sample.velocity)
         predicted = Phi @ np.concatenate([self.amplitude, self.rate])
         predicted += Gamma @ np.concatenate([sample.torque - terms.f1, terms.f2])

@@ -20,6 +20,7 @@ the past. The rest of the time step, at most 5 us, is corrected to second order 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -88,30 +89,20 @@ class Motion:
     def __init__(self, model, density=None):
         self.model, self.density = model, density
         self._n, self._size = model.n_joints, model.n_joints + model.n_modes
-        self._designs = {}
-
-    def linearisation(self, q):
-        """A at rest in configuration q, shape (N, N)."""
-        rest = np.concatenate([q, np.zeros(2 * self._size - self._n)])
-        return state_matrix(self.model, rest, coulomb=False, step=DIFFERENCE)
+        self._kept = lru_cache(KEPT)(lambda dt, *q: self.design(dt, np.array(q)))
 
     def design(self, dt, q):
-        """The `Step` over dt [s] in configuration q (n,) [rad]."""
-        density = None
-        if self.density is not None:
-            x = np.concatenate([q, np.zeros(2 * self._size - self._n)])
-            density = force_density(self.model, x, self.density)
-        return discretise(self.linearisation(q), dt, density)
+        """The `Step` over dt [s] at rest in configuration q (n,) [rad]."""
+        rest = np.concatenate([q, np.zeros(2 * self._size - self._n)])
+        A = state_matrix(self.model, rest, coulomb=False, step=DIFFERENCE)
+        density = self.density
+        if density is not None:
+            density = force_density(self.model, rest, density)
+        return discretise(A, dt, density)
 
     def step_for(self, dt, position):
         """The kept `Step` for a time step and configuration like these."""
-        key = (round(dt, 5), *np.round(position, 1).tolist())
-        found = self._designs.get(key)
-        if found is None:
-            if len(self._designs) >= KEPT:
-                self._designs.clear()
-            found = self._designs[key] = self.design(key[0], np.array(key[1:]))
-        return found
+        return self._kept(round(dt, 5), *np.round(position, 1).tolist())
 
     def advance(self, x, torque, dt, step):
         """The state after dt under constant torque (n,), shape (N,); `step` from `step_for`."""
