@@ -75,9 +75,13 @@ ROWS = {
     "20 states lost in a row": Row("state drop", end=HOLDING, lasting="for=0.02"),
     "states sent twice": Row("state duplicate", end=HOLDING, lasting=""),
     "states in the wrong order": Row("state swap", end=HOLDING, lasting="for=0.05"),
-    "stamps 1 s in the future": Row("state future by=1.0", reason="jumped ahead by 1 s"),
-    "clock back by 1 s": Row("clock jump by=-1.0", reason="clock went back by 0.999 s", lasting=""),
-    "clock ahead by 10 s": Row("clock jump by=10.0", reason="jumped ahead by 10 s", lasting=""),
+    "stamps 1 s in the future": Row("state future by=1.0", reason=r"1\.0 s after the last state"),
+    "clock back by 1 s": Row(
+        "clock jump by=-1.0", reason="0.999 s before the last state", lasting=""
+    ),
+    "clock ahead by 10 s": Row(
+        "clock jump by=10.0", reason=r"10\.0 s after the last state", lasting=""
+    ),
     "joint encoder stuck": Row(
         "joint_position stick", reason="tracking error of joint1", lasting="", within=300
     ),

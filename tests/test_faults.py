@@ -199,7 +199,7 @@ def test_a_stamp_that_goes_back_is_a_fault(source):
     torque, state = source.exchange(message)
     assert torque.mode == JointTorque.DISABLED
     assert state.supervisor_state == CompositeState.FAULT
-    assert "clock went back by 0.999 s" in state.rejected_reason
+    assert "0.999 s before the last state" in state.rejected_reason
     source.sim.advance(None)
     source.recover()
     source.until_enabled()
@@ -211,7 +211,7 @@ def test_a_stamp_that_jumps_ahead_is_a_fault(source):
     torque, state = source.exchange(message)
     assert torque.mode == JointTorque.DISABLED
     assert state.supervisor_state == CompositeState.FAULT
-    assert "jumped ahead by 3.6e+03 s" in state.rejected_reason
+    assert "3600.0 s after the last state" in state.rejected_reason
     source.restart()
     source.until_enabled()
 

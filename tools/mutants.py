@@ -427,7 +427,7 @@ LIMITS = [
         (
             "arm_controller",
             "stamps: max_gap",
-            "if sample.stamp_ns - before_ns > self._max_gap and self.enabled:",
+            "if since_ns > self._max_gap and self.enabled:",
             "if False:",
         ),
         (

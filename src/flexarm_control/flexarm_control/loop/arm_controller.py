@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flexarm_dynamics.errors import FlexarmError, MessageError, check_finite
+from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.parameters import parameter
 
 from ..arrays import clip
@@ -69,7 +69,7 @@ class ArmController:
         self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
         self._start_tolerance = start_tolerance
         self.torque = np.zeros(n)
-        self._before, self._nothing = np.zeros(n), np.zeros(0)
+        self._nothing = np.zeros(0)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
         self.enabled, self.saturated, self.fast_enabled = False, False, True
         self._trajectory_reason = ""
@@ -169,21 +169,9 @@ class ArmController:
         return self.law.feedforward is not None and self.law.feedforward.plans
 
     def prepare(self, trajectory):
-        """Design work for a trajectory that is about to be offered; off the control path.
+        """Design work for a `trajectory` that is about to be offered, for `offer`; off the control path.
 
-        Parameters
-        ----------
-        trajectory : JointTrajectoryData
-
-        Returns
-        -------
-        object or None
-            For `offer`; None where there is nothing to prepare.
-
-        Raises
-        ------
-        DesignError
-            When it can't be done: the trajectory may be offered without.
+        None where there is nothing to prepare; a `DesignError` where it can't be done: then offer it without.
         """
         start = self.reference.resting
         if start is None or not self.plans:
@@ -370,51 +358,41 @@ class ArmController:
 
     def _judge(self, sample, now_ns):
         """Class of the sample, which is the last one from now on; raises for one that can't be used."""
-        joints, modes = self.model.joint_names, self.model.mode_names
         order = self._order
         verdict = order.judge(sample)
         if verdict == SampleOrder.STALE:
             return verdict
         if verdict == SampleOrder.FOREIGN:
-            raise MessageError(
-                f"two sources send states (sessions {order.session} and {sample.session}): stop one of them"
-            )
-        before_ns, missed = order.stamp_ns, sample.sequence - order.sequence - 1
+            raise order.two_sources(sample)
+        since_ns = sample.stamp_ns - order.stamp_ns
+        missed = max(sample.sequence - order.sequence - 1, 0)
         if verdict != SampleOrder.REPEAT:
             order.take(sample)  # a bad one, too: what comes next is judged beside it
         if verdict == SampleOrder.JUMP:
-            raise MessageError(
-                f"the source's clock went back by {1e-9 * (before_ns - sample.stamp_ns):.3g} s at state"
-                f" {sample.sequence}"
+            raise _refused_stamp(
+                -since_ns, "s before the last state, so the source's clock went back"
             )
         if now_ns is not None and self._max_age is not None:
             self._check_age(sample, now_ns)
         if verdict == SampleOrder.NEW:
-            if missed > 0:
-                self.missed += missed
-            if sample.stamp_ns - before_ns > self._max_gap and self.enabled:
-                raise MessageError(
-                    f"the state's stamp jumped ahead by {1e-9 * (sample.stamp_ns - before_ns):.3g} s, max_gap is"
-                    f" {1e-9 * self._max_gap:g} s; {max(missed, 0)} states are missing"
+            self.missed += missed
+            if since_ns > self._max_gap and self.enabled:
+                problem = (
+                    f"s after the last state is beyond max_gap, and {missed} states are missing"
                 )
-        check_finite(sample.position, joints, "joint_position")
+                raise _refused_stamp(since_ns, problem, self._max_gap)
+        sample.check(self.model)
         if not sample.velocity_known:
-            raise MessageError("joint_velocity is empty: the observer is to fill it in")
-        check_finite(sample.velocity, joints, "joint_velocity")
-        if sample.amplitude is not None:
-            check_finite(sample.amplitude, modes, "modal_amplitude")
-        if sample.rate is not None:
-            check_finite(sample.rate, modes, "modal_rate")
+            hint = "have the observer fill it in"
+            raise MessageError("is empty", field="joint_velocity", hint=hint)
         return verdict
 
     def _check_age(self, sample, now_ns):
         age = now_ns - sample.stamp_ns
         if abs(age) > self._max_age:
-            when = "old" if age > 0 else "from the future"
-            raise MessageError(
-                f"state {sample.sequence} is {1e-9 * abs(age):.3g} s {when}, max_age is {1e-9 * self._max_age:g} s:"
-                " synchronise the clocks, or set synchronised_clocks to false"
-            )
+            when = "in the past" if age > 0 else "in the future"
+            hint = "synchronise the clocks, or set synchronised_clocks to false"
+            raise _refused_stamp(abs(age), f"s {when} is beyond max_age", self._max_age, hint)
 
     def _wait(self, sample, verdict):
         """No torque without deflections; the joints are known, so that trajectories may be offered."""
@@ -456,14 +434,19 @@ class ArmController:
 
     def _limited(self, u, dt):
         """Torque within its size and rate, into `torque`."""
+        ranges = [(self._least, self._limit)]  # the last: the size holds whatever comes before
         if self._rate_limited:
-            self._before[:] = self.torque
             step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
             np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
-            np.copyto(self.torque, u)
-            clip(self.torque, self._before - step, self._before + step)
-        else:
-            np.copyto(self.torque, u)
-        # Last: the size holds whatever came before.
-        clip(self.torque, self._least, self._limit)
+            ranges.insert(0, (self.torque - step, self.torque + step))
+        np.copyto(self.torque, u)
+        for low, high in ranges:
+            clip(self.torque, low, high)
         self.saturated = bool((self.torque != u).any())
+
+
+def _refused_stamp(ns, problem, limit_ns=None, hint=""):
+    """What refuses a state for the time [ns] from its stamp to another one."""
+    value = float(f"{1e-9 * ns:.3g}")
+    limit = None if limit_ns is None else float(f"{1e-9 * limit_ns:g}")
+    return MessageError(problem, field="header.stamp", value=value, limit=limit, hint=hint)

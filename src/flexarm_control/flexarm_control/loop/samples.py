@@ -5,6 +5,8 @@ from collections import deque
 
 import numpy as np
 
+from flexarm_dynamics.errors import MessageError, check_finite
+
 
 class ArmSample:
     """What was measured at one instant, in the arm file's order, SI.
@@ -52,6 +54,22 @@ class ArmSample:
         """(session, sequence): equal for a sample that was sent again."""
         return self.session, self.sequence
 
+    def check(self, model):
+        """Refuse values that are not finite or beyond any arm's; what is not known is not judged.
+
+        Raises
+        ------
+        MessageError
+        """
+        joints, modes = model.joint_names, model.mode_names
+        check_finite(self.position, joints, "joint_position")
+        if self.velocity_known:
+            check_finite(self.velocity, joints, "joint_velocity")
+        if self.amplitude is not None:
+            check_finite(self.amplitude, modes, "modal_amplitude")
+        if self.rate is not None:
+            check_finite(self.rate, modes, "modal_rate")
+
 
 #: Sequence numbers on the topics are uint32.
 WRAP = 2**32
@@ -88,6 +106,11 @@ class SampleOrder:
     def _or_restart(self, verdict):
         self._other += 1
         return verdict if self._other < self.ALONE else self.RESTART
+
+    def two_sources(self, sample):
+        """What refuses a FOREIGN sample."""
+        sessions = f"sessions {self.session} and {sample.session}"
+        return MessageError(f"two sources send states ({sessions})", hint="stop one of them")
 
     def take(self, sample):
         """Remember `sample` as the last one."""

@@ -120,29 +120,21 @@ class Supervisor:
         self.model = model
         self.state, self.reason = State.INACTIVE, ""
         self.stops = self.faults = 0
-        self._names = [
-            *(f"tracking error of {j}" for j in model.joint_names),
-            *(f"velocity of {j}" for j in model.joint_names),
-            *(f"position of {j}" for j in model.joint_names),
-            *(f"deflection of {name}" for name in model.mode_names),
-            *(f"strain of {g.name}" for g in model.arm.gauges),
-            "time at the torque limit",
-        ]
-        self._units = (
-            ["rad"] * model.n_joints
-            + ["rad/s"] * model.n_joints
-            + ["rad"] * model.n_joints
-            + [""] * (model.n_modes + len(model.arm.gauges))
-            + ["s"]
+        joints = model.joint_names
+        watched = (
+            ("tracking error of", joints, " rad"),
+            ("velocity of", joints, " rad/s"),
+            ("position of", joints, " rad"),
+            ("deflection of", model.mode_names, ""),
+            ("strain of", model.arm.gauge_names, ""),
+            ("time at the torque", ["limit"], " s"),
         )
-        n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
-        self._ratio = np.zeros(3 * n + m + g + 1)
-        self._value = np.zeros_like(self._ratio)
-        bounds = np.cumsum([0, n, n, n, m, g, 1])
+        self._names = [(f"{what} {name}", unit) for what, names, unit in watched for name in names]
+        bounds = np.cumsum([0, *(len(names) for _, names, _ in watched)])
         self._parts = [slice(a, b) for a, b in pairwise(bounds)]
+        self._ratio, self._value = np.zeros((2, len(self._names)))
         self._low, self._high = np.array([j.limits.position for j in model.arm.joints]).T
-        self._rows = gauge_rows(model, model.arm.gauges) if g else np.zeros((0, m))
-        self._torque_deceleration = None
+        self._rows = gauge_rows(model, model.arm.gauges)
         self.forget()
         self.configure(settings, torque_limit)
 
@@ -314,8 +306,7 @@ class Supervisor:
 
     def _text(self, i):
         """What limit was exceeded."""
-        name, unit = self._names[i], f" {self._units[i]}".rstrip()
-        value, limit = self._value[i], self._limit[i]
+        (name, unit), value, limit = self._names[i], self._value[i], self._limit[i]
         if name.startswith("position"):
             return (
                 f"{name} is {value:.3g} rad out of its range, or will be, {limit:g} rad are allowed"

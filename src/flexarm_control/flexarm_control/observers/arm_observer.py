@@ -4,7 +4,7 @@
 import numpy as np
 
 from flexarm_dynamics.arm.strain_map import StrainMap
-from flexarm_dynamics.errors import MessageError, ModelError, check_finite
+from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
@@ -31,17 +31,12 @@ PARAMETERS = (
 
 
 def design_observer(name, model, values):
-    """Find an observer by name, check its parameters and design it.
-
-    Raises
-    ------
-    UnknownComponentError, ParameterError, DesignError
-    """
+    """As `component.make`, of an observer by its `name`."""
     return make(OBSERVERS, name, model, values, "observer.")
 
 
 def observe(model, name, values):
-    """Make an `ArmObserver` from an observer's name and its parameters, including those of `PARAMETERS`.
+    """The `ArmObserver` of an observer's `name` and its parameters, those of `PARAMETERS` among them.
 
     Raises
     ------
@@ -161,8 +156,7 @@ class ArmObserver:
         if verdict == SampleOrder.STALE:
             return None
         if verdict == SampleOrder.FOREIGN:
-            sessions = f"sessions {self._order.session} and {sample.session}"
-            raise MessageError(f"two sources send states ({sessions})", hint="stop one of them")
+            raise self._order.two_sources(sample)
         # After a jump of the clock or a long silence the past is useless.
         gap = sample.stamp_ns - last_stamp > MAX_GAP_NS
         restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
@@ -251,9 +245,8 @@ class ArmObserver:
             # It would stay so for ever.
             observer.reset()
             name = type(observer).__name__
-            raise MessageError(
-                "has lost the arm: its estimate is not finite", field=f"observer {name}"
-            )
+            problem = "has lost the arm: its estimate is not finite"
+            raise MessageError(problem, field=f"observer {name}")
         start = 0
         for group in (self.position, self.amplitude, self.velocity, self.rate):
             group[:] = x[start : start + group.size]
@@ -279,22 +272,13 @@ class ArmObserver:
             ) from error
 
     def _check(self, sample):
-        arm = self.model.arm
-        check_finite(sample.position, self.model.joint_names, "joint_position")
-        if sample.velocity_known:
-            check_finite(sample.velocity, self.model.joint_names, "joint_velocity")
-        if sample.amplitude is not None:
-            check_finite(sample.amplitude, self.model.mode_names, "modal_amplitude")
-        elif sample.strain is None:
-            raise MessageError(
-                "neither strain nor modal_amplitude is given", hint="give one of them"
-            )
-        elif self.strain_map is None:
-            raise MessageError(
-                f"can't be mapped: the arm file of {arm.name} has no gauges", field="strain"
-            )
-        if sample.rate is not None:
-            check_finite(sample.rate, self.model.mode_names, "modal_rate")
+        sample.check(self.model)
+        if sample.amplitude is None and sample.strain is None:
+            problem = "neither strain nor modal_amplitude is given"
+            raise MessageError(problem, hint="give one of them")
+        if sample.amplitude is None and self.strain_map is None:
+            problem = f"can't be mapped: the arm file of {self.model.arm.name} has no gauges"
+            raise MessageError(problem, field="strain")
         wild = np.abs(sample.torque) >= MAX_TORQUE  # false for NaN, which means unknown
         if wild.any():
             i = int(np.argmax(wild))
