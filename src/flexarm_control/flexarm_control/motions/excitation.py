@@ -71,19 +71,14 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     Parameters
     ----------
     model : ArmModel
-    profile : Profile
-        From rest to rest; or an object with its methods and duration.
+    profile : Motion
     configuration : (n,) array_like, optional
         Where (11) is taken [rad]; along the motion if not given.
     points : int
         Of time; the quasi-steady state is linear between them.
-
-    Returns
-    -------
-    Excitation
     """
     times = np.linspace(0.0, profile.duration, points)
-    q, qd, qdd = (f(times) for f in (profile.position, profile.velocity, profile.acceleration))
+    q, qd, qdd = profile.states(times)
     torque, steady = np.empty_like(q), np.empty((points, model.n_modes))
     for k in range(points):
         torque[k], steady[k] = reduced(model, q[k], qd[k], qdd[k])
@@ -96,8 +91,7 @@ def reduced(model, q, qd, qdd):
     """Slow torque (n,) [N m] and quasi-steady amplitudes (m,) [m, rad] of a motion: (10) and (9)."""
     terms = model.terms(q, qd)
     if not model.n_modes:
-        torque = terms.M @ qdd + terms.f1
-        return torque, np.zeros(0)
+        return terms.M @ qdd + terms.f1, np.zeros(0)
     a, B = slow_subsystem(terms)
     torque = np.linalg.solve(B, qdd - a)
     return torque, quasi_steady_state(terms, torque)
@@ -149,16 +143,12 @@ class FastResponse:
         self.drive = -integral[:, :, :m] / step
 
     def deviation(self, steady):
-        """Return z_f at the grid's points.
+        """Return z_f at the grid's points, (k, 2m) or (k, 2m, c).
 
         Parameters
         ----------
         steady : (k, m) or (k, m, c) array
             Quasi-steady amplitudes; the last axis are c motions side by side.
-
-        Returns
-        -------
-        (k, 2m) or (k, 2m, c) array
         """
         out = np.zeros((steady.shape[0], 2 * self.m, *steady.shape[2:]))
         for k, change in enumerate(np.diff(steady, axis=0) if self.m else ()):

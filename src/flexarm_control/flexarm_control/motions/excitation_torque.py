@@ -129,13 +129,11 @@ class ExcitationTorque:
 
 
 def _joints(model, name):
-    if not name:
-        return list(range(model.n_joints))
-    if name not in model.joint_names:
-        raise DesignError(
-            "is unknown", field="joint", value=name, limit=", ".join(model.joint_names)
-        )
-    return [model.joint_names.index(name)]
+    """Indices of the excited joints."""
+    names = model.joint_names
+    if name and name not in names:
+        raise DesignError("is unknown", field="joint", value=name, limit=", ".join(names))
+    return [names.index(name)] if name else list(range(model.n_joints))
 
 
 def _amplitude(joint, wanted, hold):

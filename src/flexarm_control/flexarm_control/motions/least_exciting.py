@@ -17,7 +17,7 @@ An interior-point method solves the quadratic programme (`least_squares`). A lin
 is a solution at all, and finds the least torque or duration if there is none.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -88,10 +88,6 @@ def least_exciting(
     configuration : (n,) array_like, optional
         Where (11) is taken [rad]; along the motion if not given.
 
-    Returns
-    -------
-    LeastExciting
-
     Raises
     ------
     TrajectoryError
@@ -151,10 +147,11 @@ class _Basis:
         self.matrices = [A[:, self.free] for A in full]
         self.constants = [A @ fixed for A in full]
 
-    def coefficients(self, x):
-        out = np.zeros(self.count)
-        out[self.free], out[-_REST:] = x, 1.0
-        return out
+    def spline(self, x):
+        """sigma by s."""
+        coefficients = np.zeros(self.count)
+        coefficients[self.free], coefficients[-_REST:] = x, 1.0
+        return BSpline(self.knots, coefficients, _DEGREE)
 
     def fit(self, sigma):
         """Coefficients of the spline nearest to a time law given at the grid's times."""
@@ -171,54 +168,40 @@ class _Problem:
         self.basis = _Basis()
         self.first = self.basis.fit(base.shape[0](self.basis.s))
 
-    def profile(self, x, duration=None):
+    def profile(self, x):
         """The motion of the coefficients."""
-        b = self.basis
-        spline = BSpline(b.knots, b.coefficients(x), _DEGREE)
+        spline = self.basis.spline(x)
         shape = (spline, spline.derivative(), spline.derivative(2))
-        duration = self.base.duration if duration is None else duration
-        return Profile(self.base.start, self.base.angle, duration, shape)
+        return replace(self.base, shape=shape)
 
     # Limits ------------------------------------------------------------------------------------
 
     def linearised(self, x, duration):
         """Torque and quasi-steady amplitudes at the grid's times: r + A x, exact at x in value and gradient.
 
-        Returns
-        -------
-        r : (k, n + m) array
-        A : (k, n + m, c) array
+        r is (k, n + m), A (k, n + m, c).
         """
-        b, T = self.basis, duration
-        states = [(r + A @ x) for r, A in zip(b.constants[:3], b.matrices[:3], strict=True)]
-        value = self._reduced(*states, T)
-        gradients = []
-        for i in range(3):
+        matrices = self.basis.matrices[:3]
+        states = [r + A @ x for r, A in zip(self.basis.constants[:3], matrices, strict=True)]
+        value = self._reduced(*states, duration)
+        A = np.zeros((*value.shape, x.size))
+        for i, matrix in enumerate(matrices):
             # Forward differences: exact for the acceleration, which is linear, and accurate enough for the
             # others, whose change between two rounds goes to zero.
             step = 1.0 if i == 2 else _STEP
             ahead = list(states)
             ahead[i] = states[i] + step
-            gradients.append((self._reduced(*ahead, T) - value) / step)
-        A = sum(
-            gradient[:, :, None] * matrix[:, None, :]
-            for gradient, matrix in zip(gradients, b.matrices[:3], strict=True)
-        )
+            gradient = (self._reduced(*ahead, duration) - value) / step
+            A += gradient[:, :, None] * matrix[:, None, :]
         return value - A @ x, A
 
     def _reduced(self, sigma, rate, acceleration, duration):
         """Torque and quasi-steady amplitudes (k, n + m) of states of sigma, derivatives by s."""
-        start, angle = self.base.start, self.base.angle
-        states = zip(sigma, rate, acceleration, strict=True)
+        angle = self.base.angle
+        q, qd = self.base.start + np.outer(sigma, angle), np.outer(rate, angle) / duration
+        states = zip(q, qd, np.outer(acceleration, angle) / duration**2, strict=True)
         try:
-            rows = [
-                np.concatenate(
-                    excitation.reduced(
-                        self.model, start + angle * s, angle * v / duration, angle * a / duration**2
-                    )
-                )
-                for s, v, a in states
-            ]
+            return np.array([np.concatenate(excitation.reduced(self.model, *s)) for s in states])
         except np.linalg.LinAlgError:
             raise DesignError(
                 f"s makes the joints of {self.model.arm.name} so fast that the links lose their stiffness in this"
@@ -227,7 +210,6 @@ class _Problem:
                 value=duration,
                 hint="take a longer one",
             ) from None
-        return np.array(rows)
 
     def torque_rows(self, r, A):
         """Torque divided by its limit, at all times, for all joints that have one: r (k,), A (k, c)."""
@@ -372,8 +354,8 @@ class _Problem:
         """Peak torque divided by its limit, by the full reduced model, also between the grid's times."""
         profile = self.profile(x)
         times = np.linspace(0.0, profile.duration, 2 * (self.basis.s.size - 1) + 1)
-        motion = (f(times) for f in (profile.position, profile.velocity, profile.acceleration))
-        torque = [excitation.reduced(self.model, *state)[0] for state in zip(*motion, strict=True)]
+        states = zip(*profile.states(times), strict=True)
+        torque = [excitation.reduced(self.model, *state)[0] for state in states]
         return float(np.max(np.abs(torque) / self.torque_limit))
 
     def _programme(self, x, tighter):
@@ -382,10 +364,8 @@ class _Problem:
         r, A = self.linearised(x, T)
         rows, sides = self._objective(r[:, n:], A[:, n:])
         torque, gradients = self.torque_rows(r, A)
-        G, h = (
-            [-gradients, gradients, b.matrices[1]],
-            [torque - tighter, -torque - tighter, -b.constants[1]],
-        )
+        G = [-gradients, gradients, b.matrices[1]]
+        h = [torque - tighter, -torque - tighter, -b.constants[1]]
         bound = self.speed_bound(T)
         if np.isfinite(bound):
             G.append(-b.matrices[1])
@@ -394,10 +374,8 @@ class _Problem:
 
     def _objective(self, r, A):
         """Rows and right-hand sides whose squared difference the programme minimises."""
-        b, k = self.basis, self.basis.s.size
-        quintics = self.first
-        jerk = b.matrices[3] / np.sqrt(k)
-        jerk_constant = b.constants[3] / np.sqrt(k)
+        b, k, quintics = self.basis, self.basis.s.size, self.first
+        jerk, jerk_constant = b.matrices[3] / np.sqrt(k), b.constants[3] / np.sqrt(k)
         scale = np.sqrt(JERK_WEIGHT) / np.linalg.norm(jerk @ quintics + jerk_constant)
         rows, sides = [scale * jerk], [-scale * jerk_constant]
         if self.model.n_modes:
@@ -424,10 +402,6 @@ def least_squares(E, f, G, h):
     E, f : (k, c), (k,) arrays
         E of full column rank.
     G, h : (l, c), (l,) arrays
-
-    Returns
-    -------
-    (c,) array
 
     Raises
     ------

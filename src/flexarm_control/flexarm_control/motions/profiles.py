@@ -4,6 +4,7 @@
 Each motion goes from rest to rest: theta(t) = start + angle sigma(s), s = t / T, sigma from 0 to 1.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,20 +20,48 @@ MAX_SMOOTHNESS = 20
 MAX_DURATION = 1e9
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """A motion of n joints, at rest before 0 and after `duration`.
+class Motion(ABC):
+    """A motion of n joints, at rest before 0 and after its end.
 
     Attributes
     ----------
-    start : (n,) array
-        Positions at t = 0 [rad].
-    angle : (n,) array
-        How far each joint goes [rad].
+    start, angle : (n,) array
+        Positions at t = 0, and how far each joint goes [rad].
     duration : float
         T [s].
+    """
+
+    @abstractmethod
+    def derivative(self, order, t) -> np.ndarray:
+        """Return the derivative of an order from 0 to 2 at t [s], scalar or (k,): (n,) or (k, n)."""
+
+    def position(self, t) -> np.ndarray:
+        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
+        return self.derivative(0, t)
+
+    def velocity(self, t) -> np.ndarray:
+        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
+        return self.derivative(1, t)
+
+    def acceleration(self, t) -> np.ndarray:
+        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
+        return self.derivative(2, t)
+
+    def states(self, t):
+        """Return positions, velocities and accelerations at t [s]."""
+        return tuple(self.derivative(order, t) for order in range(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Profile(Motion):
+    """A motion in closed form, as in the module.
+
+    Attributes
+    ----------
     shape : tuple of 3 functions
         sigma, sigma' and sigma'' of s in [0, 1], elementwise [-].
+    start, angle, duration
+        As for every `Motion`.
     """
 
     start: np.ndarray
@@ -40,22 +69,11 @@ class Profile:
     duration: float
     shape: tuple[Callable, Callable, Callable]
 
-    def position(self, t) -> np.ndarray:
-        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
-        return self.start + self._shape(t, 0)
-
-    def velocity(self, t) -> np.ndarray:
-        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
-        return self._shape(t, 1)
-
-    def acceleration(self, t) -> np.ndarray:
-        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
-        return self._shape(t, 2)
-
-    def _shape(self, t, order):
+    def derivative(self, order, t):
         # Rest to rest: beyond either end sigma stays, and its derivatives are 0 as at the end.
         s = np.clip(np.asarray(t, dtype=float) / self.duration, 0.0, 1.0)
-        return self.shape[order](s)[..., None] * (self.angle / self.duration**order)
+        moved = self.shape[order](s)[..., None] * (self.angle / self.duration**order)
+        return moved if order else self.start + moved
 
 
 def paper_profile(duration=2.0, angle=np.pi / 2, start=0.0) -> Profile:
@@ -67,6 +85,7 @@ def paper_profile(duration=2.0, angle=np.pi / 2, start=0.0) -> Profile:
     this is 45 [1 + sin(2 pi t / T - pi / 2)] deg/s, from 0 to 90 deg in 2 s. The published paper
     has 90 instead of 45. That must be a misprint: the mean of the bracket is 1, so that 90 deg/s
     over 2 s would end at 180 deg, but the text ends at 90 deg and designs the fast control there.
+    The acceleration is 0 at both ends.
 
     Parameters
     ----------
@@ -76,11 +95,6 @@ def paper_profile(duration=2.0, angle=np.pi / 2, start=0.0) -> Profile:
         How far each joint goes [rad]; a float is one joint.
     start : float or (n,) array_like
         Positions at t = 0 [rad].
-
-    Returns
-    -------
-    Profile
-        The motion; its acceleration is 0 at both ends.
 
     Raises
     ------
@@ -113,11 +127,6 @@ def quintic(start, end, duration) -> Profile:
         Positions at t = 0 and t = T [rad]; floats are one joint.
     duration : float
         T [s].
-
-    Returns
-    -------
-    Profile
-        The motion.
 
     Raises
     ------
@@ -157,11 +166,6 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
         T [s].
     smoothness : int
         k, from 2 to `MAX_SMOOTHNESS`.
-
-    Returns
-    -------
-    Profile
-        The motion.
 
     Raises
     ------
@@ -208,15 +212,9 @@ def sample(profile, n_points) -> SampledProfile:
 
     Parameters
     ----------
-    profile : Profile
-        The motion, or an object with its methods and duration.
+    profile : Motion
     n_points : int
         k, at least 2.
-
-    Returns
-    -------
-    SampledProfile
-        Times, positions, velocities and accelerations.
 
     Raises
     ------
@@ -227,23 +225,11 @@ def sample(profile, n_points) -> SampledProfile:
         limit = "integers from 2"
         raise TrajectoryError("is not possible", field="n_points", value=n_points, limit=limit)
     times = np.linspace(0.0, profile.duration, n_points)
-    return SampledProfile(
-        times, profile.position(times), profile.velocity(times), profile.acceleration(times)
-    )
+    return SampledProfile(times, *profile.states(times))
 
 
 def rows(points):
-    """Return a `SampledProfile` as the points that `flexarm_control.trajectory.validate` takes.
-
-    Parameters
-    ----------
-    points : SampledProfile
-
-    Returns
-    -------
-    list of tuple
-        ``(time_from_start_ns, positions, velocities, accelerations, effort)`` each, effort empty.
-    """
+    """Return a `SampledProfile` as the `points` that `flexarm_control.trajectory.validate` takes."""
     lists = (values.tolist() for values in points)
     return [(round(1e9 * t), *values, []) for t, *values in zip(*lists, strict=True)]
 

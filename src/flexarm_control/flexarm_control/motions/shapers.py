@@ -21,11 +21,15 @@ the torque is shaped as the motion is, and V is exact.
 """
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import matmul
 
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_and_damping
+
+from .profiles import Motion
 
 #: A longer train is refused: every sample of a shaped motion evaluates the motion once per impulse.
 MAX_IMPULSES = 1000
@@ -59,17 +63,12 @@ class Shaper:
         return Shaper(times[order], amplitudes[order])
 
     def residual(self, omega, zeta):
-        """Return V, the fraction of a mode's vibration that is left.
+        """Return V, the fraction of a mode's vibration that is left: 0: none, 1: as without shaper.
 
         Parameters
         ----------
         omega, zeta : float or array
             Natural frequency [rad/s] and damping ratio [-] of the mode.
-
-        Returns
-        -------
-        float or array
-            0: none, 1: as without shaper.
         """
         omega, zeta = np.asarray(omega, float)[..., None], np.asarray(zeta, float)[..., None]
         pole = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
@@ -82,23 +81,15 @@ class Shaper:
         return ShapedProfile(profile, self)
 
 
-class ShapedProfile:
+class ShapedProfile(Motion):
     """A motion convolved with a shaper: the sum of its delayed copies, each with its amplitude.
 
-    It has the methods of a `Profile`; its derivatives are as exact as those of the profile.
+    Its derivatives are as exact as those of the motion. It is longer by the shaper's duration.
 
     Parameters
     ----------
-    profile : Profile
-        From rest to rest.
+    profile : Motion
     shaper : Shaper
-
-    Attributes
-    ----------
-    start, angle : (n,) array
-        As the profile's [rad].
-    duration : float
-        The profile's and the shaper's together [s].
     """
 
     def __init__(self, profile, shaper):
@@ -106,22 +97,12 @@ class ShapedProfile:
         self.start, self.angle = profile.start, profile.angle
         self.duration = profile.duration + shaper.duration
 
-    def position(self, t) -> np.ndarray:
-        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
-        return self._sum(self._profile.position, t)
-
-    def velocity(self, t) -> np.ndarray:
-        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
-        return self._sum(self._profile.velocity, t)
-
-    def acceleration(self, t) -> np.ndarray:
-        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
-        return self._sum(self._profile.acceleration, t)
-
-    def _sum(self, function, t):
+    def derivative(self, order, t):
         t = np.asarray(t, float)
         copies = zip(self._shaper.amplitudes, self._shaper.times, strict=True)
-        return sum(amplitude * function(t - delay) for amplitude, delay in copies)
+        return sum(
+            amplitude * self._profile.derivative(order, t - delay) for amplitude, delay in copies
+        )
 
 
 def zv(omega, zeta) -> Shaper:
@@ -199,10 +180,7 @@ def for_modes(kind, omega, zeta) -> Shaper:
             limit=MAX_IMPULSES,
             hint="shape fewer modes",
         )
-    out = trains[0]
-    for train in trains[1:]:
-        out = out @ train
-    return out
+    return reduce(matmul, trains)
 
 
 def modes_at(model, q):

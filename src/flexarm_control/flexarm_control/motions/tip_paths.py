@@ -20,21 +20,15 @@ from flexarm_dynamics.errors import TrajectoryError
 from flexarm_dynamics.models.inverse_kinematics import TOLERANCE as ARRIVED
 from flexarm_dynamics.models.inverse_kinematics import TipKinematics, checked, nearest, show
 
+from .profiles import Motion
+
 #: How far the resting tip may be from the path [m].
 TOLERANCE = 1e-7
 _MIN_KNOTS, _MAX_KNOTS = 32, 512
 
 
-class TipPath:
-    """A motion of the tip along a path; it has the methods of a `Profile`.
-
-    Attributes
-    ----------
-    start, angle : (n,) array
-        Joint angles at the start, and how far each joint goes [rad].
-    duration : float
-        [s]
-    """
+class TipPath(Motion):
+    """A motion of the tip along a path: the `curve` x(s), the `joints` Q(s) and the time `law` sigma(t)."""
 
     def __init__(self, curve, joints, law):
         self._curve, self._joints, self._law = curve, joints, law
@@ -51,17 +45,13 @@ class TipPath:
         """Return the wanted position of the tip at t [s], scalar or (k,): (3,) or (k, 3) [m]."""
         return self._curve(self._law.position(t))
 
-    def position(self, t) -> np.ndarray:
-        """Return the positions at t [s], scalar or (k,): (n,) or (k, n) [rad]."""
-        return self._joints(self._law.position(t)[..., 0])
-
-    def velocity(self, t) -> np.ndarray:
-        """Return the velocities at t [s], scalar or (k,): (n,) or (k, n) [rad/s]."""
-        return self._slope(self._law.position(t)[..., 0]) * self._law.velocity(t)
-
-    def acceleration(self, t) -> np.ndarray:
-        """Return the accelerations at t [s], scalar or (k,): (n,) or (k, n) [rad/s^2]."""
-        s, rate = self._law.position(t)[..., 0], self._law.velocity(t)
+    def derivative(self, order, t):
+        s = self._law.position(t)[..., 0]
+        if order == 0:
+            return self._joints(s)
+        rate = self._law.velocity(t)
+        if order == 1:
+            return self._slope(s) * rate
         return self._curvature(s) * rate**2 + self._slope(s) * self._law.acceleration(t)
 
 
@@ -75,14 +65,10 @@ def line(model, start, end, law, bent=True) -> TipPath:
         Joint angles at the start; the line begins at the tip there [rad].
     end : (3,) array_like
         Where it ends, in the base frame [m].
-    law : Profile
+    law : Motion
         Of one joint, from 0 to 1: the fraction of the path.
     bent : bool
         Whether to compensate the deflections by weight.
-
-    Returns
-    -------
-    TipPath
 
     Raises
     ------
