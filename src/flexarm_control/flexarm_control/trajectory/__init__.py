@@ -23,22 +23,12 @@ Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 
 from .reference import ReferenceGenerator, Verdict
 from .request import JointTrajectoryData, validate
-from .values import (
-    BRAKING_STEP,
-    END_VELOCITY_TOLERANCE,
-    MAX_BRAKING,
-    MAX_MAGNITUDE,
-    MAX_POINTS,
-    SPEED_ROUNDING,
-)
+from .values import BRAKING_STEP, MAX_MAGNITUDE, MAX_POINTS
 
 __all__ = [
     "BRAKING_STEP",
-    "END_VELOCITY_TOLERANCE",
-    "MAX_BRAKING",
     "MAX_MAGNITUDE",
     "MAX_POINTS",
-    "SPEED_ROUNDING",
     "JointTrajectoryData",
     "ReferenceGenerator",
     "Verdict",

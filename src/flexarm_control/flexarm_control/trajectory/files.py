@@ -126,8 +126,6 @@ def _with_lines(text, lines):
 
 
 # CSV -------------------------------------------------------------------------------------------
-
-
 # The fields of errors begin with what follows the file's name: ":3: q2", or ": points[0]".
 
 
@@ -197,21 +195,20 @@ def _csv_columns(header, joint_names, line):
 
 
 def _csv_number(word, column, line):
+    field = f":{line}: {column}"
     try:
         value = float(word)
     except ValueError:
-        value = None
-    if value is None or not math.isfinite(value):
-        problem = "is not a number" if value is None else "is not finite"
-        raise TrajectoryError(problem, field=f":{line}: {column}", value=word)
+        raise TrajectoryError("is not a number", field=field, value=word) from None
+    if not math.isfinite(value):
+        raise TrajectoryError("is not finite", field=field, value=word)
     return value
 
 
 def _csv_time(value, line):
+    field, hint = f":{line}: t", "use shorter times"
     if abs(value) > 9e9:
-        raise TrajectoryError(
-            "s is beyond 2^63 ns", field=f":{line}: t", value=value, hint="use shorter times"
-        )
+        raise TrajectoryError("s is beyond 2^63 ns", field=field, value=value, hint=hint)
     return round(value * SECOND)
 
 
@@ -274,9 +271,8 @@ def _yaml_point(point, field):
     time = _mapping(time, f"{field}.time_from_start", ("sec", "nanosec"))
     for key, value in time.items():
         if isinstance(value, bool) or not isinstance(value, int):
-            raise TrajectoryError(
-                "is no integer", field=f"{field}.time_from_start.{key}", value=value
-            )
+            where = f"{field}.time_from_start.{key}"
+            raise TrajectoryError("is no integer", field=where, value=value)
     return time.get("sec", 0) * SECOND + time.get("nanosec", 0), *values
 
 
@@ -284,23 +280,19 @@ def _yaml_values(values, field):
     if values is None:
         return []
     if not isinstance(values, list):
-        raise TrajectoryError(
-            "is no list", field=field, value=values, hint="give one number per joint"
-        )
+        hint = "give one number per joint"
+        raise TrajectoryError("is no list", field=field, value=values, hint=hint)
     out = []
     for i, value in enumerate(values):
         try:
-            # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
-            out.append(value if isinstance(value, float) else _yaml_number(value))
+            if isinstance(value, bool):
+                raise TypeError
+            out.append(
+                float(value)
+            )  # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number
         except NOT_NUMBERS:
             raise TrajectoryError("is not a number", field=f"{field}[{i}]", value=value) from None
     return out
-
-
-def _yaml_number(value):
-    if isinstance(value, bool):
-        raise TypeError
-    return float(value)
 
 
 def _yaml_text(trajectory):

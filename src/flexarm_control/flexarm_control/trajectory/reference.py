@@ -47,9 +47,9 @@ class Verdict:
 class ReferenceGenerator:
     """Generates the joints' reference: holds, follows trajectories, stops.
 
-    The newest accepted trajectory wins. From its start on it replaces the one that is followed.
-    A trajectory that was accepted earlier and has not begun is replaced at once, except that one
-    which only waits for the next sample still begins if the newer one starts later.
+    The newest accepted trajectory wins. From its start on it replaces the one that is followed. A trajectory that was
+    accepted earlier and has not begun is replaced at once, except that one which only waits for the next sample still
+    begins if the newer one starts later.
 
     Parameters
     ----------
@@ -84,11 +84,9 @@ class ReferenceGenerator:
                 limit="finite, at least 0",
             )
         self._start_tolerance = float(start_tolerance)
-        self._velocity_max = (
-            None
-            if velocity_max is None
-            else joint_limit("velocity_max", velocity_max, self.joint_names)
-        )
+        if velocity_max is not None:
+            velocity_max = joint_limit("velocity_max", velocity_max, self.joint_names)
+        self._velocity_max = velocity_max
         n = len(self.joint_names)
         self._state = np.zeros((3, n))
         self._scratch, self._near = np.zeros((3, n)), np.zeros((3, n))
@@ -110,20 +108,7 @@ class ReferenceGenerator:
         self.active = self.finished = self.stopping = False
 
     def start(self, position, stamp_ns):
-        """Hold a measured position from a stamp on; earlier trajectories are forgotten.
-
-        Parameters
-        ----------
-        position : (n,) array_like
-            The measured joint positions [rad].
-        stamp_ns : int
-            The stamp of the measurement [ns].
-
-        Raises
-        ------
-        TrajectoryError
-            If the position has another shape or is not finite.
-        """
+        """Hold a measured `position` (n,) [rad] from `stamp_ns` [ns] on; earlier trajectories are forgotten."""
         position = per_joint("joint_position", position, self.joint_names)
         lost = ~np.isfinite(position)
         problem, hint = "rad is not finite", "it is needed to hold the joint"
@@ -134,18 +119,7 @@ class ReferenceGenerator:
         self._last_ns = stamp_ns
 
     def offer(self, trajectory: JointTrajectoryData) -> Verdict:
-        """Accept a validated trajectory, or return why it is refused.
-
-        Parameters
-        ----------
-        trajectory : JointTrajectoryData
-            From `validate`, for the same joints.
-
-        Returns
-        -------
-        Verdict
-            The decision. A refused trajectory changes nothing.
-        """
+        """Accept a validated trajectory, or return why it is refused; then it changes nothing."""
         if self._last_accepted is not None and trajectory.repeats(self._last_accepted):
             return Verdict(
                 False, f"repeat of trajectory {self.accepted_id}", self.accepted_id, repeat=True
@@ -230,12 +204,7 @@ class ReferenceGenerator:
         self._reference_at(path, stamp_ns)
 
     def _accept(self, trajectory):
-        derivatives = [
-            values
-            for values in (trajectory.positions, trajectory.velocities, trajectory.accelerations)
-            if values is not None
-        ]
-        path = Path(trajectory.times_ns, derivatives, self.accepted_id + 1)
+        path = Path(trajectory.times_ns, trajectory.fields, self.accepted_id + 1)
         replaced = self._pending
         self._pending = None
         if trajectory.stamp_ns == 0:
@@ -253,17 +222,10 @@ class ReferenceGenerator:
         return Verdict(True, reason, path.trajectory_id)
 
     def sample(self, stamp_ns):
-        """Fill `position`, `velocity`, `acceleration` and the flags for a stamp [ns].
+        """Fill `position`, `velocity`, `acceleration` and the flags for a stamp `stamp_ns` of the arm's clock [ns].
 
-        The same stamps after the same calls give the same bits. A stamp may be earlier than the last;
-        before the start of the followed trajectory, the reference is the state at that start.
-
-        `stamp_ns` is on the arm's clock [ns].
-
-        Raises
-        ------
-        TrajectoryError
-            If there is no state yet.
+        The same stamps after the same calls give the same bits. A stamp may be earlier than the last; before the start
+        of the followed trajectory, the reference is the state at that start.
         """
         if self._last_ns is None:
             raise TrajectoryError(
@@ -288,7 +250,7 @@ class ReferenceGenerator:
         self.stopping = moving and not of_trajectory
 
     def near(self, offset):
-        """State (position, velocity, acceleration), (3, n), at an offset [s] from the last sampled stamp.
+        """State (position, velocity, acceleration), (3, n), at an `offset` [s] from the last sampled stamp.
 
         It is on the polynomial of that stamp, continued beyond its ends, so that derivatives of the reference can be
         computed. Overwritten by the next call.
@@ -313,16 +275,12 @@ class ReferenceGenerator:
             path.evaluate(stamp_ns, self._scratch)
 
     def stop(self, stamp_ns, deceleration):
-        """Bring the reference to rest from what it is at a stamp, then hold.
+        """Bring the reference to rest from its state at a stamp, then hold; cancel all trajectories.
 
-        Each joint's velocity follows the cubic from its present velocity v and acceleration a to
-        rest, the position its integral, over the shortest time T in which no acceleration
-        exceeds ``D = max(deceleration, |a|)``: with w = v / T and v >= 0 that is
-        (3 w + a)^2 = 3 D (2 w + a), from a = 0 ``T = 1.5 |v| / D``. T is rounded up to the next
-        `BRAKING_STEP`: a joint that is nearly at rest while it accelerates may move on by up to
-        ``|a| T^2 / 12``.
-
-        All trajectories are cancelled; offered again, they are new.
+        Each joint's velocity follows the cubic from its present velocity v and acceleration a to rest, over the
+        shortest time T in which no acceleration exceeds ``D = max(deceleration, |a|)``: with w = v / T and v >= 0 that
+        is (3 w + a)^2 = 3 D (2 w + a), from a = 0 ``T = 1.5 |v| / D``. T is rounded up to the next `BRAKING_STEP`: a
+        joint that is nearly at rest while it accelerates may move on by up to ``|a| T^2 / 12``.
 
         Parameters
         ----------
@@ -349,18 +307,14 @@ class ReferenceGenerator:
 
 def _decelerations(deceleration, joint_names):
     """Return the decelerations as an (n,) array, all finite and above 0 [rad/s^2]."""
+    field = "deceleration"
     try:
         values = np.broadcast_to(np.asarray(deceleration, dtype=float), (len(joint_names),))
     except NOT_NUMBERS:
-        raise TrajectoryError(
-            "is no number",
-            field="deceleration",
-            value=deceleration,
-            hint="give a number, or one per joint",
-        ) from None
+        hint = "give a number, or one per joint"
+        raise TrajectoryError("is no number", field=field, value=deceleration, hint=hint) from None
     bad = ~((values > 0.0) & (values < np.inf))
-    problem, limit = "rad/s^2 is out of range", "finite, above 0"
-    refuse_joint("deceleration", bad, values, joint_names, problem, limit)
+    refuse_joint(field, bad, values, joint_names, "rad/s^2 is out of range", "finite, above 0")
     return values
 
 

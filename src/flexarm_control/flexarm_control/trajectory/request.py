@@ -59,19 +59,18 @@ class JointTrajectoryData:
         """Times of the points from the start, (k,) [s]."""
         return self.times_ns / SECOND
 
+    @property
+    def fields(self) -> list:
+        """Positions, then velocities and accelerations if given: one to three (k, n) arrays."""
+        every = (self.positions, self.velocities, self.accelerations)
+        return [values for values in every if values is not None]
+
     def repeats(self, other: "JointTrajectoryData") -> bool:
         """Whether `other` has the same joints, the same stamp and the same points, bit by bit."""
         if self.stamp_ns != other.stamp_ns or self.joint_names != other.joint_names:
             return False
-        pairs = (
-            (self.times_ns, other.times_ns),
-            (self.positions, other.positions),
-            (self.velocities, other.velocities),
-            (self.accelerations, other.accelerations),
-        )
-        return all(
-            a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs
-        )
+        mine, others = [self.times_ns, *self.fields], [other.times_ns, *other.fields]
+        return len(mine) == len(others) and all(map(np.array_equal, mine, others))
 
 
 def validate(
@@ -103,11 +102,6 @@ def validate(
         Limit of the speeds in the arm's order [rad/s]. It applies to the given velocities and to
         the mean speed between two points, which no curve through both can stay below.
 
-    Returns
-    -------
-    JointTrajectoryData
-        The trajectory.
-
     Raises
     ------
     TrajectoryError
@@ -122,7 +116,13 @@ def validate(
         _field(name, column, arm_joint_names, order)
         for name, column in zip(_FIELDS[1:4], columns[1:4], strict=True)
     ]
-    _refuse_effort(columns[4])
+    filled = np.flatnonzero(_lengths("effort", columns[4]))
+    if filled.size:
+        raise TrajectoryError(
+            "is not empty",
+            field=f"points[{int(filled[0])}].effort",
+            hint="leave it empty: the torque is computed from the motion",
+        )
     if fields[0] is None:
         raise TrajectoryError(
             "is empty", field="points[0].positions", hint="give the position of every joint"
@@ -183,30 +183,26 @@ def _columns(points):
             limit=MAX_POINTS,
             hint="send fewer, farther apart",
         )
-    if not set(map(type, points)) <= {tuple, list} or set(map(len, points)) != {len(_FIELDS)}:
-        for index, point in enumerate(points):
-            if not isinstance(point, tuple | list) or len(point) != len(_FIELDS):
-                raise TrajectoryError(
-                    "is no point",
-                    field=f"points[{index}]",
-                    value=point,
-                    hint=f"give ({', '.join(_FIELDS)})",
-                )
+    for index, point in enumerate(points):
+        if not isinstance(point, tuple | list) or len(point) != len(_FIELDS):
+            hint = f"give ({', '.join(_FIELDS)})"
+            raise TrajectoryError("is no point", field=f"points[{index}]", value=point, hint=hint)
     return [[point[i] for point in points] for i in range(len(_FIELDS))]
 
 
 def _stamp(stamp_ns):
     """Return the stamp as an int within the range of a ROS time [ns]."""
-    field, hint = "header.stamp", "give integer nanoseconds, 0 for now"
+    rest = {
+        "field": "header.stamp",
+        "value": stamp_ns,
+        "hint": "give integer nanoseconds, 0 for now",
+    }
     try:
         stamp_ns = operator.index(stamp_ns)
     except TypeError:
-        raise TrajectoryError("is no integer", field=field, value=stamp_ns, hint=hint) from None
+        raise TrajectoryError("is no integer", **rest) from None
     if not 0 <= stamp_ns <= _MAX_NS:
-        limit = f"0 to {_MAX_NS} ns"
-        raise TrajectoryError(
-            "is out of range", field=field, value=stamp_ns, limit=limit, hint=hint
-        )
+        raise TrajectoryError("is out of range", limit=f"0 to {_MAX_NS} ns", **rest)
     return stamp_ns
 
 
@@ -312,16 +308,6 @@ def _unreadable(name, column, convert, problem, hint=""):
         except NOT_NUMBERS:
             return TrajectoryError(problem, field=f"points[{index}].{name}", value=value, hint=hint)
     return TrajectoryError(problem, field=f"points[].{name}", hint="give lists of plain numbers")
-
-
-def _refuse_effort(column):
-    filled = np.flatnonzero(_lengths("effort", column))
-    if filled.size:
-        raise TrajectoryError(
-            "is not empty",
-            field=f"points[{int(filled[0])}].effort",
-            hint="leave it empty: the torque is computed from the motion",
-        )
 
 
 def _refuse_end_velocity(trajectory):

@@ -62,11 +62,6 @@ def load(text, model, start=None) -> JointTrajectoryData:
     model : ArmModel
     start : (n,) array_like, optional
         Where a written motion starts [rad]; zero if not given.
-
-    Raises
-    ------
-    FlexarmError
-        As `files.read` and `from_spec`.
     """
     if Path(text).suffix.lower() in files.SUFFIXES:
         return files.read(text, model.joint_names, *limits(model))
@@ -97,10 +92,9 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
         As the families raise it.
     """
     family, settings = parse(text)
-    settings, points = dict(settings), integer(settings.get("points", str(POINTS)), "points")
-    settings.pop("points", None)
     start = np.zeros(model.n_joints) if start is None else start
-    return sampled(motion(family, settings, model, start), model, points)
+    profile = motion(family, settings, model, start)
+    return sampled(profile, model, _number(int, settings, "points", POINTS))
 
 
 def sampled(profile, model, points=POINTS) -> JointTrajectoryData:
@@ -119,9 +113,8 @@ def limits(model):
 
 
 def parse(text):
-    """Split ``family:setting=value,...`` into the family and a dict of texts."""
+    """Split ``family:setting=value,...`` into the family and a dict of texts, which `motion` checks."""
     family, _, rest = text.strip().partition(":")
-    check_family(family)
     settings = {}
     for item in filter(None, (word.strip() for word in rest.split(","))):
         key, equals, value = (word.strip() for word in item.partition("="))
@@ -133,12 +126,11 @@ def parse(text):
         if key in settings:
             raise TrajectoryError("is given twice", field=family, value=key)
         settings[key] = value
-    check_settings(family, settings)
     return family, settings
 
 
-def check_family(family):
-    """Refuse an unknown family."""
+def _check(family, settings):
+    """Refuse an unknown family, settings that it does not have, and required ones that are missing."""
     if family not in FAMILIES:
         raise TrajectoryError(
             "is no family of motions",
@@ -147,10 +139,6 @@ def check_family(family):
             limit=", ".join(FAMILIES),
             hint=f"or give a file that ends in {', '.join(files.SUFFIXES)}",
         )
-
-
-def check_settings(family, settings):
-    """Refuse settings that a family does not have, and required ones that are missing."""
     known = (*FAMILIES[family], *_COMMON)
     for key in settings:
         if key not in known:
@@ -159,11 +147,8 @@ def check_settings(family, settings):
             )
     for key in REQUIRED.get(family, ()):
         if key not in settings:
-            raise TrajectoryError(
-                f"{key} is missing",
-                field=family,
-                hint=f"give {key}=x;y;z in the base frame [m]",
-            )
+            hint = f"give {key}=x;y;z in the base frame [m]"
+            raise TrajectoryError(f"{key} is missing", field=family, hint=hint)
 
 
 def needs_model(family, settings):
@@ -172,7 +157,7 @@ def needs_model(family, settings):
 
 
 def motion(family, settings, model, start):
-    """Return the motion of a family: a `Profile`, or what has its methods.
+    """Return the `Motion` of a family.
 
     Parameters
     ----------
@@ -191,18 +176,17 @@ def motion(family, settings, model, start):
     FlexarmError
         As the family raises it.
     """
-    check_family(family)
-    check_settings(family, settings)
+    _check(family, settings)
     start = np.asarray(start, float)
     if "from" in settings:
-        start = numbers(settings["from"], start.size, "from", "angles, one per joint")
-    duration = number(settings.get("duration", "2"), "duration")
-    make = {"line": _tip_path, "arc": _tip_path}.get(family, _point_to_point)
+        start = _numbers(settings["from"], start.size, "from", "angles, one per joint")
+    duration = _number(float, settings, "duration", 2.0)
+    make = _tip_path if family in ("line", "arc") else _point_to_point
     return make(family, settings, model, start, duration)
 
 
 def _point_to_point(family, settings, model, start, duration):
-    to = numbers(settings.get("to", repr(math.pi / 2)), start.size, "to", "angles, one per joint")
+    to = _numbers(settings.get("to", repr(math.pi / 2)), start.size, "to", "angles, one per joint")
     if family == "paper":
         profile = profiles.paper_profile(duration, to - start, start)
     elif family == "quintic":
@@ -211,24 +195,23 @@ def _point_to_point(family, settings, model, start, duration):
         profile = profiles.smooth(start, to, duration, _smoothness(settings))
     else:
         profile = _least_exciting(settings, model, start, to, duration)
-    shaper = shaper_of(settings, model, to)
+    shaper = _shaper(settings, model, to)
     return profile if shaper is None else shaper.apply(profile)
 
 
 def _least_exciting(settings, model, start, to, duration):
     from ..motions.least_exciting import least_exciting
 
-    bounds = {}
-    for key in ("torque-limit", "velocity-limit"):
-        if key in settings:
-            bounds[key.replace("-", "_")] = numbers(
-                settings[key], model.n_joints, key, "numbers, one per joint"
-            )
+    bounds = {
+        key.replace("-", "_"): _numbers(settings[key], start.size, key, "numbers, one per joint")
+        for key in ("torque-limit", "velocity-limit")
+        if key in settings
+    }
     return least_exciting(model, start, to, duration, **bounds).profile
 
 
 def _tip_path(family, settings, model, start, duration):
-    tip = numbers(settings["tip"], 3, "tip", "coordinates x;y;z", spread=False)
+    tip = _numbers(settings["tip"], 3, "tip", "coordinates x;y;z", spread=False)
 
     from ..motions import tip_paths
 
@@ -236,14 +219,14 @@ def _tip_path(family, settings, model, start, duration):
     if family == "line":
         path = tip_paths.line(model, start, tip, law)
     else:
-        via = numbers(settings["via"], 3, "via", "coordinates x;y;z", spread=False)
+        via = _numbers(settings["via"], 3, "via", "coordinates x;y;z", spread=False)
         path = tip_paths.arc(model, start, via, tip, law)
     # The law is shaped, not the joints: the tip stays on its path.
-    shaper = shaper_of(settings, model, path.position(path.duration))
+    shaper = _shaper(settings, model, path.position(path.duration))
     return path if shaper is None else path.with_law(shaper.apply(law))
 
 
-def shaper_of(settings, model, end):
+def _shaper(settings, model, end):
     """Return the shaper that the settings ask for, for the modes where the motion ends, or None."""
     if "shaper" not in settings:
         if "shape-modes" in settings:
@@ -253,27 +236,21 @@ def shaper_of(settings, model, end):
                 hint=f"give shaper={' or shaper='.join(shapers.SHAPERS)} too",
             )
         return None
-    modes = min(SHAPE_MODES, model.n_modes)
-    if "shape-modes" in settings:
-        modes = integer(settings["shape-modes"], "shape-modes")
+    modes = _number(int, settings, "shape-modes", min(SHAPE_MODES, model.n_modes))
     return shapers.for_arm(model, end, settings["shaper"], modes)
 
 
 def _smoothness(settings):
-    return integer(settings.get("smoothness", str(TIP_SMOOTHNESS)), "smoothness")
+    return _number(int, settings, "smoothness", TIP_SMOOTHNESS)
 
 
-def number(text, name):
-    """Read a number."""
-    return _read(float, text, name, "is not a number")
+def _number(kind, settings, key, default):
+    """Read an int or a float."""
+    problem = "is not a number" if kind is float else "is no integer"
+    return _read(kind, settings.get(key, default), key, problem)
 
 
-def integer(text, name):
-    """Read an integer."""
-    return _read(int, text, name, "is no integer")
-
-
-def numbers(text, count, name, what, spread=True):
+def _numbers(text, count, name, what, spread=True):
     """Read so many finite numbers, (count,); with `spread` one number stands for all."""
     hint = f"give {count} finite {what}, separated by semicolons"
     words = text.split(";")
