@@ -1,26 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of fast laws."""
 
-from abc import ABC, abstractmethod
-
 import numpy as np
 
 from ..component import Law
 
 
-class FastLaw(Law, ABC):
+class FastLaw(Law):
     """Fast control u_fast of (12) and (15), designed on the boundary layer (11).
 
     Registered by name in the entry-point group ``flexarm.fast_laws``; its parameters are ``fast.<name>`` in the
     controller node. Riccati equations are solved in the constructor; `torque` runs on the control path. u_fast is zero
     where z_f is: the constraint of (12).
 
-    Parameters
+    Attributes
     ----------
-    model : ArmModel
-        The arm.
-    parameters : dict
-        Checked values of `PARAMETERS`, arrays at full length.
+    K_f : ndarray, shape (n, 2m)
+        Feedback gain of (15), u_fast = K_f z_f [N m/m, N m s/m]. A law whose gain depends on q overrides `gain`, one
+        with states of its own `torque`.
     """
 
     #: False for a law that uses the amplitudes alone: it runs without an observer.
@@ -31,7 +28,6 @@ class FastLaw(Law, ABC):
         """Joint configuration that the law is made for, shape (n,) [rad]: the full-order loop is checked there."""
         return np.array(self.parameters.get("configuration", np.zeros(self.model.n_joints)))
 
-    @abstractmethod
     def torque(self, z_f, q):
         """Fast torque.
 
@@ -47,12 +43,10 @@ class FastLaw(Law, ABC):
         ndarray, shape (n,)
             [N m]
         """
+        return self.gain(q) @ z_f
 
     def gain(self, q):
-        """Feedback gain K_f of (15) in configuration q, u_fast = K_f z_f, shape (n, 2m): for analysis.
-
-        None for a law with states of its own, which has `state_space` instead.
-        """
+        """K_f in configuration q; None for a law with states of its own, which has `state_space` instead."""
         return self.K_f
 
     def state_space(self, dt):

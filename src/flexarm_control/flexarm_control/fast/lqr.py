@@ -46,21 +46,12 @@ CONFIGURATION = parameter("configuration", [0.0], "rad", -100.0, 100.0, length="
 
 @dataclass(frozen=True)
 class Regulator:
-    """Boundary layer (11) in one joint configuration and its optimal gain.
+    """Boundary layer (11) in one joint configuration and its optimal gain."""
 
-    Attributes
-    ----------
-    A2, B2 : ndarray, shape (2m, 2m), (2m, n)
-    V : ndarray, shape (2m, 2m)
-        Solution of (20).
-    K_f : ndarray, shape (n, 2m)
-        u_f = K_f z_f.
-    """
-
-    A2: np.ndarray
-    B2: np.ndarray
-    V: np.ndarray
-    K_f: np.ndarray
+    A2: np.ndarray  # (2m, 2m)
+    B2: np.ndarray  # (2m, n)
+    V: np.ndarray  # (2m, 2m), solution of (20)
+    K_f: np.ndarray  # (n, 2m)
 
 
 def regulator(model, q, parameters):
@@ -111,7 +102,7 @@ def regulator(model, q, parameters):
 
 def _solve(shifted, B2, q, parameters):
     """K_f and V of (20) for A2 + alpha I."""
-    # Takes most of a second to import: only who designs this law waits for it.
+    # The import takes most of a second: only a design of this law waits for it.
     import control
 
     try:
@@ -145,14 +136,5 @@ class Lqr(FastLaw):
 
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
-        design = regulator(model, np.array(self.parameters["configuration"]), self.parameters)
-        self.A2, self.B2, self.V = design.A2, design.B2, design.V
-        self._K_f = design.K_f
-
-    def torque(self, z_f, q):
-        return self._K_f @ z_f
-
-    @property
-    def K_f(self):
-        """Gain of (15), shape (n, 2m) [N m/m, N m s/m]."""
-        return self._K_f
+        design = regulator(model, self.configuration, self.parameters)
+        self.A2, self.B2, self.V, self.K_f = design.A2, design.B2, design.V, design.K_f

@@ -12,11 +12,7 @@ class NoFastLaw(FastLaw):
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
         self._zero = np.zeros(model.n_joints)
+        self.K_f = np.zeros((model.n_joints, 2 * model.n_modes))
 
     def torque(self, z_f, q):
         return self._zero
-
-    @property
-    def K_f(self):
-        """Zeros, shape (n, 2m)."""
-        return np.zeros((self.model.n_joints, 2 * self.model.n_modes))

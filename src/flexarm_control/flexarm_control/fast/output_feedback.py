@@ -11,16 +11,15 @@ The law predicts over the time since the last sample and corrects by the amplitu
     \hat z^-_k = \Phi \hat z_{k-1} + \Gamma u_{k-1}, \qquad
     \hat z_k = \hat z^-_k + L\,(y_k - C\hat z^-_k), \qquad u_k = K_f \hat z_k,
 
-with K_f of (19), (20), the gain of `lqr`. The rates are never looked at. With
-:math:`\rho = e^{-ph}` and the blocks of Phi,
+with K_f of (19), (20), the gain of `lqr`. The rates are not used. With :math:`\rho = e^{-ph}` and the blocks of Phi,
 
 .. math::
     L = \begin{bmatrix} (1-\rho^2)\,I \\
         (1-\rho)\,(\Phi_{22}\Phi_{12}^{-1} - \rho\,\Phi_{12}^{-1}\Phi_{11}) \end{bmatrix}
 
-places the poles of the error, :math:`e_k = (I - LC)\Phi e_{k-1}`, at rho times those of Phi: in continuous
-time each open fast pole moved to the left by p, its frequency kept. A soft mode is so observed by two poles
-near -p; a stiff one is only damped, which asks little of it. By the separation principle the closed loop has
+places the poles of the error, :math:`e_k = (I - LC)\Phi e_{k-1}`, at rho times those of Phi. In continuous time each
+open fast pole moves to the left by p and keeps its frequency. A soft mode is thus observed by two poles near -p; the
+error of a stiff mode is only damped, which takes little correction. By the separation principle the closed loop has
 these poles and those of Phi + Gamma K_f.
 
 Proof of L: eliminating the rates, amplitudes obey :math:`y_{k+2} = a_1 y_{k+1} + a_0 y_k` with
@@ -28,8 +27,8 @@ Proof of L: eliminating the rates, amplitudes obey :math:`y_{k+2} = a_1 y_{k+1} 
 :math:`a_0 = \Phi_{12}\Phi_{21} - \Phi_{12}\Phi_{22}\Phi_{12}^{-1}\Phi_{11}`; their error with this L obeys
 :math:`e_{k+2} = \rho a_1 e_{k+1} + \rho^2 a_0 e_k`, the same with every pole times rho.
 
-Amplitudes that are half a period of the fastest mode apart do not tell its rate (Phi12 is singular): over a gap
-of more than 0.9 of that, as lost samples make it, the law predicts and does not correct.
+The rate of the fastest mode can't be computed from amplitudes that are half its period apart (Phi12 is singular). Over
+a gap of more than 0.9 of that time, after lost samples, the law predicts and does not correct.
 """
 
 import numpy as np
@@ -50,7 +49,7 @@ class OutputFeedback(FastLaw):
     K_f : ndarray, shape (n, 2m)
         Gain on the *estimated* deviation.
     predicted, estimate : ndarray, shape (2m,)
-        State before the present sample and corrected by it [m, rad, m/s, rad/s].
+        Deviation before and after the correction by the present sample [m, rad, m/s, rad/s].
     """
 
     PARAMETERS = (
@@ -68,16 +67,16 @@ class OutputFeedback(FastLaw):
 
     #: Designs are kept for this many different time steps; a new one takes about 0.1 ms.
     KEPT = 64
-    #: Part of half a period of the fastest mode, beyond which amplitudes do not correct.
+    #: Longest time step that allows a correction, over half a period of the fastest mode.
     MAX_PART = 0.9
-    #: After so many samples in a row without a correction the law gives up.
+    #: After this many samples in a row without a correction the law fails.
     BLIND = 20
 
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
-        q = np.array(self.parameters["configuration"])
-        self._design = regulator(model, q, self.parameters)
-        self.A2, self.B2, self._K_f = self._design.A2, self._design.B2, self._design.K_f
+        q = self.configuration
+        design = regulator(model, q, self.parameters)
+        self.A2, self.B2, self.K_f = design.A2, design.B2, design.K_f
         m = model.n_modes
         poles, vectors = np.linalg.eig(self.A2) if m else (np.zeros(1), np.zeros((0, 1)))
         self._longest = self.MAX_PART * np.pi / max(poles.imag.max(), 1e-300)
@@ -88,13 +87,13 @@ class OutputFeedback(FastLaw):
         self.reset()
 
     def _check_period(self, q):
-        """Refuse a period that the regulator, designed in continuous time and held in discrete, is not stable with."""
+        """Refuse a period with which the regulator, designed in continuous time, is unstable when sampled."""
         period = self.parameters["period"]
         Phi, Gamma, _ = self._step(period)
         self._refuse_long(period)
-        poles = np.linalg.eigvals(Phi + Gamma @ self._K_f)
+        poles = np.linalg.eigvals(Phi + Gamma @ self.K_f)
         if poles.size and not np.abs(poles).max() < 1.0:
-            fastest = np.abs(np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)).max()
+            fastest = np.abs(np.linalg.eigvals(self.A2 + self.B2 @ self.K_f)).max()
             raise DesignError(
                 f"at joint configuration {q.tolist()} closed fast poles of up to {fastest:.4g} rad/s are unstable in a"
                 f" loop sampled every {period:g} s (largest pole {np.abs(poles).max():.4g})",
@@ -153,16 +152,10 @@ class OutputFeedback(FastLaw):
         else:
             np.dot(self._L, z_f[:m] - self.predicted[:m], out=self.estimate)
             self.estimate += self.predicted
-        self._u = self._K_f @ self.estimate
+        self._u = self.K_f @ self.estimate
         return self._u
 
-    @property
-    def K_f(self):
-        """Gain on the law's own estimate, shape (n, 2m) [N m/m, N m s/m]."""
-        return self._K_f
-
     def gain(self, q):
-        """None: the law has states of its own, see `state_space`."""
         return None
 
     def state_space(self, dt):
@@ -171,26 +164,12 @@ class OutputFeedback(FastLaw):
         .. math::
             w' = (\Phi + \Gamma K_f)[(I - LC) w + L C z_f], \qquad u_f = K_f[(I - LC) w + L C z_f].
 
-        The law starts from w = (amplitudes of the first sample, 0).
-
-        Parameters
-        ----------
-        dt : float
-            Sampling period [s].
-
-        Returns
-        -------
-        A, B, C, D : ndarray, shapes (2m, 2m), (2m, 2m), (n, 2m), (n, 2m)
-            Columns of B and D for the rates are zero.
-
-        Raises
-        ------
-        DesignError
-            The period is too long for the fastest mode.
+        It starts from w = (amplitudes of the first sample, 0). The columns of B and D for the rates are zero. A period
+        `dt` that is too long for the fastest mode raises a `DesignError`.
         """
         self._refuse_long(dt)
         Phi, Gamma, L = self._step(dt)
         correct = np.hstack([L, np.zeros_like(L)])
         keep = np.eye(correct.shape[0]) - correct
-        closed = Phi + Gamma @ self._K_f
-        return closed @ keep, closed @ correct, self._K_f @ keep, self._K_f @ correct
+        closed = Phi + Gamma @ self.K_f
+        return closed @ keep, closed @ correct, self.K_f @ keep, self.K_f @ correct

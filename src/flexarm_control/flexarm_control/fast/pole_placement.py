@@ -56,9 +56,9 @@ class PolePlacement(FastLaw):
 
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
-        q = np.array(self.parameters["configuration"])
+        q = self.configuration
         self.A2, self.B2 = fast_subsystem(model.terms(q, np.zeros(model.n_joints)))
-        self._K_f = np.zeros((model.n_joints, 2 * model.n_modes))
+        self.K_f = np.zeros((model.n_joints, 2 * model.n_modes))
         self.frequencies, self.poles = np.zeros(0), np.zeros(0, complex)
         if model.n_modes:
             self._design(q)
@@ -75,8 +75,8 @@ class PolePlacement(FastLaw):
         self.poles = wanted.ravel()
         self._refuse_unreached(pairs[moved, 0], vectors[:, moved], q)
         for open_pair, closed_pair in zip(pairs[moved], wanted[moved], strict=True):
-            closed = self.A2 + self.B2 @ self._K_f
-            self._K_f += moving_gain(closed, self.B2, open_pair, np.poly(closed_pair).real)
+            closed = self.A2 + self.B2 @ self.K_f
+            self.K_f += moving_gain(closed, self.B2, open_pair, np.poly(closed_pair).real)
         self._refuse_missed(q)
 
     def _refuse_unreached(self, poles, vectors, q):
@@ -92,7 +92,7 @@ class PolePlacement(FastLaw):
                 )
 
     def _refuse_missed(self, q):
-        closed = np.linalg.eigvals(self.A2 + self.B2 @ self._K_f)
+        closed = np.linalg.eigvals(self.A2 + self.B2 @ self.K_f)
         distance = np.abs(self.poles[:, None] - closed) / np.abs(self.poles)[:, None]
         place = linear_sum_assignment(distance)
         i = int(np.argmax(distance[place]))
@@ -105,21 +105,9 @@ class PolePlacement(FastLaw):
                 " own",
             )
 
-    def torque(self, z_f, q):
-        return self._K_f @ z_f
-
-    @property
-    def K_f(self):
-        """Gain of (15), shape (n, 2m) [N m/m, N m s/m]."""
-        return self._K_f
-
 
 def modes_of(A2):
-    """Poles of (11) mode by mode, by ascending natural frequency.
-
-    Parameters
-    ----------
-    A2 : ndarray, shape (2m, 2m)
+    """Poles of A2 in (11), mode by mode, by ascending natural frequency.
 
     Returns
     -------
@@ -152,7 +140,7 @@ def moving_gain(A, B, pair, polynomial):
     Returns
     -------
     ndarray, shape (n, 2m)
-        u = K z.
+        K of u = K z.
     """
     poles, vectors = np.linalg.eig(A)
     left = np.linalg.inv(vectors)

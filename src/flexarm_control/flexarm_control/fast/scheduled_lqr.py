@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Optimal fast control, its gain scheduled over the workspace: the law of `lqr` as (11) changes with q.
 
-Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular
-grid of joint configurations and the gain is interpolated between them, on the control path, multilinearly:
+Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular grid of
+joint configurations. On the control path the gain is interpolated multilinearly between them:
 
 .. math::
     u_f = K_f(q)\,z_f, \qquad
     K_f(q) = \sum_{c} \Big[\prod_j w_{j}(c, q_j)\Big] K_c, \qquad w_j \in \{1-t_j,\; t_j\},
 
-over the 2^d corners c of the cell that holds q, t_j in [0, 1] the place in the cell. Joints that leave A2 and B2
-as they are (the first of a planar arm, the yaw of one on a column) have no place in the grid; they are found by
-evaluation. Beyond the ends the gain is that of the end; a joint without position limits turns through: it is
-brought back into +-pi.
+The sum runs over the 2^d corners c of the cell that contains q; t_j in [0, 1] is the place of q_j in the cell. Joints
+that do not change A2 and B2 are not in the grid: the first joint of a planar arm, the yaw of an arm on a column. They
+are found by evaluating (11). Beyond an end of the grid the gain is that of the end. The angle of a joint without
+position limits is first brought into +-pi.
 
-The closed boundary layer A2(q) + B2(q) K_f(q) is checked where interpolation errs most, in the middle of every
-cell, and at random: with every pole left of -alpha/2 the design stands. This is frozen q: (11) is a boundary layer
-because q changes slowly beside it.
+The closed boundary layer A2(q) + B2(q) K_f(q) is checked in the middle of every cell, where the interpolation error is
+largest, and at random configurations. Every pole must lie left of -alpha/2. The check takes q as constant: it changes
+slowly beside the fast states of (11).
 """
 
 import itertools
@@ -42,7 +42,7 @@ class GainTable:
     points : int
         Points per joint.
     turns : ndarray of bool, shape (d,)
-        Joints that turn through: brought into +-pi first.
+        Joints without position limits: their angle is brought into +-pi first.
     matrices : ndarray, shape (points**d, rows, columns)
     """
 
@@ -87,6 +87,8 @@ class ScheduledLqr(FastLaw):
         Joint configurations of the grid [rad]; the other joints in the middle of their range.
     gains : ndarray, shape (N, n, 2m)
         K_f at the nodes.
+    K_f : ndarray, shape (n, 2m)
+        Gain in the middle of the range.
     low, high : ndarray, shape (n,)
         Range of every joint [rad].
     """
@@ -104,11 +106,11 @@ class ScheduledLqr(FastLaw):
         ),
     )
 
-    #: Most designs: some minutes of Riccati equations for an arm of ten modes.
+    #: This many designs take some minutes for an arm of ten modes.
     MAX_DESIGNS = 20000
-    #: At most as many random configurations are checked beside the middles of the cells.
+    #: At most this many random configurations are checked beside the middles of the cells.
     CHECKED = 1000
-    #: Relative change of A2 or B2 below which a joint is taken not to matter.
+    #: Relative change of A2 or B2 below which a joint does not matter.
     NEGLIGIBLE = 1e-9
 
     def __init__(self, model, parameters):
@@ -122,7 +124,7 @@ class ScheduledLqr(FastLaw):
         s = self.scheduled
         self._table = GainTable(s, self.low[s], self.high[s], grid, self._turns[s], self.gains)
         self._check(grid)
-        self._K_f = self._table(self.configuration)
+        self.K_f = self.gain(self.configuration)
 
     def _set_range(self):
         """Range of each joint, from the parameters or from the arm file's limits."""
@@ -185,7 +187,7 @@ class ScheduledLqr(FastLaw):
         return out
 
     def _check(self, grid):
-        """Poles between the nodes; raises where one is too slow."""
+        """Refuse a table that leaves a pole too slow between the nodes."""
         if not self.scheduled.size:
             return
         middles = self._grid((np.arange(grid - 1) + 0.5) / (grid - 1))
@@ -211,13 +213,5 @@ class ScheduledLqr(FastLaw):
         """In the middle of the range."""
         return 0.5 * (self.low + self.high)
 
-    def torque(self, z_f, q):
-        return self._table(q) @ z_f
-
     def gain(self, q):
         return self._table(q)
-
-    @property
-    def K_f(self):
-        """Gain in the middle of the range, shape (n, 2m); `gain` has the others."""
-        return self._K_f
