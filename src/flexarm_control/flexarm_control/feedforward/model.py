@@ -2,26 +2,26 @@
 r"""Feed-forward from a model that runs along: the nominal arm, simulated under a regulator of its own.
 
 The slow manifold along the reference, :math:`s_{ref} = (q_{ref}, \bar\delta, \dot q_{ref}, \dot{\bar\delta})` with
-its torque u_ref, would be a motion of the arm if it never jumped and its expansion in mu did not end. Both
-it does: the rates of the deflections jump wherever the reference's jerk does, and a fast control that pulls the
-real arm over such a jump kicks the joints, which return no faster than the slow poles. So the nominal arm
-is simulated here instead, with the control model, under
+its torque u_ref, is not quite a motion of the arm: its expansion in mu is cut off, and the rates of the deflections
+jump wherever the reference's jerk does. A fast control that pulls the real arm over such a jump kicks the joints, and
+they return no faster than the slow poles. Therefore the nominal arm is simulated here, with the control model, under
 
 .. math:: u_s = u_{ref} + K_s\,(s_{ref} - s),
 
 where K_s is the optimal regulator of the *whole* arm, joints and bending, with prescribed degree of stability.
-Nothing but the reference acts on it: neither noise, nor delay, nor an unknown payload limits its gains, and it
-brings joints and bending to the reference in about a period of the slowest mode. (s, u_s) is a motion of the nominal
-arm, sample by sample, within its torque limits; the composite control holds the real arm to it with the gains that
-the real arm allows.
+Only the reference acts on the simulated arm, so that neither noise nor delay nor an unknown payload limits the gains.
+The regulator brings joints and bending to the reference in about a period of the slowest mode. (s, u_s) is a motion of
+the nominal arm, sample by sample, within its torque limits; the composite control holds the real arm to it with the
+gains that the real arm allows.
 
 The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the joint errors e alone, with
-:math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`, omega_1 the lowest bending
-frequency with the joints locked: the joints are held about as stiffly as the softest mode is, which is what that mode
-can still follow. Where the arm's inertia changes with its joints, the gain is designed along each trajectory, at its
-receipt, and interpolated; a trajectory that comes while the arm moves is then followed on the slow manifold alone.
+:math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`. omega_1 is the lowest bending
+frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. If the arm's
+inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated. A
+trajectory that arrives while the arm moves is then followed on the slow manifold alone.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -39,32 +39,20 @@ from .base import Feedforward
 
 #: Prescribed degree of stability of the regulator, over the lowest bending frequency.
 DECAY = 0.3
-#: Beyond this joint error the simulated arm begins anew on the reference [rad].
+#: Beyond this joint error the simulated arm starts again on the reference [rad].
 LOST = 1.0
-#: Between two designs along a trajectory no joint turns farther [rad].
+#: Largest turn of a joint between two designs along a trajectory [rad].
 APART = 0.12
 #: Relative change of the plant with the joints below which one gain serves everywhere.
 NEGLIGIBLE = 1e-6
-#: At rest, and this close to it in every coordinate, the simulated arm is taken to be there.
+#: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
 SAME_START = 1e-6
 
 
 def regulator(model, q):
-    """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module.
-
-    Parameters
-    ----------
-    model : ArmModel
-    q : ndarray, shape (n,)
-        [rad]
-
-    Raises
-    ------
-    DesignError
-        When the Riccati equation has no stabilising solution.
-    """
+    """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module."""
     n = model.n_joints
     omega = float(model.frequencies(q, locked=True)[0]) if model.n_modes else 10.0
     A, B = linear_plant(model, q, coulomb=False)
@@ -106,50 +94,38 @@ class Gains:
         return (1.0 - f) * self.gains[i] + f * self.gains[i + 1]
 
 
+@dataclass(eq=False)
 class Preparation:
     """What was designed for one trajectory.
 
     Attributes
     ----------
-    trajectory_id : int
-        0 until it is accepted.
     start : ndarray, shape (3, n)
         State of the reference that it begins from.
     gains : Gains or None
-    plan : object or None
-        A motion with ``at(elapsed)`` and `duration`, of a feed-forward that plans.
+    plan : preview.Plan or None
+        A motion, from a feed-forward that plans.
+    trajectory_id : int
+        0 until it is accepted.
     """
 
-    def __init__(self, start, gains, plan=None):
-        self.trajectory_id, self.start, self.gains, self.plan = 0, start, gains, plan
+    start: np.ndarray
+    gains: Gains | None
+    plan: object = None
+    trajectory_id: int = 0
 
 
 def path_of(trajectory, start):
-    """The path of a trajectory from a state of rest.
-
-    `start` has position, velocity and acceleration of the reference, (3, n).
-
-    Raises
-    ------
-    DesignError
-        When it does not begin at rest.
-    """
+    """The path of a trajectory from the reference's state `start`, (3, n), which must be at rest."""
     if np.abs(start[1:]).max() > SAME_START:
         raise DesignError("the motion does not begin at rest", field="feedforward")
-    fields = (trajectory.positions, trajectory.velocities, trajectory.accelerations)
-    path = Path(trajectory.times_ns, [values for values in fields if values is not None], 1)
+    path = Path(trajectory.times_ns, trajectory.fields, 1)
     path.begin(0, start)
     return path
 
 
 def gains_along(model, path, period):
-    """Regulators along a path, checked in the middle between each two.
-
-    Raises
-    ------
-    DesignError
-        When one is impossible, or does not hold where it is interpolated.
-    """
+    """Regulators along a path for samples of a `period` [s]; each interpolation is checked in its middle."""
     n, state = model.n_joints, np.zeros((3, model.n_joints))
     grid = np.linspace(0.0, path.duration_ns / SECOND, 400)
     q = np.empty((grid.size, n))
@@ -174,7 +150,7 @@ def gains_along(model, path, period):
 
 
 class _Ahead:
-    """The reference at a coming stamp, and what was worked out for it; the reference itself is left alone."""
+    """The reference at a coming stamp and the result for it; the reference itself does not change."""
 
     def __init__(self, reference, dt, limit):
         self.path, self.dt, self.limit = reference.path, dt, limit
@@ -192,12 +168,8 @@ class _Ahead:
     def foresaw(self, reference, dt):
         """Whether this is the sample that has come."""
         path = reference.path
-        return (path, path and path.start_ns, reference.stamp_ns, dt) == (
-            self.path,
-            self.start_ns,
-            self.stamp_ns,
-            self.dt,
-        )
+        now = (path, path and path.start_ns, reference.stamp_ns, dt)
+        return now == (self.path, self.start_ns, self.stamp_ns, self.dt)
 
 
 class ModelFeedforward(Feedforward):
@@ -210,11 +182,11 @@ class ModelFeedforward(Feedforward):
         self._substeps = substeps(model, settings.period, "rk4")
         self.state, self._error = np.zeros(2 * (n + m)), np.zeros(2 * (n + m))
         self._name_parts()
-        #: The gain that serves everywhere; None where it depends on the joints.
+        #: The gain, if it does not depend on the joints; else None.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
         self._prepared, self._first = None, True
-        self._ahead = None  # what `look_ahead` has done
-        self._held = None  # position, and what `wanted` made of it, while the reference rests
+        self._ahead = None  # the result of `look_ahead`
+        self._held = None  # position, and the result of `wanted` there, while the reference rests
 
     def _make_stepper(self):
         n, m = self.model.n_joints, self.model.n_modes
@@ -255,12 +227,12 @@ class ModelFeedforward(Feedforward):
 
     def prepare(self, trajectory, start):
         # A model of its own: the loop goes on with this one meanwhile.
-        model = build(self.model.arm)
-        return Preparation(start, gains_along(model, path_of(trajectory, start), self._period))
+        model, path = build(self.model.arm), path_of(trajectory, start)
+        gains = None if self.K is not None else gains_along(model, path, self.settings.period)
+        return Preparation(start, gains, self._plan(model, path, start))
 
-    @property
-    def _period(self):
-        return self.settings.period
+    def _plan(self, model, path, start):
+        """A `Plan` that is followed in place of the slow manifold, if any."""
 
     def take(self, plan, trajectory_id):
         if plan is not None:
@@ -277,7 +249,7 @@ class ModelFeedforward(Feedforward):
             self._ahead = None
 
     def _preparation(self, reference):
-        """What was designed for the trajectory that is followed, and the time since its start; or None."""
+        """What was designed for the active trajectory, and the time since its start; None, 0 without."""
         prepared, path = self._prepared, reference.path
         if prepared is None or path is None or path.trajectory_id != prepared.trajectory_id:
             return None, 0.0
@@ -287,14 +259,12 @@ class ModelFeedforward(Feedforward):
 
     def wanted(self, reference, prepared, elapsed):
         """State (2 (n + m),) and torque (n,) that the regulator holds the simulated arm to."""
-        if reference.velocity.any() or reference.acceleration.any():
-            self._held = None
-        elif self._held is not None and np.array_equal(self._held[0], reference.position):
+        rests = not (reference.velocity.any() or reference.acceleration.any())
+        if rests and self._held is not None and np.array_equal(self._held[0], reference.position):
             return self._held[1:]
         delta, rate, torque = self.manifold.along(reference)
         state = np.concatenate([reference.position, delta, reference.velocity, rate])
-        if not (reference.velocity.any() or reference.acceleration.any()):
-            self._held = reference.position.copy(), state, torque
+        self._held = (reference.position.copy(), state, torque) if rests else None
         return state, torque
 
     def update(self, reference, dt):
@@ -303,20 +273,20 @@ class ModelFeedforward(Feedforward):
             self.state[:], self.torque[:] = ahead.state, ahead.torque
             self.acceleration[:] = ahead.acceleration
             return
-        if not self._first and dt > 0.0:  # the torque of the last sample has acted since
+        if not self._first and dt > 0.0:  # under the torque of the last sample
             self._move(self.state, dt)
         self._regulate(reference, self.state, self.torque)
         self.acceleration[:] = reference.acceleration
 
     def _regulate(self, reference, state, torque):
-        """The torque for a state of the simulated arm, which is put where it is wanted if it begins anew; in place."""
+        """Set the torque for a state of the simulated arm, both in place; the state, too, if the arm starts again."""
         prepared, elapsed = self._preparation(reference)
         wanted, nominal = self.wanted(reference, prepared, elapsed)
         K = self.K
         if K is None and prepared is not None and prepared.gains is not None:
             K = prepared.gains.at(elapsed)
         np.subtract(wanted, state, out=self._error)
-        if self._begins_anew(reference, K):
+        if self._starts_again(reference, K):
             state[:] = wanted
             self._error[:] = 0.0
         np.copyto(torque, nominal)
@@ -326,7 +296,7 @@ class ModelFeedforward(Feedforward):
 
     def _move(self, state, dt):
         """Advance a state of the simulated arm in place, under the present torque."""
-        count = max(1, round(dt / self._period)) * self._substeps
+        count = max(1, round(dt / self.settings.period)) * self._substeps
         self._advance(state, self.torque, dt / count, count)
 
     def look_ahead(self, reference, dt):
@@ -340,8 +310,8 @@ class ModelFeedforward(Feedforward):
         n, size = self.model.n_joints, ahead.state.size // 2
         return ahead.state[:n], ahead.state[size : size + n], ahead.acceleration
 
-    def _begins_anew(self, reference, K):
-        """Whether the simulated arm is put where it is wanted."""
+    def _starts_again(self, reference, K):
+        """Whether the simulated arm is put on the wanted state: at first, when lost, and at rest when it is there."""
         n, first = self.model.n_joints, self._first
         self._first = False
         if first or K is None or not np.abs(self._error[:n]).max() < LOST:  # NaN is lost, too

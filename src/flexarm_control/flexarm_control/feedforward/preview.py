@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Feed-forward with preview: a motion that bends the arm and leaves it straight at its end.
 
-When a whole trajectory is known at its receipt, the joints need not follow it to the last millidegree: a small
-shift p of the reference, zero with its rates at either end, can be chosen such that the bending which
-:math:`\ddot q = \ddot q_{ref} + \ddot p` makes ends at rest with the trajectory. With :math:`p = \sum_j c_j N_j(t)`
+A trajectory is known as a whole when it is received, and the joints need not follow it exactly. A small shift p of the
+reference, zero with its rates at both ends, is chosen so that the bending under
+:math:`\ddot q = \ddot q_{ref} + \ddot p` is at rest when the trajectory ends. With :math:`p = \sum_j c_j N_j(t)`
 (quintic B-splines) the modal rows of (2) along the reference,
 
 .. math:: M_{22}\ddot\delta + C_2\dot\delta + K_2\delta = -M_{21}(\ddot q_{ref} + \ddot p) - f_2,
 
-are linear in c to first order, so that the shift of least mean square which does it,
+are linear in c to first order. The shift of least mean square,
 
 .. math::
     \min_c \int |p|^2 + \epsilon\,|\ddot p|^2/\omega_1^4\,dt \quad\text{s.t.}\quad
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
-is one linear system; where its torque is beyond the limit, a linear programme (HiGHS through scipy) finds the
-smallest largest shift within it. All of this is done at receipt, off the control path. What the linearisation neglects
-is integrated with the full equations and taken in by solving again. The motion then serves `model` in the place of
-the slow manifold: the nominal arm that runs along takes up what is left.
+solves one linear system. If its torque exceeds the limit, a linear programme (HiGHS through scipy) finds the shift with
+the smallest maximum within the limit. The full equations are then integrated along the solution, linearised there, and
+solved again. All of this happens when the trajectory is received, off the control path. `model` follows the motion in
+place of the slow manifold: the regulator of its simulated arm removes the remaining error.
 """
 
 from dataclasses import dataclass
@@ -28,30 +28,27 @@ from scipy.linalg import eigh
 from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.models.model import build
 
 from ..trajectory.values import SECOND
-from .model import ModelFeedforward, Preparation, gains_along, path_of
+from .model import ModelFeedforward
 
-#: Longest time between two knots of the shift, over the period of the lowest bending mode.
+#: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
-#: At least and at most so many free coefficients per joint.
+#: Least and largest number of free coefficients per joint.
 MIN_COUNT, MAX_COUNT = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
 #: Rounds of linearisation.
 ROUNDS = 4
-#: Shift and torque are bounded at so many times.
+#: Number of times at which shift and torque are bounded.
 GRID = 100
-#: The equations are linearised at so many times.
-KNOTS = 80
-#: Step of the differences by which they are [rad], [rad/s].
-SMALL = 1e-6
+#: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s].
+KNOTS, SMALL = 80, 1e-6
 #: Weight of the shift's acceleration, over the square of the lowest bending frequency, beside the shift.
 SMOOTHNESS = 0.01
 #: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin [rad].
 STABLE = 1.5
-#: Longest grid step over the period of the fastest mode that is brought to rest.
+#: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A longer motion is not planned [samples].
 MAX_STEPS = 20_000
@@ -94,30 +91,16 @@ class Preview(ModelFeedforward):
 
     plans = True
 
-    def prepare(self, trajectory, start):
-        """Plan the motion of a trajectory; off the control path.
-
-        `start` as in the class above.
-
-        Raises
-        ------
-        DesignError
-            When the trajectory does not go from rest to rest, is too long, or can't be done within the torque limit.
-        """
-        # A model of its own: the loop goes on with this one meanwhile.
-        model = build(self.model.arm)
-        path = path_of(trajectory, start)
-        gains = None if self.K is not None else gains_along(model, path, self._period)
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is checked
-            plan = _Planner(model, path, start, self.limit).solve()
-        return Preparation(start, gains, plan)
+    def _plan(self, model, path, start):
+        with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
+            return _Planner(model, path, start, self.limit).solve()
 
     def wanted(self, reference, prepared, elapsed):
         if prepared is None or not 0.0 <= elapsed < prepared.plan.duration:
             return super().wanted(reference, prepared, elapsed)
         # The torque is held over the coming period: that of its middle.
         plan = prepared.plan
-        return plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self._period)
+        return plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
 
 
 def _finite(*arrays):
@@ -190,37 +173,43 @@ class _Planner:
         )
 
     def _bend(self):
-        """Deflection, its derivatives and joint torque at whole steps of the motion, products of deflections included.
-
-        Returns
-        -------
-        bending : ndarray, shape (steps + 1, 3, m)
-        torque : ndarray, shape (steps + 1, n)
-        """
-        n, m, h = self.model.n_joints, self.model.n_modes, self.h
-        out, torque = np.zeros((self.steps + 1, 3, m)), np.zeros((self.steps + 1, n))
-        out[0, 0] = self.model.static_deflection(self.start[0])
+        """Bending (steps + 1, 3, m) and joint torque (steps + 1, n) of the motion, products of deflections included."""
+        torque = np.zeros((self.steps + 1, self.model.n_joints))
 
         def acceleration(k, x, v):
-            return self._bending(*self.motion[k], x, v)
+            a, u = self._bending(*self.motion[k], x, v)
+            if (
+                k % 2 == 0
+            ):  # a whole step; its own first stage replaces the last stage of the step before
+                torque[k // 2] = u
+            return a
 
+        start = self.model.static_deflection(self.start[0])
+        return self._integrated(acceleration, start), torque
+
+    def _integrated(self, acceleration, start):
+        """Deflection and its derivatives at whole steps, (steps + 1, 3, ...), by Runge-Kutta's method from rest.
+
+        `acceleration` takes the place in `times`, a deflection and its rate.
+        """
+        h, out = self.h, np.zeros((self.steps + 1, 3, *start.shape))
+        out[0, 0] = start
         for i in range(self.steps):
             x, v, k = out[i, 0], out[i, 1], 2 * i
-            a1, torque[i] = acceleration(k, x, v)
-            out[i, 2] = a1
+            a1 = out[i, 2] = acceleration(k, x, v)
             v2 = v + 0.5 * h * a1
-            a2, _ = acceleration(k + 1, x + 0.5 * h * v, v2)
+            a2 = acceleration(k + 1, x + 0.5 * h * v, v2)
             v3 = v + 0.5 * h * a2
-            a3, _ = acceleration(k + 1, x + 0.5 * h * v2, v3)
+            a3 = acceleration(k + 1, x + 0.5 * h * v2, v3)
             v4 = v + h * a3
-            a4, _ = acceleration(k + 2, x + h * v3, v4)
+            a4 = acceleration(k + 2, x + h * v3, v4)
             out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        out[-1, 2], torque[-1] = acceleration(-1, out[-1, 0], out[-1, 1])
-        return out, torque
+        out[-1, 2] = acceleration(2 * self.steps, out[-1, 0], out[-1, 1])
+        return out
 
     def _along(self, c):
-        """The reference shifted by c, and the equations of motion linearised along it."""
+        """Set the motion: the reference shifted by c."""
         self.motion = self.reference + np.einsum("dtj,nj->tdn", self.basis, c)
 
     def _linearise(self, bending):
@@ -276,37 +265,15 @@ class _Planner:
         return a, t.M[:n, :n] @ qdd + t.M[:n, n:] @ a + t.f1 + t.C1 @ v + t.K1 @ x
 
     def _respond(self):
-        """Linear response of the bending to each coefficient of the shift, at whole steps.
-
-        Returns
-        -------
-        ndarray, shape (steps + 1, 3, m, n count)
-            Deflection, rate and their second derivative; columns joint by joint.
-        """
+        """Linear response of the bending to each coefficient of the shift: (steps + 1, 3, m, n count)."""
         m, n, count = self.model.n_modes, self.model.n_joints, self.basis.shape[2]
         by = self.by_joints.reshape(-1, m, 3, n)
-        force = np.einsum("tmdn,dtj->tmnj", by, self.basis)
-        columns = n * count
-        force = force.reshape(-1, m, columns)
-        out = np.zeros((self.steps + 1, 3, m, columns))
-        K, D, h = self.spring, self.damper, self.h
+        force = np.einsum("tmdn,dtj->tmnj", by, self.basis).reshape(-1, m, n * count)
 
         def acceleration(k, x, v):
-            return K[k] @ x + D[k] @ v + force[k]
+            return self.spring[k] @ x + self.damper[k] @ v + force[k]
 
-        for i in range(self.steps):
-            x, v, k = out[i, 0], out[i, 1], 2 * i
-            a1 = out[i, 2] = acceleration(k, x, v)
-            v2 = v + 0.5 * h * a1
-            a2 = acceleration(k + 1, x + 0.5 * h * v, v2)
-            v3 = v + 0.5 * h * a2
-            a3 = acceleration(k + 1, x + 0.5 * h * v2, v3)
-            v4 = v + h * a3
-            a4 = acceleration(k + 2, x + h * v3, v4)
-            out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-            out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        out[-1, 2] = acceleration(-1, out[-1, 0], out[-1, 1])
-        return out
+        return self._integrated(acceleration, np.zeros((m, n * count)))
 
     def _torque(self, bending):
         """Joint torque that goes with `_respond`'s columns, at whole steps, (steps + 1, n, n count)."""
@@ -321,8 +288,7 @@ class _Planner:
         """Change of the shift's coefficients, (n, count)."""
         free, u = _finite(*self._bend())
         self._linearise(free)
-        forced = self._respond()
-        end = free[-1]
+        forced, end = self._respond(), free[-1]
         A = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
         b = -np.concatenate([self.modal @ (end[0] - self.rest), self.modal @ end[1]])
         # On one scale: deflections are thousandths.
