@@ -36,7 +36,7 @@ def add_arguments(parser):
         nargs="+",
         action="extend",
         metavar="NAME=VALUE",
-        help="parameters beyond the file's: slow.kp=[4.0] fast.alpha=4.0",
+        help="parameters beyond the file's: slow.kp=4 fast.alpha=4",
     )
     add("--rate", type=float, help="samples per second [Hz] (as in the file, or 1000)")
     add(

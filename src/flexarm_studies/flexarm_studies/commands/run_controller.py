@@ -57,7 +57,7 @@ def add_arguments(parser):
         nargs="+",
         action="extend",
         metavar="NAME=VALUE",
-        help="parameters beyond the file's: slow.type=sliding_mode fast.alpha=4.0",
+        help="parameters beyond the file's: slow.kp=9 fast.type=none",
     )
     add(
         "--payload-scale",

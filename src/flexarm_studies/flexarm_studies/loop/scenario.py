@@ -115,7 +115,8 @@ def parameters(file, settings=()):
         Parameter file of the nodes: shipped name or path. Each parameter is taken from the section of the node
         that it belongs to.
     settings : sequence of str
-        ``name=value`` each, the value as YAML, as `ros2 param set` takes it.
+        ``name=value`` each, the value as YAML, as `ros2 param set` takes it; for a float or an array of them also
+        plain numbers: ``slow.kp=9``, one for all joints, or ``slow.kp=9,4``.
 
     Returns
     -------
@@ -137,8 +138,8 @@ def parameters(file, settings=()):
     found = {k: v for k, v in found.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
     set_here = dict(map(_setting, settings))
     found |= set_here
-    for name in set_here:
-        _check_name(name, found)
+    for name, value in set_here.items():
+        found[name] = _as_declared(_parameter(name, found), value)
     return found
 
 
@@ -146,7 +147,7 @@ def _setting(text):
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise ParameterError(
-            "is no setting", value=text, hint="write name=value, such as slow.kp=[6.25]"
+            "is no setting", value=text, hint="write name=value, such as slow.kp=6.25"
         )
     try:
         return name.strip(), yaml.safe_load(value)
@@ -154,21 +155,32 @@ def _setting(text):
         raise ParameterError(f"is not YAML: {error}", field=name, value=value) from None
 
 
-def _check_name(name, values):
-    """Refuse a name that none of the chosen components has."""
+def _as_declared(parameter, value):
+    """A setting's value; plain numbers become the float or the list of floats that the parameter is."""
+    try:
+        if parameter.kind == "float" and not isinstance(value, bool):
+            return float(str(value))
+        if parameter.kind == "float_array" and not isinstance(value, (bool, list)):
+            return [float(word) for word in str(value).split(",")]
+    except ValueError:
+        pass  # to be refused where parameters are checked
+    return value
+
+
+def _parameter(name, values):
+    """The declaration of a parameter of the loop or of one of the chosen components, by its name in a file."""
     prefix = name.split(".")[0]
     if prefix in COMPONENTS:
-        known = ("type", *(p.name for p in declared(prefix, values)))
-        known = [f"{prefix}.{k}" for k in known]
-    else:
-        known = [p.name for p in (*CONTROLLER, *SIMULATOR_PARAMETERS)]
-        known = [k for k in known if k not in (*OF_NODES, *OF_SCENARIOS)]
-    if name in known:
-        return
-    if prefix in COMPONENTS:
+        known = {
+            f"{prefix}.{p.name}": p for p in (COMPONENTS[prefix].type, *declared(prefix, values))
+        }
         there, what = known, f" of {type_of(prefix, values)!r}"
     else:
+        known = {p.name: p for p in (*CONTROLLER, *SIMULATOR_PARAMETERS)}
+        known = {k: p for k, p in known.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
         there, what = [*known, *(f"{p}.…" for p in COMPONENTS)], ""
+    if name in known:
+        return known[name]
     close = difflib.get_close_matches(name, known, 1)
     hint = f"there are {', '.join(there)}" + (f"; did you mean {close[0]}?" if close else "")
     raise ParameterError(f"no such parameter{what}", field=name, hint=hint)
@@ -187,7 +199,7 @@ def loop_of(scenario):
     for name, value in values.items():
         if name.split(".")[0] in COMPONENTS:
             continue
-        _check_name(name, values)
+        _parameter(name, values)
         if name in {p.name for p in CONTROLLER}:
             controller[name] = value
         if name in {p.name for p in SIMULATOR_PARAMETERS}:  # `rate` is both nodes'
