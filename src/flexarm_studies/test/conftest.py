@@ -1,12 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A synthetic record for the tests of metrics and figures."""
+"""What several test files need: commands as typed, changed arm files, synthetic records."""
+
+import json
 
 import numpy as np
 import pytest
+import yaml
 
+from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
-from flexarm_studies.loop.metrics import Record
+from flexarm_studies.loop.metrics import SimulatedRecord
+
+
+@pytest.fixture
+def flexarm(capsys):
+    """Runs a command in this process: exit code, standard output, standard error."""
+
+    def run(*words):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([str(word) for word in words])
+        return stop.value.code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def result(flexarm):
+    """Runs a command that must succeed, with ``--json``: what it prints."""
+
+    def run(*words):
+        code, out, err = flexarm(*words, "--json")
+        assert code == 0, err
+        return json.loads(out)
+
+    return run
+
+
+@pytest.fixture
+def changed_arm(tmp_path):
+    """Writes a shipped arm file with something changed; its path."""
+
+    def write(name, change):
+        data = yaml.safe_load(arm_file.find(name).read_text())
+        change(data)
+        path = tmp_path / f"changed_{name}.yaml"
+        path.write_text(yaml.safe_dump(data))
+        return str(path)
+
+    return write
 
 
 @pytest.fixture(scope="session")
@@ -15,18 +57,26 @@ def arm_r():
     return model.build(arm_file.load("R"))
 
 
-@pytest.fixture
-def make_record():
-    """Makes a record of rest, 100 samples a second from -0.1 to 4 s; what is given replaces zeros."""
+#: Of the synthetic records: every 10 ms from -0.1 to 4 s.
+TIME = np.arange(-10, 401) * 0.01
 
-    def make(**changed):
-        time = np.arange(-10, 401) * 0.01
-        columns = dict.fromkeys(Record.__dataclass_fields__, 1)
-        columns |= dict.fromkeys(("amplitude", "rate", "quasi_steady"), 2)
-        arrays = {name: np.zeros((time.size, n)) for name, n in columns.items()}
-        arrays["time"] = time
-        for name, function in changed.items():
-            arrays[name] = np.array([np.atleast_1d(function(t)) for t in time], float)
-        return Record(**arrays)
+
+@pytest.fixture(scope="session")
+def make_record():
+    """Makes a record of an arm at rest; numbers or functions of time replace zeros."""
+
+    def make(arm_model, time=TIME, **given):
+        n, m = arm_model.n_joints, arm_model.n_modes
+        widths = dict.fromkeys(SimulatedRecord.__dataclass_fields__, n)
+        widths |= dict.fromkeys(("amplitude", "rate", "quasi_steady", "plant_amplitude"), m)
+        columns = {}
+        for name, width in widths.items():
+            value = given.get(name, 0.0)
+            rows = [np.ravel(value(t) if callable(value) else value) for t in time]
+            columns[name] = np.broadcast_to(np.array(rows, float), (time.size, width))
+        columns["time"] = time
+        for name in ("saturated", "state"):
+            columns[name] = columns[name][:, 0].astype(int)
+        return SimulatedRecord(**columns)
 
     return make

@@ -14,19 +14,11 @@ from flexarm_studies.case_study import figures
 pytestmark = pytest.mark.slow
 
 NAMES = [
-    "fig02_reference_velocity",
-    "fig03_joint_angle_error",
-    "fig04_joint_velocity_error",
-    "fig05_mode1_deflection",
-    "fig06_mode2_deflection",
-    "fig07_mode1_rate",
-    "fig08_mode2_rate",
-    "fig09_tip_position_error",
-    "fig10_tip_velocity_error",
-    "fig05b_quasi_steady_state",
-    "fig11_torques",
-    "overview",
-]
+    "fig02_reference_velocity", "fig03_joint_angle_error", "fig04_joint_velocity_error",
+    "fig05_mode1_deflection", "fig06_mode2_deflection", "fig07_mode1_rate", "fig08_mode2_rate",
+    "fig09_tip_position_error", "fig10_tip_velocity_error", "fig05b_quasi_steady_state",
+    "fig11_torques", "overview",
+]  # fmt: skip
 UNITS = {
     "fig02": "[deg/s]", "fig03": "[deg]", "fig04": "[deg/s]", "fig05": "[ft]", "fig06": "[ft]",
     "fig07": "[ft/s]", "fig08": "[ft/s]", "fig09": "[ft]", "fig10": "[ft/s]", "fig11": "[lbf ft]",
@@ -34,8 +26,11 @@ UNITS = {
 }  # fmt: skip
 
 
-def swinging(make_record, size):
-    return make_record(
+@pytest.fixture(scope="session")
+def swinging(arm_r, make_record):
+    """Makes a record of an arm that swings by `size`."""
+    return lambda size: make_record(
+        arm_r,
         reference=lambda t: 1.0,
         position=lambda t: 1.0 - np.radians(size) * np.cos(t),
         velocity=lambda t: np.radians(10.0 * size),
@@ -54,54 +49,29 @@ def directory(tmp_path_factory):
     return tmp_path_factory.mktemp("figures") / "R_m11"
 
 
-@pytest.fixture(scope="module")
-def drawn(request, directory):
-    """File names that were made, and what every axis held: by figure, then axis."""
-    from flexarm_dynamics.arm import arm_file
-    from flexarm_dynamics.models import model
+def content(axis):
+    lines = {line.get_label(): line.get_xydata() for line in axis.get_lines()}
+    return {
+        "title": axis.get_title(),
+        "x": axis.get_xlabel(),
+        "y": axis.get_ylabel(),
+        "lines": lines,
+    }
 
-    make = request.getfixturevalue("module_record")
-    held = []
+
+@pytest.fixture(scope="module")
+def drawn(swinging, arm_r, directory):
+    """File names that were made, and what every axis held: by figure, then axis."""
+    held, close = [], plt.close
 
     def remember(figure):
-        held.append(
-            [
-                {
-                    "title": a.get_title(),
-                    "x": a.get_xlabel(),
-                    "y": a.get_ylabel(),
-                    "lines": {l.get_label(): l.get_xydata() for l in a.get_lines()},  # noqa: E741
-                }
-                for a in figure.axes
-            ]
-        )
+        held.append([content(axis) for axis in figure.axes])
         close(figure)
 
-    close, plt.close = plt.close, remember
-    try:
-        made = figures.draw(
-            directory, "arm R", make(2.0), make(1.0), model.build(arm_file.load("R"))
-        )
-    finally:
-        plt.close = close
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(plt, "close", remember)
+        made = figures.draw(directory, "arm R", swinging(2.0), swinging(1.0), arm_r)
     return made, dict(zip([p.stem for p in made], held, strict=True))
-
-
-@pytest.fixture(scope="module")
-def module_record():
-    from flexarm_studies.loop.metrics import Record
-
-    def make(size):
-        def make_record(**functions):
-            time = np.arange(-10, 401) * 0.01
-            values = {
-                n: np.array([np.atleast_1d(f(t)) for t in time]) for n, f in functions.items()
-            }
-            return Record(time=time, **values)
-
-        return swinging(make_record, size)
-
-    return make
 
 
 def test_every_figure_of_the_paper_is_made_as_png_and_svg(drawn, directory):
@@ -117,25 +87,17 @@ def test_every_figure_of_the_paper_is_made_as_png_and_svg(drawn, directory):
         assert svg.rstrip().endswith("</svg>")
 
 
-def test_every_axis_has_a_title_and_the_time_in_seconds(drawn):
-    for name, axes in drawn[1].items():
-        for axis in axes:
-            assert axis["title"], name
-            assert axis["x"] == "time from the start of the trajectory [s]", name
-
-
-@pytest.mark.parametrize("name", UNITS)
-def test_the_unit_stands_beside_the_axis(drawn, name):
-    for stem, axes in drawn[1].items():
-        if stem.split("_")[0] == name:
-            assert any(axis["y"].endswith(UNITS[name]) for axis in axes)
-            assert all(re.search(r"\[\S.*\]$", axis["y"]) for axis in axes if axis["y"])
-
-
-def test_the_arm_is_named_in_the_title_of_every_single_figure(drawn):
-    for name, axes in drawn[1].items():
-        if len(axes) == 1:
-            assert "(arm R)" in axes[0]["title"], name
+@pytest.mark.parametrize("name", NAMES)
+def test_every_axis_has_a_title_the_time_in_seconds_and_a_unit(drawn, name):
+    axes = drawn[1][name]
+    if (short := name.split("_")[0]) in UNITS:
+        assert any(axis["y"].endswith(UNITS[short]) for axis in axes)
+    for axis in axes:
+        assert axis["title"]
+        assert axis["x"] == "time from the start of the trajectory [s]"
+        assert not axis["y"] or re.search(r"\[\S.*\]$", axis["y"])
+    if len(axes) == 1:
+        assert "(arm R)" in axes[0]["title"]
 
 
 def test_titles_and_units_are_readable_in_the_svg(drawn, directory):
@@ -183,7 +145,7 @@ def test_drawing_leaves_no_figure_open_and_the_style_alone(drawn):
     assert plt.rcParams["axes.grid"] is plt.rcParamsDefault["axes.grid"]
 
 
-def test_the_same_records_give_the_same_files(drawn, directory, module_record, arm_r, tmp_path):
-    figures.draw(tmp_path, "arm R", module_record(2.0), module_record(1.0), arm_r)
+def test_the_same_records_give_the_same_files(drawn, directory, swinging, arm_r, tmp_path):
+    figures.draw(tmp_path, "arm R", swinging(2.0), swinging(1.0), arm_r)
     for path in directory.iterdir():
         assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name

@@ -16,7 +16,7 @@ def test_joint_errors_are_in_degrees_over_the_windows(arm_r, make_record):
     # error: 3 deg before the start, up to 2 deg during the motion, -0.5 deg from 3 s on
     error = lambda t: 3.0 if t < 0 else (2.0 * t if t <= 1.0 else -0.5)  # noqa: E731
     record = make_record(
-        reference=lambda t: 1.0, position=lambda t: 1.0 - np.radians(error(round(t, 9)))
+        arm_r, reference=lambda t: 1.0, position=lambda t: 1.0 - np.radians(error(round(t, 9)))
     )
     found = case_study_metrics(record, arm_r, settle=3.0, until=4.0)
     assert_allclose(found["peak_joint_error_deg"], 2.0, rtol=1e-12)
@@ -25,12 +25,14 @@ def test_joint_errors_are_in_degrees_over_the_windows(arm_r, make_record):
 
 def test_both_ends_of_the_window_belong_to_it(arm_r, make_record):
     for edge, peak in ((0.0, 1.0), (-0.01, 0.0), (4.0, 1.0), (3.99, 1.0)):
-        record = make_record(position=lambda t, e=edge: np.radians(1.0) * (abs(t - e) < 1e-6))
+        record = make_record(
+            arm_r, position=lambda t, e=edge: np.radians(1.0) * (abs(t - e) < 1e-6)
+        )
         found = case_study_metrics(record, arm_r, until=4.0)
         assert_allclose(found["peak_joint_error_deg"], peak, rtol=1e-12, atol=1e-15)
-    record = make_record(position=lambda t: np.radians(1.0) * (abs(t - 4.0) < 1e-6))
+    record = make_record(arm_r, position=lambda t: np.radians(1.0) * (abs(t - 4.0) < 1e-6))
     assert case_study_metrics(record, arm_r, until=3.98)["peak_joint_error_deg"] == 0.0
-    record = make_record(position=lambda t: np.radians(1.0) * (abs(t - 3.0) < 1e-6))
+    record = make_record(arm_r, position=lambda t: np.radians(1.0) * (abs(t - 3.0) < 1e-6))
     assert case_study_metrics(record, arm_r)["max_joint_error_after_3s_deg"] > 0.9
 
 
@@ -39,7 +41,7 @@ def test_tip_deflections_are_in_feet_with_the_tip_shapes(arm_r, make_record):
     def amplitude(t):
         return FOOT * np.array([0.03, 0.01] if t < 2.999 else [0.01 * np.sin(2 * np.pi * t), 0.0])
 
-    found = case_study_metrics(make_record(amplitude=amplitude), arm_r, until=4.0)
+    found = case_study_metrics(make_record(arm_r, amplitude=amplitude), arm_r, until=4.0)
     assert_allclose(found["peak_tip_deflection_ft"], 0.04, rtol=1e-9)
     # one period of a sine, its first zero twice: 101 samples instead of 100
     rms = 0.02 / np.sqrt(2.0) * np.sqrt(100.0 / 101.0)
@@ -48,6 +50,7 @@ def test_tip_deflections_are_in_feet_with_the_tip_shapes(arm_r, make_record):
 
 def test_peak_torques_are_magnitudes_in_pound_feet(arm_r, make_record):
     record = make_record(
+        arm_r,
         slow_torque=lambda t: -2.0 * POUND_FORCE_FOOT * (0 < t < 1),
         fast_torque=lambda t: 1.5 * POUND_FORCE_FOOT * (2 < t < 3),
         torque=lambda t: -3.0 * POUND_FORCE_FOOT * (1 < t < 2) + 99.0 * (t < -0.005),
@@ -60,13 +63,14 @@ def test_peak_torques_are_magnitudes_in_pound_feet(arm_r, make_record):
 def test_metrics_are_plain_finite_numbers_even_before_the_observer_has_converged(
     arm_r, make_record
 ):
-    record = make_record(rate=lambda t: [np.nan, np.nan] if t < 0.5 else [0.0, 0.0])
+    record = make_record(arm_r, rate=lambda t: [np.nan, np.nan] if t < 0.5 else [0.0, 0.0])
     json.dumps(case_study_metrics(record, arm_r, until=4.0), allow_nan=False)
 
 
 def test_the_end_point_is_a9_and_a10(arm_r, make_record):
     q, qd, y, yd = 0.3, 1.5, 0.02, -0.4
     record = make_record(
+        arm_r,
         position=lambda t: q,
         velocity=lambda t: qd,
         reference=lambda t: 0.5,
@@ -86,6 +90,7 @@ def test_the_end_point_is_a9_and_a10(arm_r, make_record):
 
 def test_the_rate_of_the_end_point_is_the_derivative_of_the_end_point(arm_r, make_record):
     record = make_record(
+        arm_r,
         position=lambda t: np.sin(t),
         velocity=lambda t: np.cos(t),
         amplitude=lambda t: [0.01 * np.sin(3 * t), 0.002 * np.cos(2 * t)],
@@ -95,8 +100,8 @@ def test_the_rate_of_the_end_point_is_the_derivative_of_the_end_point(arm_r, mak
     assert_allclose(slope[1:-1], record.tip_x_rate(arm_r)[0][1:-1], atol=2e-4)
 
 
-def test_a_thinned_record_keeps_every_nth_row(make_record):
-    record = make_record(position=lambda t: t)
+def test_a_thinned_record_keeps_every_nth_row(arm_r, make_record):
+    record = make_record(arm_r, position=lambda t: t)
     thin = record.thinned(4)
     for name in Record.__dataclass_fields__:
         assert_array_equal(getattr(thin, name), getattr(record, name)[::4])

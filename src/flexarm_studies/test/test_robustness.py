@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lost and late samples: what the network does, the loop over it, and where it breaks; a laboratory's sensing."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from flexarm_bringup import cli
 from flexarm_control.loop.samples import ArmSample
 from flexarm_dynamics.arm.units import FOOT
 from flexarm_dynamics.errors import FlexarmError
@@ -130,31 +128,24 @@ def test_a_torque_is_held_until_it_is_too_old_then_the_safe_action_is_taken():
 # --------------------------------------------------------------------------- where it breaks
 
 
-def robustness(capsys, *words):
+@pytest.fixture
+def robustness(result):
     """Rows of ``flexarm robustness R`` for a short motion, one run at each level."""
-    motion = ["--trajectory", "quintic:to=0.5,duration=0.7", "--window", "0.8"]
-    options = cli.parser().parse_args(
-        ["robustness", "R", "--json", "--seeds", "1", *motion, *words]
-    )
-    options.function(options)
-    return json.loads(capsys.readouterr().out)
+    motion = ("--trajectory", "quintic:to=0.5,duration=0.7", "--window", 0.8)
+    return lambda *words: result("robustness", "R", "--seeds", 1, *motion, *words)
 
 
-def test_the_default_bears_a_fifth_of_the_samples_lost_and_delays_up_to_10_ms(capsys):
-    rows = robustness(capsys, "--loss", "0.2", "--delay", "10")
-    assert [(r["disturbance"], r["level"]) for r in rows] == [
-        ("samples lost", 20.0),
-        ("delay uniform from 0 to", 10.0),
-    ]
+def test_the_default_bears_a_fifth_of_the_samples_lost_and_delays_up_to_10_ms(robustness):
+    rows = robustness("--loss", 0.2, "--delay", 10)
+    levels = [(r["disturbance"], r["level"]) for r in rows]
+    assert levels == [("samples lost", 20.0), ("delay uniform from 0 to", 10.0)]
     for row in rows:
         assert row["stable"] == row["of"] == 1, row["why"]
         assert 0.5 < row["joint error [deg]"] < 2.0 and 0.9 < row["bending [-]"] < 1.1
 
 
-def test_so_does_the_papers_control_which_breaks_when_nearly_all_are_lost(capsys):
-    rows = robustness(
-        capsys, "--controller", "paper_composite", "--loss", "0.2:0.75:0.95", "--delay", "10"
-    )
+def test_so_does_the_papers_control_which_breaks_when_nearly_all_are_lost(robustness):
+    rows = robustness("--controller", "paper_composite", "--loss", "0.2:0.75:0.95", "--delay", "10")
     assert [r["stable"] for r in rows] == [1, 0, 1]
     assert rows[1]["why"]
 

@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Payload
 from flexarm_dynamics.errors import FlexarmError, ParameterError, TrajectoryError
@@ -19,7 +17,7 @@ from flexarm_sim.integrators import integrate
 from flexarm_sim.plant import Plant
 from flexarm_sim.simulator import Simulator
 from flexarm_studies.loop.closed_loop import ClosedLoop
-from flexarm_studies.loop.metrics import SimulatedRecord, tracking_metrics
+from flexarm_studies.loop.metrics import tracking_metrics
 from flexarm_studies.loop.scenario import (
     COMPONENTS,
     Scenario,
@@ -28,7 +26,7 @@ from flexarm_studies.loop.scenario import (
     run,
     run_loop,
     trajectory_of,
-)
+)  # fmt: skip
 
 PAPER = parameters("paper_composite")
 SHORT = {"trajectory": "quintic:to=0.005,duration=0.1", "window": 0.05}
@@ -41,13 +39,13 @@ def short():
     return scenario, *run(scenario)
 
 
-def changed_arm(directory, name, change):
-    """An arm file with something changed; its path."""
-    data = yaml.safe_load(arm_file.find(name).read_text())
-    change(data)
-    path = directory / "changed.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
+def noisy(data):
+    for gauge in data["gauges"]:
+        gauge["noise"] = 1e-6
+
+
+def without_limits(data):
+    del data["joints"][0]["limits"]
 
 
 def same_records(one, other):
@@ -103,12 +101,8 @@ def test_each_option_changes_the_plant_alone_as_it_says(option, by_hand):
     assert loop.controller.model.arm == arm
 
 
-def test_rate_noise_and_seed_reach_the_simulator(tmp_path):
-    def noisy(data):
-        for gauge in data["gauges"]:
-            gauge["noise"] = 1e-6
-
-    path = changed_arm(tmp_path, "R", noisy)
+def test_rate_noise_and_seed_reach_the_simulator(changed_arm):
+    path = changed_arm("R", noisy)
     loop = loop_of(Scenario(path, PAPER, noise=True, seed=7, rate=500.0))
     direct = Simulator(loop.simulator.settings | {"arm": path, "plant_arm": ""})
     assert loop.simulator.period_ns == 2_000_000
@@ -121,9 +115,8 @@ def test_rate_noise_and_seed_reach_the_simulator(tmp_path):
     assert np.any(other != loop.simulator.strain)
 
 
-def test_the_same_scenario_gives_the_same_samples_and_another_seed_others(tmp_path):
-    path = changed_arm(tmp_path, "R", lambda d: [g.update(noise=1e-6) for g in d["gauges"]])
-    scenario = Scenario(path, PAPER, noise=True, seed=3, delay=0.0015, **SHORT)
+def test_the_same_scenario_gives_the_same_samples_and_another_seed_others(changed_arm):
+    scenario = Scenario(changed_arm("R", noisy), PAPER, noise=True, seed=3, delay=0.0015, **SHORT)
     record, metrics = run(scenario)
     again, same = run(pickle.loads(pickle.dumps(scenario)))
     through_json, alike = run(Scenario(**json.loads(json.dumps(scenario.as_dict()))))
@@ -136,18 +129,16 @@ def test_the_same_scenario_gives_the_same_samples_and_another_seed_others(tmp_pa
 # --------------------------------------------------------------------------- late torque
 
 
-class Given:
-    """In the place of a controller's step: enabled, with the torques given."""
+def given(loop, torques):
+    """Let the controller of a loop send these torques; None: it is not enabled."""
+    torques = iter(torques)
 
-    def __init__(self, loop, torques):
-        self._loop, self._torques = loop, iter(torques)
+    def step(sample):
+        if (torque := next(torques)) is not None:
+            loop.controller.torque[:] = torque
+        return torque is not None
 
-    def __call__(self, sample):
-        torque = next(self._torques)
-        if torque is None:
-            return False
-        self._loop.controller.torque[:] = torque
-        return True
+    loop.controller.step = step
 
 
 @pytest.mark.parametrize(
@@ -157,7 +148,7 @@ class Given:
 def test_torque_acts_after_the_delay_to_the_nanosecond(delay, whole, share):
     loop = loop_of(Scenario("R", PAPER, delay=delay))
     sent = [None, None, 3.0, -2.0, 5.0, 1.0, 4.0, -3.0, 2.0, 0.5]
-    loop.controller.step = Given(loop, sent)
+    given(loop, sent)
     at = lambda k: 0.0 if k < 0 or sent[k] is None else sent[k]  # noqa: E731
     for k in range(len(sent)):
         loop.step()
@@ -169,7 +160,7 @@ def test_late_torque_moves_the_plant_as_an_independent_integration_does():
     delay, torques = 0.0023, [3.0, -2.0, 5.0, 1.0, -4.0, 2.0]
     loop = loop_of(Scenario("R", PAPER, delay=delay))
     # The arm rests under its safe action until the first torque arrives.
-    loop.controller.step = Given(loop, torques)
+    given(loop, torques)
     for _ in torques:
         loop.step()
     plant_model = loop.simulator.plant_model
@@ -209,70 +200,43 @@ def test_an_impossible_delay_is_refused(delay):
 # --------------------------------------------------------------------------- metrics
 
 
-def record_of(arm_model, reference, position, amplitude, time=None, torque=0.0, saturated=False):
-    """A record from functions of time or constants."""
-    time = np.arange(-5, 401) * 0.01 if time is None else time
-    n, m = arm_model.n_joints, arm_model.n_modes
+@pytest.fixture
+def metrics_of(make_record):
+    """Makes a record and judges it; the measured position is far off, as no metric looks at it."""
 
-    def rows(given, width):
-        values = given(time) if callable(given) else given
-        return np.broadcast_to(np.asarray(values, float).reshape(-1, width), (time.size, width))
+    def judged(arm_model, columns, end=1.0, **options):
+        record = make_record(arm_model, **{"position": 9.9, **columns})
+        return tracking_metrics(record, arm_model, arm_model, end, **options)
 
-    zeros, modes = np.zeros((time.size, n)), np.zeros((time.size, m))
-    return SimulatedRecord(
-        time=time,
-        reference=rows(reference, n),
-        reference_velocity=zeros,
-        position=zeros + 9.9,  # as measured: no metric looks at it
-        velocity=zeros,
-        amplitude=modes,
-        rate=modes,
-        quasi_steady=modes,
-        slow_torque=zeros,
-        fast_torque=zeros,
-        torque=rows(torque, n),
-        plant_position=rows(position, n),
-        plant_amplitude=rows(amplitude, m),
-        saturated=np.broadcast_to(
-            saturated(time) if callable(saturated) else saturated, time.shape
-        ),
-        state=np.zeros(time.size, int),
-    )
+    return judged
 
 
-def metrics_of(record, arm_model, end=1.0, **options):
-    return tracking_metrics(record, arm_model, arm_model, end, **options)
-
-
-def test_a_joints_constant_error_moves_the_tip_along_its_chord(arm_r):
-    found = metrics_of(record_of(arm_r, 1.0, 0.9, [0.0, 0.0]), arm_r)
+def test_a_joints_constant_error_moves_the_tip_along_its_chord(arm_r, metrics_of):
+    found = metrics_of(arm_r, {"reference": 1.0, "plant_position": 0.9})
     chord = 2e3 * arm_r.arm.links[0].length * np.sin(0.05)
     assert_allclose(found["peak_joint_error_rad"], [0.1], rtol=1e-12)
     assert_allclose(found["rms_joint_error_rad"], [0.1], rtol=1e-12)
-    assert_allclose(found["peak_tip_error_mm"], chord, rtol=1e-12)
-    assert_allclose(found["rms_tip_error_mm"], chord, rtol=1e-12)
-    assert_allclose(found["final_tip_error_mm"], chord, rtol=1e-12)
+    for name in ("peak", "rms", "final"):
+        assert_allclose(found[f"{name}_tip_error_mm"], chord, rtol=1e-12)
     assert found["settling_time_s"] is None
     assert found["residual_tip_rms_mm"] < 1e-12
     assert "static_sag_mm" not in found
 
 
-def test_samples_before_the_start_count_for_nothing(arm_r):
-    early = lambda t: np.where(t < -1e-9, 2.0, 0.0)  # noqa: E731
-    found = metrics_of(record_of(arm_r, 0.0, early, [0.0, 0.0], torque=early), arm_r)
+def test_samples_before_the_start_count_for_nothing(arm_r, metrics_of):
+    early = lambda t: 2.0 * (t < -1e-9)  # noqa: E731
+    found = metrics_of(arm_r, {"plant_position": early, "torque": early})
     assert found["peak_joint_error_rad"] == [0.0]
     assert found["peak_torque_Nm"] == [0.0]
     assert found["peak_tip_error_mm"] == 0.0
 
 
-def test_each_joint_has_its_own_error_and_torque():
+def test_each_joint_has_its_own_error_and_torque(metrics_of):
     two_link = model.build(arm_file.load("two_link"))
-    wave = lambda t: np.column_stack([0.2 * np.sin(np.pi * t), 0.0 * t])  # noqa: E731
-    time = np.arange(400) * 0.01  # two whole periods
-    found = metrics_of(
-        record_of(two_link, wave, [0.0, 0.1], [0.0] * 4, time, torque=lambda t: 5.0 * wave(t)),
-        two_link,
-    )
+    wave = lambda t: np.array([0.2 * np.sin(np.pi * t), 0.0])  # noqa: E731
+    columns = {"time": np.arange(400) * 0.01}  # two whole periods
+    columns |= {"reference": wave, "plant_position": [0.0, 0.1], "torque": lambda t: 5.0 * wave(t)}
+    found = metrics_of(two_link, columns)
     assert_allclose(found["peak_joint_error_rad"], [0.2, 0.1], rtol=1e-12)
     assert_allclose(found["rms_joint_error_rad"], [0.2 / np.sqrt(2.0), 0.1], rtol=1e-12)
     assert_allclose(found["peak_torque_Nm"], [1.0, 0.0], rtol=1e-12)
@@ -280,54 +244,55 @@ def test_each_joint_has_its_own_error_and_torque():
     assert "case_study" not in found
 
 
-def test_the_residual_is_the_rms_of_the_deflection_in_the_window_alone(arm_r):
+def test_the_residual_is_the_rms_of_the_deflection_in_the_window_alone(arm_r, metrics_of):
     tip = arm_r.mode_shapes("link1", "y")(1.0)
 
     def bending(t):
-        size = np.where(t < 0.995, 0.05, np.where(t < 2.995, 0.002, 0.04))
-        return np.column_stack([size * np.sin(2 * np.pi * t + 0.3), 0.0 * t])
+        size = 0.05 if t < 0.995 else 0.002 if t < 2.995 else 0.04
+        return [size * np.sin(2 * np.pi * t + 0.3), 0.0]
 
-    record = record_of(arm_r, 0.0, 0.7, bending)
+    columns = {"plant_position": 0.7, "plant_amplitude": bending}
     # two whole periods of 100 samples
-    found = metrics_of(record, arm_r, end=1.0, window=1.99, settle=0.0)
+    found = metrics_of(arm_r, columns, window=1.99, settle=0.0)
     assert_allclose(found["residual_tip_rms_mm"], abs(tip[0]) * 2.0 / np.sqrt(2.0), rtol=1e-9)
     assert_allclose(found["peak_deflection_mm"], 50.0 * abs(tip[0]), rtol=2e-3)
-    assert metrics_of(record, arm_r, end=1.0, window=3.5)["residual_tip_rms_mm"] is None
+    assert metrics_of(arm_r, columns, window=3.5)["residual_tip_rms_mm"] is None
 
 
 @pytest.mark.parametrize(
     ("last_outside", "settled"), [(2.5, 1.51), (1.0, 0.05), (1.03, 0.05), (1.06, 0.07), (0.5, 0.05)]
 )
-def test_settling_counts_from_the_end_to_the_first_sample_that_stays(arm_r, last_outside, settled):
+def test_settling_counts_from_the_end_to_the_first_sample_that_stays(
+    arm_r, metrics_of, last_outside, settled
+):
     reach = arm_r.arm.links[0].length
-    off = lambda t: np.where(t < last_outside + 1e-6, 2e-3, 0.5e-3) / reach  # noqa: E731
-    record = record_of(arm_r, 0.0, off, [0.0, 0.0])
-    assert_allclose(metrics_of(record, arm_r)["settling_time_s"], settled, rtol=1e-9)
-    assert metrics_of(record, arm_r, tolerance=0.4e-3)["settling_time_s"] is None
-    assert metrics_of(record, arm_r, tolerance=3e-3)["settling_time_s"] == 0.05
+    off = lambda t: (2e-3 if t < last_outside + 1e-6 else 0.5e-3) / reach  # noqa: E731
+    time, never, at_once = (
+        metrics_of(arm_r, {"plant_position": off}, tolerance=tolerance)["settling_time_s"]
+        for tolerance in (1e-3, 0.4e-3, 3e-3)
+    )
+    assert time == pytest.approx(settled, rel=1e-9)
+    assert never is None and at_once == 0.05
 
 
-def test_a_record_that_ends_before_the_motion_has_no_settling_time(arm_r):
-    record = record_of(arm_r, 0.0, 0.0, [0.0, 0.0])
-    found = metrics_of(record, arm_r, end=5.0)
+def test_a_record_that_ends_before_the_motion_has_no_settling_time(arm_r, metrics_of):
+    found = metrics_of(arm_r, {}, end=5.0)
     assert found["settling_time_s"] is None
     assert found["residual_tip_rms_mm"] is None
 
 
-def test_the_share_of_saturated_samples(arm_r):
-    record = record_of(arm_r, 0.0, 0.0, [0.0, 0.0], saturated=lambda t: (t < 0) | (t >= 3.005))
-    assert_allclose(metrics_of(record, arm_r)["saturation_share"], 100 / 401, rtol=1e-12)
+def test_the_share_of_saturated_samples(arm_r, metrics_of):
+    found = metrics_of(arm_r, {"saturated": lambda t: t < 0 or t >= 3.005})
+    assert_allclose(found["saturation_share"], 100 / 401, rtol=1e-12)
 
 
-def test_under_gravity_errors_about_the_static_sag_are_reported_as_well(tmp_path):
-    def fall(data):
-        data["gravity"] = [0.0, -9.81, 0.0]
-
-    arm = model.build(arm_file.load(changed_arm(tmp_path, "one_link", fall)))
+def test_under_gravity_errors_about_the_static_sag_are_reported_as_well(metrics_of):
+    arm = model.build(replace(arm_file.load("one_link"), gravity=(0.0, -9.81, 0.0)))
     link, payload = arm.arm.links[0], arm.arm.payload
-    at_rest = lambda t: np.array([arm.static_deflection([q]) for q in 0.3 * np.minimum(t, 1.0)])  # noqa: E731
-    angle = lambda t: 0.3 * np.minimum(t, 1.0)  # noqa: E731
-    found = metrics_of(record_of(arm, angle, angle, at_rest), arm)
+    angle = lambda t: 0.3 * min(t, 1.0)  # noqa: E731
+    at_rest = lambda t: arm.static_deflection([angle(t)])  # noqa: E731
+    columns = {"reference": angle, "plant_position": angle}
+    found = metrics_of(arm, {**columns, "plant_amplitude": at_rest})
     EI, L, g = link.stiffness["y"], link.length, 9.81 * np.cos(0.3)
     beam = g * (link.mass_per_length * L**4 / 8.0 + payload.mass * L**3 / 3.0) / EI
     assert_allclose(found["static_sag_mm"], 1e3 * beam, rtol=0.01)  # two modes of the exact beam
@@ -336,7 +301,7 @@ def test_under_gravity_errors_about_the_static_sag_are_reported_as_well(tmp_path
     assert found["rms_tip_error_about_sag_mm"] < 0.005
     assert found["residual_tip_rms_mm"] < 1e-6
     assert found["settling_time_s"] == 0.05
-    straight = metrics_of(record_of(arm, angle, angle, [0.0, 0.0]), arm)
+    straight = metrics_of(arm, columns)
     assert_allclose(straight["final_tip_error_mm"], found["static_sag_mm"], rtol=1e-9)
     assert_allclose(straight["residual_tip_rms_mm"], found["static_sag_mm"], rtol=1e-9)
     assert straight["peak_tip_error_mm"] < 1e-9
@@ -360,21 +325,21 @@ def test_a_shorter_run_has_no_case_study(short):
     assert short[2]["case_study"] is None
 
 
-def test_the_true_tip_is_judged_and_not_the_measured_one(tmp_path, short):
+def test_the_true_tip_is_judged_and_not_the_measured_one(changed_arm, short):
     scenario, _, ideal = short
 
     def coarse(data):
         data["joints"][0]["encoder_counts"] = 400
 
-    record, metrics = run(replace(scenario, arm=changed_arm(tmp_path, "R", coarse)))
+    record, metrics = run(replace(scenario, arm=changed_arm("R", coarse)))
     error = np.abs(record.reference - record.plant_position)[record.time > -1e-9]
     assert_allclose(metrics["peak_joint_error_rad"], error.max(0))
     assert np.abs(record.position - record.plant_position).max() > 1e-3
     assert metrics["peak_joint_error_rad"] != ideal["peak_joint_error_rad"]
 
 
-def test_a_loop_that_loses_its_arm_says_why_and_ends_there(tmp_path):
-    free = changed_arm(tmp_path, "R", lambda data: data["joints"][0].pop("limits"))
+def test_a_loop_that_loses_its_arm_says_why_and_ends_there(changed_arm):
+    free = changed_arm("R", without_limits)
     record, metrics = run(
         Scenario(free, PAPER | {"strain_limit": 1.0, "tracking_error_limit": 0.0}, delay=0.1)
     )
@@ -480,13 +445,29 @@ def test_parameters_come_from_the_section_of_the_node_that_they_belong_to(tmp_pa
     }
 
 
-def test_settings_win_over_the_file_and_are_read_as_yaml():
-    found = parameters("paper_slow", ["slow.kp=[9.0]", "fast.type=lqr", "torque_limit=[2.0]"])
-    assert found["slow.kp"] == [9.0]
+def test_settings_win_over_the_file():
+    found = parameters("paper_slow", ["slow.kp=9", "slow.kv=6", "fast.type=lqr", "torque_limit=2"])
     assert found["fast.type"] == "lqr"
     loop = loop_of(Scenario("R", found))
     assert_array_equal(loop.controller.law.slow.kp, [9.0])
     assert_array_equal(loop.controller.torque_limit, [2.0])
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("slow.kp=9", [9.0]),
+        ("slow.kp=9,4.5", [9.0, 4.5]),
+        ("slow.kp=[9.0, 4.5]", [9.0, 4.5]),
+        ("fast.alpha=4", 4.0),
+        ("fast.alpha=1e1", 10.0),
+        ("manifold.order=1", 1),
+        ("slow.type=none", "none"),
+    ],
+)
+def test_a_setting_is_yaml_or_plain_numbers(setting, value):
+    found = parameters("paper_composite", ["manifold.type=corrected", setting])
+    assert found[setting.split("=")[0]] == value
 
 
 def test_parameters_of_components_that_are_not_chosen_stay_out_as_in_the_nodes():
@@ -573,61 +554,49 @@ def test_closed_loop_takes_the_observers_common_parameters():
 # --------------------------------------------------------------------------- the command
 
 
-def flexarm(*words):
-    """Run a command in this process; its exit code."""
-    with pytest.raises(SystemExit) as stop:
-        cli.main([str(w) for w in words])
-    return stop.value.code
-
-
 CONTROLLED = ("--controller", "paper_composite", "--trajectory", SHORT["trajectory"])
 METRICS = {
-    "lost": bool,
-    "reason": str,
-    "state": str,
-    "motion_s": float,
-    "simulated_s": float,
-    "peak_joint_error_rad": list,
-    "rms_joint_error_rad": list,
-    "peak_tip_error_mm": float,
-    "rms_tip_error_mm": float,
-    "residual_tip_rms_mm": float,
-    "residual_window_s": list,
-    "final_tip_error_mm": float,
-    "settling_time_s": float | None,
-    "peak_torque_Nm": list,
-    "rms_torque_Nm": list,
-    "saturation_share": float,
-    "peak_deflection_mm": float,
-    "case_study": dict | None,
-}
+    "lost": bool, "reason": str, "state": str, "motion_s": float, "simulated_s": float,
+    "peak_joint_error_rad": list, "rms_joint_error_rad": list,
+    "peak_tip_error_mm": float, "rms_tip_error_mm": float, "final_tip_error_mm": float,
+    "residual_tip_rms_mm": float, "residual_window_s": list, "settling_time_s": float | None,
+    "peak_torque_Nm": list, "rms_torque_Nm": list, "saturation_share": float,
+    "peak_deflection_mm": float, "case_study": dict | None,
+}  # fmt: skip
 
 
-def test_json_has_the_scenario_and_every_metric(capsys, tmp_path):
+def test_json_has_the_scenario_and_every_metric(result, tmp_path):
     out = tmp_path / "new" / "run.csv"
     options = ("--payload-scale", 2, "--delay", 0.001, "--window", 0.1, "--settle-within", 5)
-    assert flexarm("simulate", "R", *CONTROLLED, *options, "--json", "--out", out) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert set(result) == {"scenario", "metrics", "out", "rows"}
-    assert {k: type(v) for k, v in result["metrics"].items()}.keys() == METRICS.keys()
+    found = result("simulate", "R", *CONTROLLED, *options, "--out", out)
+    assert set(found) == {"scenario", "metrics", "out", "rows"}
+    assert found["metrics"].keys() == METRICS.keys()
     for name, kind in METRICS.items():
-        assert isinstance(result["metrics"][name], kind), name
-    scenario = Scenario(**result["scenario"])
+        assert isinstance(found["metrics"][name], kind), name
+    scenario = Scenario(**found["scenario"])
     assert (scenario.payload_scale, scenario.delay, scenario.tolerance) == (2.0, 0.001, 0.005)
     record, metrics = run(scenario)
-    assert metrics == result["metrics"]
+    assert metrics == found["metrics"]
     table = np.genfromtxt(out, delimiter=",", names=True)
-    assert table.size == result["rows"] == record.time.size
+    assert table.size == found["rows"] == record.time.size
     assert_allclose(table["q1"], record.plant_position[:, 0], atol=1e-11)
     assert_allclose(table["tau1"], table["tau_slow1"] + table["tau_fast1"], atol=1e-10)
     error = np.hypot(table["tip_x"] - table["tip_ref_x"], table["tip_y"] - table["tip_ref_y"])
     assert_allclose(1e3 * error[table["t"] > -1e-9].max(), metrics["peak_tip_error_mm"], rtol=1e-8)
 
 
-def test_what_is_printed_names_joints_components_and_figures(capsys):
-    words = ("--set", "observer.bandwidth=5000.0", "--initial", "-0.2", "--window", 0.1)
-    assert flexarm("simulate", "R", *CONTROLLED, *words, "--method", "rk4") == 0
-    text = capsys.readouterr().out
+def test_what_is_printed_names_joints_components_and_figures(flexarm):
+    words = (
+        "--set",
+        "slow.kp=6.25",
+        "observer.bandwidth=5000",
+        "--initial",
+        "-0.2",
+        "--window",
+        0.1,
+    )
+    code, text, _ = flexarm("simulate", "R", *CONTROLLED, *words, "--method", "rk4")
+    assert code == 0
     for word in (
         "joint1",
         "lqr",
@@ -639,43 +608,14 @@ def test_what_is_printed_names_joints_components_and_figures(capsys):
         assert word in text
 
 
-def test_a_lost_arm_is_exit_code_1_with_the_reason_and_the_figures(capsys, tmp_path):
-    free = changed_arm(tmp_path, "R", lambda data: data["joints"][0].pop("limits"))
+def test_a_lost_arm_is_exit_code_1_with_the_reason_and_the_figures(flexarm, changed_arm):
     words = ("--controller", "paper_composite", "--trajectory", "paper", "--delay", 0.1, "--json")
-    assert flexarm("simulate", free, *words) == 1
-    out, err = capsys.readouterr()
+    code, out, err = flexarm("simulate", changed_arm("R", without_limits), *words)
+    assert code == 1
     assert json.loads(out)["metrics"]["lost"] is True
     assert "the arm was lost: strain of root is" in err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--controller", "paper_composite"), "--trajectory: is missing"),
-        (("--controller", "nowhere", "--trajectory", "paper"), "neither a file nor shipped"),
-        ((*CONTROLLED, "--torque", "x.csv"), "--torque: is not possible with --controller"),
-        ((*CONTROLLED, "--modes", 3), "--modes: is not possible with --controller"),
-        ((*CONTROLLED, "--foreshortening"), "--foreshortening: is not possible with --controller"),
-        ((*CONTROLLED, "--set", "slow.kp=[6]"), "slow.kp: [6] is a list of integers"),
-        ((*CONTROLLED, "--set", "slow.kp=[6.0]", "x=1"), "x: no such parameter"),
-        ((*CONTROLLED, "--payload-scale", -1), "R: payload times -1.0"),
-        ((*CONTROLLED, "--plant-modes", 99), "plant_modes: 99 is above"),
-        (("--payload-scale", 2), "--payload-scale: is possible only with --controller"),
-        (("--noise",), "--noise: is possible only with --controller"),
-        (("--set", "slow.kp=[1.0]"), "--set: is possible only with --controller"),
-    ],
-)
-def test_wrong_options_are_exit_code_1_and_named(capsys, words, message):
-    assert flexarm("simulate", "R", *words) == 1
-    assert message in capsys.readouterr().err
-
-
-def test_noise_that_the_arm_file_does_not_state_is_a_warning(capsys, tmp_path):
-    def quiet(data):
-        for gauge in data["gauges"]:
-            gauge.pop("noise", None)
-            gauge.pop("drift", None)
-
-    path = changed_arm(tmp_path, "R", quiet)
-    assert flexarm("simulate", path, *CONTROLLED, "--window", 0.05, "--noise") == 0
-    assert "--noise: the arm file of R states none" in capsys.readouterr().err
+def test_noise_that_the_arm_file_does_not_state_is_a_warning(flexarm):
+    code, _, err = flexarm("simulate", "R", *CONTROLLED, "--window", 0.05, "--noise")
+    assert code == 0 and "--noise: the arm file of R states none" in err
