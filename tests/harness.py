@@ -44,7 +44,53 @@ def answers(tap, session, sequence):
     return [m for m in tap.messages if (m.session, m.sequence) == (session, sequence)]
 
 
-class Bench(Session):
+class Nodes:
+    """Nodes as tests use them, whether they are processes or not; `start`, `call` and `tap` are the subclass's."""
+
+    def start_loop(self, simulator=None, observer=None, controller=None, **common):
+        """Start the three nodes."""
+        for name, own in (
+            ("simulator", simulator),
+            ("observer", observer),
+            ("controller", controller),
+        ):
+            self.start(name, {**common, **(own or {})})
+
+    def diagnostics(self, name):
+        """What a node says on /diagnostics, newest last."""
+        arrays = self.tap(DiagnosticArray, "/diagnostics").messages
+        return [s for a in arrays for s in a.status if s.name == name]
+
+    def set(self, node, **values):
+        """Set parameters one by one; dots as double underscores. The results, in order."""
+        return self.call(
+            SetParameters, f"{node}/set_parameters", parameters=_messages(values)
+        ).results
+
+    def set_atomically(self, node, **values):
+        """Set parameters all or none; the result."""
+        name = f"{node}/set_parameters_atomically"
+        return self.call(SetParametersAtomically, name, parameters=_messages(values)).result
+
+    def get(self, node, name):
+        """Value of a parameter, arrays as lists; None where there is no such parameter."""
+        answer = self.call(GetParameters, f"{node}/get_parameters", names=[name])
+        if not answer.values:
+            return None
+        return plain(answer.values[0])
+
+    def change(self, node, transition):
+        """Call a lifecycle transition; whether the node is where it leads."""
+        number, goal = TRANSITIONS[transition]
+        self.call(ChangeState, f"{node}/change_state", transition=Transition(id=number))
+        return self.lifecycle(node) == goal
+
+    def lifecycle(self, node):
+        """Label of a node's lifecycle state."""
+        return self.call(GetState, f"{node}/get_state").current_state.label
+
+
+class Bench(Nodes, Session):
     """Processes, and a session of this process beside them.
 
     Parameters
@@ -76,18 +122,13 @@ class Bench(Session):
         command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
         return self.processes.start(key or name, command)
 
-    def start_loop(self, simulator=None, observer=None, controller=None, **common):
-        """Start the three nodes."""
-        for name, own in (
-            ("simulator", simulator),
-            ("observer", observer),
-            ("controller", controller),
-        ):
-            self.start(name, {**common, **(own or {})})
-
     def log(self, key):
         """What a process has printed."""
         return self.processes.log(key)
+
+    def check(self):
+        """Fail if a process has ended unexpectedly."""
+        self.processes.check()
 
     def kill(self, key):
         """End a process as kill -9 does, and note what it leaves in shared memory."""
@@ -113,41 +154,6 @@ class Bench(Session):
     def publisher(self, kind, topic, readers=1):
         """A publisher (reliable, volatile, as ``ros2 topic pub``) that `readers` have discovered."""
         return super().publisher(kind, topic, readers)
-
-    def diagnostics(self, name):
-        """What a node says on /diagnostics, newest last."""
-        arrays = self.tap(DiagnosticArray, "/diagnostics").messages
-        return [s for a in arrays for s in a.status if s.name == name]
-
-    # Services --------------------------------------------------------------------------------
-
-    def set(self, node, **values):
-        """Set parameters one by one; dots as double underscores. The results, in order."""
-        return self.call(
-            SetParameters, f"{node}/set_parameters", parameters=_messages(values)
-        ).results
-
-    def set_atomically(self, node, **values):
-        """Set parameters all or none; the result."""
-        name = f"{node}/set_parameters_atomically"
-        return self.call(SetParametersAtomically, name, parameters=_messages(values)).result
-
-    def get(self, node, name):
-        """Value of a parameter, arrays as lists; None where there is no such parameter."""
-        answer = self.call(GetParameters, f"{node}/get_parameters", names=[name])
-        if not answer.values:
-            return None
-        return plain(answer.values[0])
-
-    def change(self, node, transition):
-        """Call a lifecycle transition; whether the node is where it leads."""
-        number, goal = TRANSITIONS[transition]
-        self.call(ChangeState, f"{node}/change_state", transition=Transition(id=number))
-        return self.lifecycle(node) == goal
-
-    def lifecycle(self, node):
-        """Label of a node's lifecycle state."""
-        return self.call(GetState, f"{node}/get_state").current_state.label
 
     # End -------------------------------------------------------------------------------------
 
@@ -407,7 +413,7 @@ class Drive:
     """Answers the simulator's states with torques, as a controller does."""
 
     def __init__(self, bench, namespace=""):
-        self.bench = bench
+        self.bench, self.namespace = bench, namespace
         self.states = bench.tap(ArmState, f"{namespace}arm_state")
         self._publisher = bench.publisher(JointTorque, f"{namespace}joint_torque")
         bench.wait_for("a state", lambda: self.states.newest)
@@ -419,6 +425,15 @@ class Drive:
         self.bench.wait_for("the state again", lambda: len(self.states.messages) > seen)
         self.state = self.states.newest
         return self.state
+
+    def reset(self):
+        """Reset the simulator and take the first state of its new session."""
+        answer = self.bench.call(Trigger, f"{self.namespace}simulator/reset")
+        assert answer.success, answer.message
+        session = int(answer.message.split()[-1])
+        self.bench.wait_for("the session", lambda: self.states.newest.session == session)
+        self.state = self.states.newest
+        assert self.state.sequence == 0
 
     def send(self, **fields):
         """Publish a torque, whatever it is."""

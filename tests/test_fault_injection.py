@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of the simulator, over DDS: who may set them, and that they are on arm_state."""
+"""Faults of the simulator: who may set them, and that they are on arm_state."""
 
 import numpy as np
 import pytest
-from harness import Arm, Bench, Drive
+from harness import Drive
+from in_process import InProcess
 
 from flexarm_ros.messages import stamp_ns
 
@@ -11,9 +12,9 @@ OWN = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory):
+def simulated():
     """A simulator that takes faults, answered by this process, and beside it one that takes none."""
-    with Bench(tmp_path_factory.mktemp("log")) as bench:
+    with InProcess() as bench:
         bench.start("simulator", {"arm": "R", **OWN}, key="plain", remaps=["__ns:=/plain"])
         own = {"allow_faults": True, "publish_modal_amplitude": False}
         bench.start("simulator", {"arm": "R", **OWN, **own})
@@ -24,10 +25,7 @@ def simulated(tmp_path_factory):
 def drive(simulated):
     """The simulator without faults, after a reset."""
     faults(simulated, [])
-    answer = simulated.bench.call(Arm.reset_kind, "simulator/reset")
-    session = int(answer.message.split()[-1])
-    simulated.bench.wait_for("the session", lambda: simulated.first().session == session)
-    assert simulated.state.sequence == 0
+    simulated.reset()
     return simulated
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from harness import Arm, Bench, Drive, Source, trajectory
+from in_process import InProcess
 
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import stamp_ns
@@ -21,28 +22,36 @@ J = ["joint1"]
 # Bad states into observer and controller --------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def line(tmp_path_factory):
+def source_on(bench):
     """Observer and controller of the paper, and a source of states in place of a simulator."""
-    with Bench(tmp_path_factory.mktemp("log")) as bench:
-        file = parameter_files.find("paper_composite")
-        bench.start("observer", file=file)
-        bench.start("controller", {"state_timeout": 60.0}, file=file)
-        source = Source(bench)
-        bench.publisher(ArmState, "arm_state_estimate")
-        source.step()
-        yield source
+    file = parameter_files.find("paper_composite")
+    bench.start("observer", file=file)
+    bench.start("controller", {"state_timeout": 60.0}, file=file)
+    source = Source(bench)
+    bench.publisher(ArmState, "arm_state_estimate")
+    source.step()
+    return source
+
+
+def in_a_new_session(source):
+    """The source in a new session, its arm in motion and bent, the torque enabled."""
+    source.restart()
+    for _ in range(20):
+        source.sim.advance(np.array([3.0]))
+    source.until_enabled()
+    assert np.abs(source.sim.amplitude).min() > 1e-6
+    return source
+
+
+@pytest.fixture(scope="module")
+def in_this_process():
+    with InProcess() as bench:
+        yield source_on(bench)
 
 
 @pytest.fixture
-def source(line):
-    """The source in a new session, its arm in motion and bent, the torque enabled."""
-    line.restart()
-    for _ in range(20):
-        line.sim.advance(np.array([3.0]))
-    line.until_enabled()
-    assert np.abs(line.sim.amplitude).min() > 1e-6
-    return line
+def source(in_this_process):
+    return in_a_new_session(in_this_process)
 
 
 #: What is changed in a good state, what the reason in controller/state says, what the observer logs.
@@ -81,6 +90,16 @@ BAD_STATES = {
 
 @pytest.mark.parametrize("case", BAD_STATES)
 def test_a_bad_state_is_a_fault_with_a_reason_until_recover_is_called(source, case):
+    check_bad_state(source, case)
+
+
+def test_over_dds_a_bad_state_is_a_fault_until_recover_is_called(bench):
+    source = in_a_new_session(source_on(bench))
+    check_bad_state(source, "NaN position")
+    check_bad_state(source, "NaN strain alone")
+
+
+def check_bad_state(source, case):
     changes, reason = BAD_STATES[case]
     torque, state = source.step(**changes)
     assert torque.mode == JointTorque.DISABLED
@@ -283,25 +302,32 @@ def test_the_controller_trusts_no_observer_either(source, changes):
 # Bad torques into the simulator ------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory):
+def drive_on(bench):
     """A simulator in lockstep that this process answers."""
-    with Bench(tmp_path_factory.mktemp("log")) as bench:
-        lockstep = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
-        bench.start("simulator", {"arm": "R", **lockstep})
-        yield Drive(bench)
+    lockstep = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
+    bench.start("simulator", {"arm": "R", **lockstep})
+    return Drive(bench)
+
+
+def in_motion_beside_its_twin(drive):
+    """The simulator after a reset, the arm in motion; and its twin in this process."""
+    drive.reset()
+    drive.twin = Source.simulator("R")
+    for _ in range(10):
+        step_both(drive, 3.0)
+    assert abs(drive.state.joint_velocity[0]) > 1e-3
+    return drive
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    with InProcess() as bench:
+        yield drive_on(bench)
 
 
 @pytest.fixture
 def drive(simulated):
-    """The simulator after a reset, the arm in motion; and its twin in this process."""
-    assert simulated.bench.call(Arm.reset_kind, "simulator/reset").success
-    simulated.first()
-    simulated.twin = Source.simulator("R")
-    for _ in range(10):
-        step_both(simulated, 3.0)
-    assert abs(simulated.state.joint_velocity[0]) > 1e-3
-    return simulated
+    return in_motion_beside_its_twin(simulated)
 
 
 def step_both(drive, torque, **changes):
@@ -337,6 +363,16 @@ BAD_TORQUES = {
 
 @pytest.mark.parametrize("case", BAD_TORQUES)
 def test_a_torque_that_cannot_be_applied_is_answered_by_the_safe_action(drive, case):
+    check_bad_torque(drive, case)
+
+
+def test_over_dds_a_torque_that_cannot_be_applied_is_answered_by_the_safe_action(bench):
+    drive = in_motion_beside_its_twin(drive_on(bench))
+    check_bad_torque(drive, "NaN")
+    check_bad_torque(drive, "wrong joint")
+
+
+def check_bad_torque(drive, case):
     drive.step(1.0, **BAD_TORQUES[case])
     drive.twin.advance(None)
     same(drive)

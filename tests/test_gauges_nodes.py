@@ -7,7 +7,8 @@ import re
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from harness import Bench, Source
+from harness import Source
+from in_process import InProcess
 from std_srvs.srv import Trigger
 
 from flexarm_dynamics.arm import arm_file
@@ -21,9 +22,9 @@ BIAS = np.array([20e-6, -35e-6, 5e-6, 3e-6])
 
 
 @pytest.fixture(scope="module")
-def line(tmp_path_factory):
+def line():
     """Observer and controller of R_lab, and a driver that sends strains alone."""
-    with Bench(tmp_path_factory.mktemp("log")) as bench:
+    with InProcess() as bench:
         own = {"observer.calibration_samples": SAMPLES, "observer.stuck_samples": 10}
         bench.start("observer", {"arm": "R_lab", **own})
         bench.start("controller", {"arm": "R_lab", "fast.type": "none", "state_timeout": 60.0})

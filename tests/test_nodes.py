@@ -9,6 +9,7 @@ import signal
 import numpy as np
 import pytest
 from harness import PATIENT, SHM, Arm, Bench, Drive, Source, abandoned, segments, trajectory
+from in_process import InProcess
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -254,15 +255,16 @@ MODEL = model.build(arm_file.load("R"))
 
 
 @pytest.fixture(scope="module")
-def loop(shared_bench):
-    """The three nodes in lockstep, the paper's composite control, paused at 10 ms."""
-    bench, file = shared_bench, parameter_files.find("paper_composite")
-    bench.start("simulator", {**LOCKSTEP, "pause_at": 0.01}, file=file)
-    bench.start("observer", file=file)
-    bench.start("controller", {"state_timeout": 60.0}, file=file)
-    arm = Arm(bench, pauses_at=10)
-    arm.wait_standing()
-    return arm
+def loop():
+    """The three nodes in lockstep in this process, the paper's composite control, paused at 10 ms."""
+    file = parameter_files.find("paper_composite")
+    with InProcess() as bench:
+        bench.start("simulator", {**LOCKSTEP, "pause_at": 0.01}, file=file)
+        bench.start("observer", file=file)
+        bench.start("controller", file=file)
+        arm = Arm(bench, pauses_at=10)
+        arm.wait_standing()
+        yield arm
 
 
 @pytest.fixture
@@ -279,8 +281,7 @@ def running(loop):
     loop.offer(trajectory(["joint1"], (60.0, [6.0], [0.0], [0.0])))
     loop.wait_until(1_300_000_000)
     assert loop.state.supervisor_state == CompositeState.TRACKING
-    yield loop
-    assert all(p.poll() is None for p in bench.processes.running.values())
+    return loop
 
 
 def gain(**changes):
@@ -535,9 +536,9 @@ def torques(count):
 
 
 @pytest.fixture(scope="module")
-def three_modes(tmp_path_factory):
+def three_modes():
     """A simulator whose plant has a mode more than the controller's arm, in lockstep, not paused."""
-    with Bench(tmp_path_factory.mktemp("log")) as bench:
+    with InProcess() as bench:
         settings = {**LOCKSTEP, "pause_at": -1.0, "plant_modes": 3, "joint_states_rate": 500.0}
         bench.start("simulator", {"arm": "R", **settings})
         bench.joint_states = bench.tap(JointState, "joint_states")
@@ -567,15 +568,12 @@ def test_the_published_amplitudes_are_the_true_ones_plus_the_spill_over_of_the_t
 
 
 def test_a_reset_is_a_new_session_with_the_same_samples(three_modes):
-    arm = Arm(three_modes)
     drive = Drive(three_modes)
     sessions = {drive.state.session}
     runs = []
     for _ in range(2):
-        answer = three_modes.call(arm.reset_kind, "simulator/reset")
-        assert answer.success
-        drive.first()
-        assert drive.state.sequence == 0 and drive.state.session not in sessions
+        drive.reset()
+        assert drive.state.session not in sessions
         sessions.add(drive.state.session)
         first = drive.state
         runs.append([bits(first), *(bits(drive.step(torque)) for torque in torques(20))])
@@ -586,8 +584,7 @@ def test_a_reset_is_a_new_session_with_the_same_samples(three_modes):
 def test_a_torque_of_the_session_before_a_reset_is_ignored(three_modes):
     drive = Drive(three_modes)
     old = drive.state.session
-    assert three_modes.call(Arm.reset_kind, "simulator/reset").success
-    drive.first()
+    drive.reset()
     publisher = three_modes.publisher(JointTorque, "joint_torque")
     answer = {"session": old, "sequence": 0, "mode": 1, "joint_names": ["joint1"], "torque": [1.0]}
     publisher.publish(JointTorque(**answer))
@@ -598,12 +595,12 @@ def test_a_torque_of_the_session_before_a_reset_is_ignored(three_modes):
 
 def test_joint_states_have_the_measured_joints_at_their_own_rate(three_modes):
     drive = Drive(three_modes)
-    assert three_modes.call(Arm.reset_kind, "simulator/reset").success
-    drive.first()
-    three_modes.joint_states.messages.clear()
-    states = [drive.step(torque) for torque in torques(20)]
-    three_modes.wait_for("ten joint_states", lambda: len(three_modes.joint_states.messages) >= 10)
-    for joint, state in zip(three_modes.joint_states.messages, states[1::2], strict=True):
+    drive.reset()
+    seen = len(three_modes.joint_states.messages)
+    states = [drive.state, *(drive.step(torque) for torque in torques(20))]
+    found = three_modes.joint_states.messages
+    three_modes.wait_for("eleven joint_states", lambda: len(found) >= seen + 11)
+    for joint, state in zip(found[seen:], states[::2], strict=True):
         assert list(joint.name) == ["joint1"]
         assert stamp_ns(joint.header.stamp) == stamp_ns(state.header.stamp)
         assert list(joint.position) == list(state.joint_position)

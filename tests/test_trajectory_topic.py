@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories on the topic, published as users do: reliable, volatile, with stamp 0 or an explicit one."""
+"""Trajectories on the topic, with stamp 0 or an explicit one; two of them over DDS, published as users do."""
 
 import itertools
 import math
@@ -7,7 +7,8 @@ import re
 
 import numpy as np
 import pytest
-from harness import Arm, trajectory
+from harness import PATIENT, Arm, trajectory
+from in_process import InProcess
 
 from flexarm_control.motions import profiles
 from flexarm_msgs.msg import CompositeState, JointTorque
@@ -16,18 +17,20 @@ J = ["joint1"]
 MS = 1_000_000
 
 
-@pytest.fixture(scope="module")
-def loop(shared_bench):
+def standing_loop(bench):
     """The three nodes in lockstep, paused at 10 ms, with an arm that has limits."""
-    shared_bench.start_loop(
-        {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02},
-        # A loaded machine may hold the line up for longer than the usual timeout.
-        controller={"fast.type": "none", "state_timeout": 60.0},
-        arm="one_link",
-    )
-    arm = Arm(shared_bench, pauses_at=10)
+    lockstep = {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02}
+    bench.start_loop(lockstep, controller={**PATIENT, "fast.type": "none"}, arm="one_link")
+    arm = Arm(bench, pauses_at=10)
     arm.wait_standing()
     return arm
+
+
+@pytest.fixture(scope="module")
+def loop():
+    """The loop in this process."""
+    with InProcess() as bench:
+        yield standing_loop(bench)
 
 
 @pytest.fixture
@@ -162,6 +165,18 @@ def test_trajectories_streamed_at_50_hz_make_one_smooth_motion(arm):
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_trajectory_that_cannot_be_followed_is_refused_with_a_reason_and_the_arm_holds(arm, case):
+    check_refusal(arm, case)
+
+
+def test_over_dds_a_trajectory_is_refused_and_another_followed(bench):
+    arm = standing_loop(bench)
+    check_refusal(arm, "NaN position")
+    arm.offer(trajectory(J, (0.2, [0.3], [0.0], [0.0])))
+    start = arm.now + MS
+    follows(arm.run(0.3), start, profiles.quintic(0.0, 0.3, 0.2), 0.2)
+
+
+def check_refusal(arm, case):
     message, reason = REFUSED[case]
     accepted = arm.state.accepted_trajectory_id
     assert re.search(reason, arm.refused(message)), arm.state.rejected_reason
@@ -269,7 +284,7 @@ def test_a_new_trajectory_takes_over_with_a_continuous_reference_velocity(arm, f
     def point(at, position):
         return (at, *([position], [0.0], [0.0])[:fields])
 
-    first = arm.offer(trajectory(J, point(4.0, 2.0)))
+    first = arm.offer(trajectory(J, point(1.0, 0.5)))
     arm.pause(False)
     arm.bench.wait_for("the motion", lambda: arm.state.reference_velocity[0] > 0.5)
     arm.stand()

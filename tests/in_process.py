@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes in this process, joined by a queue in place of DDS: the same node code, one message at a time.
+
+What the nodes do with their input does not depend on how it reaches them. A family of cases is therefore tested here,
+in order, without processes, threads or waiting; one case of each family is tested over DDS as well.
+"""
+
+import heapq
+import itertools
+from collections import deque
+from types import SimpleNamespace
+from unittest import mock
+
+import rclpy
+from harness import Nodes
+from rclpy.serialization import deserialize_message, serialize_message
+
+from flexarm_control.nodes.controller import ControllerNode
+from flexarm_control.nodes.observer import ObserverNode
+from flexarm_ros.session import WaitError
+from flexarm_sim.nodes.simulator import SimulatorNode
+from flexarm_tools.running.processes import arguments, own_domain
+
+CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
+
+
+class Queue:
+    """Messages, calls and timers of all nodes, served in order; time is what the messages take.
+
+    Attributes
+    ----------
+    time : float
+        [s]
+    """
+
+    #: What a message takes [s].
+    MESSAGE = 1e-4
+
+    def __init__(self):
+        self.time, self.taps = 0.0, {}
+        self._readers, self._calls, self._waiting, self._timers = {}, deque(), deque(), []
+        self._order = itertools.count()
+
+    def publish(self, kind, topic, message):
+        """Put a message at the end of the queue, as bytes: the publisher may write its next one at once."""
+        raw = serialize_message(message)
+        self._waiting.append(lambda: self._deliver(kind, topic, raw))
+
+    def _deliver(self, kind, topic, raw):
+        self.time += self.MESSAGE
+        message = deserialize_message(raw, kind)
+        if tap := self.taps.get(topic):
+            tap.messages.append(message)
+            tap.newest = message
+        for reader in list(self._readers.get(topic, ())):
+            reader.callback(raw if reader.raw else message)
+
+    def readers(self, topic):
+        """Number of those that get a topic's messages."""
+        return len(self._readers.get(topic, ())) + (topic in self.taps)
+
+    def subscribe(self, kind, topic, callback, raw=False):
+        """Have a callback called with a topic's messages."""
+        reader = SimpleNamespace(
+            callback=callback, raw=raw, msg_type=kind, topic_name=topic, handle=None
+        )
+        self._readers.setdefault(topic, []).append(reader)
+        return reader
+
+    def unsubscribe(self, reader):
+        self._readers[reader.topic_name].remove(reader)
+
+    def call_soon(self, callback, *args):
+        """Call before the next message is delivered."""
+        self._calls.append((callback, args))
+
+    def add_timer(self, period, callback):
+        """Call a callback again and again; the timer."""
+        timer = SimpleNamespace(period=period, callback=callback, alive=True)
+        self._start(timer)
+        return timer
+
+    def _start(self, timer):
+        heapq.heappush(self._timers, (self.time + timer.period, next(self._order), timer))
+
+    def serve(self):
+        """Serve what is next: a call, a timer that is due, a message, or, while there is none, the next timer."""
+        if self._calls:
+            callback, args = self._calls.popleft()
+            callback(*args)
+        elif self._waiting and not (self._timers and self._timers[0][0] <= self.time):
+            self._waiting.popleft()()
+        elif self._timers:
+            due, _, timer = heapq.heappop(self._timers)
+            self.time = max(self.time, due)
+            if timer.alive:
+                timer.callback()
+                self._start(timer)
+
+
+class AtOnce:
+    """In place of a thread of the node: does its work when it is submitted."""
+
+    def submit(self, function, *args):
+        function(*args)
+
+    def shutdown(self, wait=True, cancel_futures=False):
+        pass
+
+
+class _OnQueue:
+    """What a node makes for its topics, timers and threads, on the queue `queue`."""
+
+    queue = None
+
+    def _publisher(self, kind, topic, profile, **_):
+        topic, queue = self.resolve_topic_name(topic), self.queue
+        return SimpleNamespace(
+            publish=lambda message: queue.publish(kind, topic, message),
+            get_subscription_count=lambda: queue.readers(topic),
+            wait_for_all_acked=lambda timeout: True,
+            topic_name=topic,
+        )
+
+    def make_subscription(self, kind, topic, callback, profile, raw=False, **_):
+        topic = self.resolve_topic_name(topic)
+        reader = self.queue.subscribe(kind, topic, callback, raw)
+        return self._keep(self.queue.unsubscribe, reader)
+
+    def make_timer(self, period, callback):
+        def end(timer):
+            timer.alive = False
+
+        return self._keep(end, self.queue.add_timer(period, callback))
+
+    def hand_over(self, callback, *args):
+        self.queue.call_soon(callback, *args)
+
+    def build(self):
+        super().build()
+        for worker in getattr(self, "_workers", ()):
+            if hasattr(worker, "_thread"):
+                worker._thread.shutdown()
+                worker._thread = AtOnce()
+
+
+class _Log:
+    """A node's log, as `rclpy` prints it."""
+
+    def __init__(self, name):
+        self._name, self.text = name, ""
+
+    def _add(self, severity, text):
+        self.text += f"[{severity}] [0.0] [{self._name}]: {text}\n"
+
+    def info(self, text):
+        self._add("INFO", text)
+
+    def warning(self, text):
+        self._add("WARN", text)
+
+    def error(self, text):
+        self._add("ERROR", text)
+
+
+class InProcess(Nodes):
+    """The part of `harness.Bench` that tests of families use, with the nodes in this process."""
+
+    def __init__(self):
+        self.queue, self.nodes, self._contexts = Queue(), {}, []
+        self._domain = own_domain()
+        self.domain = self._domain.__enter__()
+
+    def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
+        """Make a node and activate it."""
+        context = rclpy.Context()
+        self._contexts.append(context)
+        args = arguments(parameters, file, remaps)
+        rclpy.init(context=context, args=args, domain_id=self.domain)
+        kind = type(CLASSES[name].__name__, (_OnQueue, CLASSES[name]), {"queue": self.queue})
+        with mock.patch("rclpy.node.get_default_context", lambda **_: context):
+            node = kind()
+        node._logger = _Log(node.get_fully_qualified_name().lstrip("/"))
+        self.nodes[key or name] = node
+        node.autostart()
+        return node
+
+    def log(self, key):
+        """What a node has logged."""
+        return self.nodes[key].get_logger().text
+
+    def check(self):
+        """The nodes live as long as this process."""
+
+    def tap(self, kind, topic):
+        """Collects the messages of a topic from now on; one for each topic."""
+        tap = SimpleNamespace(kind=kind, messages=[], newest=None)
+        return self.queue.taps.setdefault(f"/{topic.lstrip('/')}", tap)
+
+    def publisher(self, kind, topic, readers=1):
+        """A publisher of a topic."""
+        topic = f"/{topic.lstrip('/')}"
+        assert self.queue.readers(topic) >= readers
+        return SimpleNamespace(publish=lambda message: self.queue.publish(kind, topic, message))
+
+    def call(self, kind, service, /, **request):
+        """Call a service between two messages; its answer."""
+        for node in self.nodes.values():
+            for offered in node.services:
+                if offered.service_name == f"/{service}":
+                    return offered.callback(kind.Request(**request), kind.Response())
+        raise AssertionError(f"no service {service}")
+
+    def wait_for(self, what, condition, patience=60.0):
+        """Serve until a condition holds; its value."""
+        end = self.queue.time + patience
+        while not (value := condition()):
+            if self.queue.time > end:
+                logs = "\n".join(node.get_logger().text for node in self.nodes.values())
+                raise WaitError(f"waited {patience:g} s in vain for {what}", hint=logs)
+            self.queue.serve()
+        return value
+
+    def close(self):
+        """End the nodes."""
+        for node in self.nodes.values():
+            if node.active:
+                node.stop()
+            node.destroy_node()
+        for context in self._contexts:
+            rclpy.try_shutdown(context=context)
+        self._domain.__exit__(None, None, None)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
