@@ -4,16 +4,24 @@
 import pytest
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items):
+@pytest.hookimpl(wrapper=True)  # before and after xdist reads the groups
+def pytest_collection_modifyitems(config, items):
     """Keep the tests that share a fixture in one process; let the tests in real time try again.
 
     With ``--dist loadgroup`` a test without a group goes wherever there is room. Those of a module that share a
     module's fixture, for instance running nodes, are one group, so that the fixture is set up once.
     """
+    grouped = []
     for item in items:
         fixtures = item._fixtureinfo.name2fixturedefs.values()
         if any(found[-1].scope in ("module", "class") for found in fixtures):
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
+            grouped.append(item)
         if item.get_closest_marker("real_time"):
             item.add_marker(pytest.mark.flaky(reruns=2))
+    result = yield
+    if getattr(config.option, "loadgroup", False) and not all("@" in i.nodeid for i in grouped):
+        raise pytest.UsageError(
+            "this pytest-xdist ignores groups under this pytest: see requirements"
+        )
+    return result
