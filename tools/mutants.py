@@ -299,6 +299,12 @@ LAWS = [
             "kp * later[:n] - kv * later[n:]",
         ),
         (
+            "corrected",
+            "the error's own velocity: sign",
+            "motion[1] -= later[n:]",
+            "motion[1] += later[n:]",
+        ),
+        (
             "quasi_steady",
             "(9): gone",
             "self.amplitude[:] = quasi_steady_state(terms, slow_torque)",

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slow manifolds: the paper's, the reference's, and the corrected one beside a slow manifold found numerically."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.linalg import schur
 
+from flexarm_control.component import at_rest
 from flexarm_control.composite.design import MANIFOLD, design, design_law
-from flexarm_control.composite.full_order import at_rest
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import quasi_steady_state, slow_subsystem
@@ -38,13 +37,13 @@ class Sine:
         return np.array([a * np.sin(phase), a * r * np.cos(phase), -a * r * r * np.sin(phase)])
 
 
-@pytest.fixture(scope="module", params=["R", "one_link", "two_link", "long_reach"])
-def arm(request):
-    return build(arm_file.load(request.param))
+@pytest.fixture(params=["R", "one_link", "two_link", "long_reach"])
+def arm(request, arms):
+    return arms[request.param]
 
 
-def manifold(model, kind, **values):
-    law = design(model, SLOW, NONE).slow
+def manifold(model, kind, slow=SLOW, **values):
+    law = design(model, slow, NONE).slow
     return design_law(MANIFOLD, kind, model, values, law)
 
 
@@ -70,17 +69,24 @@ def test_order_0_is_the_papers_quasi_steady_state(arm):
     assert_allclose(surface.feedforward, np.zeros(arm.n_joints), atol=1e-12)
 
 
-def test_on_the_reference_the_rates_are_those_of_the_deflections(arm):
-    """Order 1: d/dt of order 0, against a difference over a tenth of the manifold's own step."""
+@pytest.mark.parametrize("error", [0.0, 0.2])
+def test_the_rates_are_those_of_the_deflections_along_the_slow_motion(arm, error):
+    """Order 1: d/dt of order 0, against a difference over a tenth of the manifold's own step.
+
+    From an error e0 at rest the slow law makes e = e0 (1 + 2.5 t) exp(-2.5 t).
+    """
     reference, h = Sine(arm.n_joints), 1e-4
     surface, zeroth = manifold(arm, "corrected", order=1), manifold(arm, "corrected", order=0)
+
+    def state(t):
+        r, decay = reference.at(0.4 + t), error * np.exp(-2.5 * t)
+        return r.position - (1.0 + 2.5 * t) * decay, r.velocity + 6.25 * t * decay, r
+
     ends = []
-    for t in (0.4 - h, 0.4 + h):
-        r = reference.at(t)
-        updated(zeroth, r.position, r.velocity, r)
+    for t in (-h, h):
+        updated(zeroth, *state(t))
         ends.append(zeroth.amplitude.copy())
-    r = reference.at(0.4)
-    updated(surface, r.position, r.velocity, r)
+    updated(surface, *state(0.0))
     expected = (ends[1] - ends[0]) / (2.0 * h)
     assert_allclose(surface.rate, expected, atol=2e-5 * np.abs(expected).max())
 
@@ -155,8 +161,6 @@ def slow_eigenspace(order, stiffness):
 
 def softened(stiffness):
     """Arm one_link with its bending stiffness scaled."""
-    from flexarm_dynamics.arm.description import scaled
-
     return build(scaled(arm_file.load("one_link"), stiffness=stiffness, damping=0.0))
 
 
@@ -197,22 +201,31 @@ def test_joints_follow_the_reference_on_the_manifold():
 # --------------------------------------------------------------------------- by name
 
 
-def test_orders_out_of_range_are_refused():
-    model = build(arm_file.load("R"))
-    with pytest.raises(ParameterError, match=r"manifold\.order: 7 is above its upper limit \(6\)"):
-        manifold(model, "corrected", order=7)
-    with pytest.raises(ParameterError, match=r"manifold\.order: 2\.0 is not an integer"):
-        manifold(model, "corrected", order=2.0)
+@pytest.mark.parametrize(
+    ("order", "problem"), [(7, r"is above its upper limit \(6\)"), (2.0, "is not an integer")]
+)
+def test_orders_out_of_range_are_refused(arm_r, order, problem):
+    with pytest.raises(ParameterError, match=rf"manifold\.order: {order} {problem}"):
+        manifold(arm_r, "corrected", order=order)
 
 
-def test_a_law_of_another_kind_has_a_corrected_manifold_too(arm):
-    """Without linear error dynamics the law's present acceleration counts."""
-    surface = manifold(arm, "corrected", order=2)
-    surface.slow = SimpleNamespace(
-        torque=surface.slow.torque, error_gains=lambda: None, nominal=surface.slow.nominal
-    )
-    surface._flow = None
-    reference = Sine(arm.n_joints).at(0.2)
-    updated(surface, reference.position, reference.velocity, reference)
-    delta, _, _ = surface.along(reference)
-    assert_allclose(surface.amplitude, delta, atol=1e-8 * np.abs(delta).max())
+@pytest.mark.parametrize("error", [0.0, 0.2])
+def test_a_law_of_another_kind_has_a_corrected_manifold_too(arm, error):
+    """Without linear error dynamics the law adds to the reference's acceleration what it adds now."""
+    surface = manifold(arm, "corrected", {"type": "computed_torque", "ki": [1.0]}, order=1)
+    assert surface.slow.error_gains() is None
+    reference, n, h = Sine(arm.n_joints).at(0.2), arm.n_joints, 1e-4
+    q, qd = reference.position - error, reference.velocity - 0.5 * error
+    terms, torque = updated(surface, q, qd, reference)
+    a, B = slow_subsystem(terms)
+    extra = a + B @ torque - reference.acceleration
+
+    def deflection(t):
+        position, velocity, acceleration = reference.near(t)
+        position += t * (0.5 * t * extra - 0.5 * error) - error
+        there = arm.terms(position, velocity + t * extra - 0.5 * error)
+        return -np.linalg.solve(there.K2, there.M[n:, :n] @ (acceleration + extra) + there.f2)
+
+    assert_allclose(surface.amplitude, deflection(0.0), atol=1e-9 * np.abs(deflection(0.0)).max())
+    expected = (deflection(h) - deflection(-h)) / (2.0 * h)
+    assert_allclose(surface.rate, expected, atol=2e-5 * np.abs(expected).max())
