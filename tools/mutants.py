@@ -233,28 +233,24 @@ LAWS = [
             "gravity and velocity torque: missing",
             "u = np.linalg.solve(B, v - a)",
             "u = np.linalg.solve(B, v)",
-            TESTS + "test_more_slow_laws.py",
         ),
         (
             "resolved_acceleration",
             "null space: missing",
             "return y + self.damped_inverse(J) @ (b - J @ y)",
             "return self.damped_inverse(J) @ (b - J @ y)",
-            TESTS + "test_more_slow_laws.py",
         ),
         (
             "sliding_mode",
             "surface: sign",
             "s = rate + self.slope * error",
             "s = rate - self.slope * error",
-            TESTS + "test_more_slow_laws.py",
         ),
         (
             "adaptive_model_following",
             "regressor: velocity torque missing",
             "Y += self._coriolis(self._difference, q, qd, speed)",
             "Y += 0.0",
-            TESTS + "test_more_slow_laws.py",
         ),
     ),
     *of(
@@ -325,7 +321,7 @@ LAWS = [
         (
             "preview",
             "torque of the coming period",
-            "plan.torque_at(elapsed + 0.5 * self._period)",
+            "plan.torque_at(elapsed + 0.5 * self.settings.period)",
             "0.9 * plan.torque_at(elapsed)",
         ),
     ),
