@@ -53,11 +53,8 @@ DATA = {
     "inertia": ("N", 3, 3),  # of the straight link about its frame's origin, hub included
     "s": ("N", "K"),  # int phi dm; twist: int theta rho I_p dx
     "e": ("N", "K"),  # int x phi dm
-    "gram": (
-        "N",
-        "K",
-        "K",
-    ),  # int phi_j phi_k dm, across directions too; twist: int theta theta rho I_p dx
+    # int phi_j phi_k dm, across directions too; twist: int theta theta rho I_p dx
+    "gram": ("N", "K", "K"),
     "stiffness": ("N", "K", "K"),
     "damping": ("N", "K", "K"),
     "tip": ("N", "K"),  # phi(L)
@@ -80,17 +77,13 @@ DATA = {
 WORK = {
     "frame": ("N+1", 3, 3),  # link to previous link's coordinates
     "omega": ("N+1", 3),  # angular velocity of each link's frame, in its coordinates
-    "carrier": (
-        "N+1",
-        3,
-    ),  # angular velocity of what carries the joint, link coordinates; N: of the tip, link N - 1's
+    # angular velocity of what carries the joint, link coordinates; N: of the tip, link N - 1's
+    "carrier": ("N+1", 3),
     "arm": ("N+1", 3),  # from link i - 1's base to joint i, its coordinates
     "partial": ("N+1", "K", 3),  # d arm / d delta of link i - 1
     "turning": ("N+1", "K", 3),  # angular partial velocity of its tip
-    "bias_a": (
-        "N+1",
-        3,
-    ),  # acceleration of joint i that its parent's al, a0, delta_dd do not explain
+    # acceleration of joint i that its parent's al, a0, delta_dd do not explain
+    "bias_a": ("N+1", 3),
     "bias_al": ("N+1", 3),  # angular likewise
     "c": ("N", 3),
     "J": ("N", 3, 3),
@@ -108,11 +101,8 @@ WORK = {
     "Z": ("N+1", 3, 3),
     "zn": ("N+1", 3),
     "zf": ("N+1", 3),
-    "B": (
-        "N",
-        "K",
-        "K",
-    ),  # L of the articulated modal mass L D L', on its diagonal the inverse of D
+    # L of the articulated modal mass L D L', on its diagonal the inverse of D
+    "B": ("N", "K", "K"),
     "Bd": ("N", "K", "K"),  # L D
     "Ca": ("N", "K", 3),  # rows of its coupling to al
     "Cf": ("N", "K", 3),  # and to a0
@@ -340,7 +330,7 @@ def body_at_nodes(d, w, i, delta, delta_d, om):
         F[k] = 0.0
         for n in range(3):
             J[k, n] = d.inertia[i, k, n]
-    # The straight beam's share is integrated below with the rest.
+    # What the straight beam adds is integrated below with the rest.
     straight = 0.0
     for g in range(G):
         straight += d.node_mass[i, g] * d.node_x[i, g] * d.node_x[i, g]
@@ -940,13 +930,6 @@ def modal_force(d, w, delta_d, force):
             for k in range(d.count[i]):
                 acc -= d.damping[i, j, k] * delta_d[d.first[i] + k]
             force[d.first[i] + j] = acc
-
-
-def accelerations(d, w, q, delta, qd, delta_d, torque, force, none, driven, qdd, delta_dd):
-    """Joint and modal accelerations under joint torque (friction already taken off)."""
-    prepare(d, w, q, delta, qd, delta_d)
-    modal_force(d, w, delta_d, force)
-    forward_dynamics(d, w, qd, torque, force, none[0], none[1], driven, qdd, delta_dd)
 
 
 def derivative(state, torque, data, out):

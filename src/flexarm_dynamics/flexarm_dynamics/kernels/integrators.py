@@ -91,19 +91,9 @@ def runge_kutta_trajectory(
     for k in range(starts.shape[0]):
         begin_row(states, starts, ends, k, change)
         runge_kutta(
-            states[k + 1],
-            starts[k],
-            change,
-            step,
-            substeps,
-            tableau,
-            weights,
-            nodes,
-            stages,
-            net,
-            friction,
-            data,
-        )
+            states[k + 1], starts[k], change, step, substeps, tableau, weights, nodes, stages, net,
+            friction, data,
+        )  # fmt: skip
 
 
 def low_storage(
@@ -148,16 +138,6 @@ def low_storage_trajectory(
     for k in range(starts.shape[0]):
         begin_row(states, starts, ends, k, change)
         low_storage(
-            states[k + 1],
-            starts[k],
-            change,
-            step,
-            substeps,
-            below,
-            weights,
-            nodes,
-            work,
-            net,
-            friction,
-            data,
-        )
+            states[k + 1], starts[k], change, step, substeps, below, weights, nodes, work, net,
+            friction, data,
+        )  # fmt: skip
