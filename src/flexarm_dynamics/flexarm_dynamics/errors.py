@@ -112,6 +112,18 @@ class UnknownComponentError(FlexarmError):
     """A law, observer or model name that no installed package provides."""
 
 
+def check_shape(array, shape, field):
+    """Refuse an array of another shape; `field` is what the error calls it.
+
+    Raises
+    ------
+    ShapeError
+        With both shapes.
+    """
+    if np.shape(array) != shape:
+        raise ShapeError("is the wrong shape", field=field, value=np.shape(array), limit=shape)
+
+
 def check_finite(values, names, field):
     """Refuse measurements that are not finite or beyond any arm's.
 

@@ -40,9 +40,7 @@ def jacobian(function, x, step=STEP):
     for i in range(x.size):
         move = np.zeros(x.size)
         move[i] = step
-        ahead = np.array(
-            function(x + move)
-        )  # a copy: a function may return its own array, used again
+        ahead = np.array(function(x + move))  # a copy: it may be an array that is used again
         columns.append((ahead - function(x - move)) / (2.0 * step))
     return np.stack(columns, axis=1) if columns else np.zeros((np.size(function(x)), 0))
 

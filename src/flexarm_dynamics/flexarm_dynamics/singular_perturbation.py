@@ -10,8 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import matrix_balance
 
-from .errors import DesignError
-
 
 @dataclass(frozen=True)
 class StateSpace:
@@ -47,10 +45,7 @@ def state_space(terms):
         [[np.zeros((n, 2 * m))], [-(H11 @ t.K1 + H12 @ t.K2), -(H11 @ t.C1 + H12 @ t.C2)]]
     )
     A2 = np.block(
-        [
-            [np.zeros((m, m)), np.eye(m)],
-            [-(H21 @ t.K1 + H22 @ t.K2), -(H21 @ t.C1 + H22 @ t.C2)],
-        ]
+        [[np.zeros((m, m)), np.eye(m)], [-(H21 @ t.K1 + H22 @ t.K2), -(H21 @ t.C1 + H22 @ t.C2)]]
     )
     return StateSpace(
         F=F,
@@ -218,31 +213,6 @@ def time_scales(terms, kp=None, kv=None, K_f=None):
     if K_f is not None:
         A2 = A2 + B2 @ K_f
     return TimeScales(slow, np.linalg.eigvals(A2))
-
-
-def perturbation_parameter(slow_frequency, terms_along):
-    """The paper's mu over a range of joint states: highest slow over smallest fast frequency.
-
-    Parameters
-    ----------
-    slow_frequency : float
-        Highest natural frequency of the slow dynamics [rad/s].
-    terms_along : iterable of Terms
-        Terms of (2) over the trajectories or the workspace of interest.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    DesignError
-        Where a fast eigenvalue is zero.
-    """
-    smallest = min(np.abs(np.linalg.eigvals(fast_subsystem(t)[0])).min() for t in terms_along)
-    if smallest == 0.0:
-        raise DesignError("a fast eigenvalue is zero: the deflections have no stiffness here")
-    return float(slow_frequency / smallest)
 
 
 def full_order_matrix(terms, kp, kv, B_inverse, K_f):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import Arm, Flexibility, Gauge, Joint, Link, Mode
+from flexarm_dynamics.arm.description import Arm, Flexibility, Gauge, Joint, Link
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import ModelError, UnknownComponentError
 from flexarm_dynamics.models import model
@@ -24,35 +24,23 @@ def two_links():
     return Arm("two", (Joint("j1"), Joint("j2")), (upper, fore), gauges=gauges)
 
 
-def test_modes_are_named_by_link_direction_and_number():
-    assert Mode("link1", "twist", 3).name == "link1_twist_mode3"
-
-
-def test_modal_coordinates_go_link_by_link_direction_by_direction():
+def test_names_come_link_by_link_direction_by_direction():
     """y before z before twist, whatever the order in the file."""
-    assert two_links().mode_names == (
+    arm = two_links()
+    assert arm.mode_names == (
         "upper_y_mode1",
         "upper_y_mode2",
         "upper_z_mode1",
         "fore_twist_mode1",
         "fore_twist_mode2",
     )
-
-
-def test_names_come_in_order():
-    arm = two_links()
-    assert arm.joint_names == ("j1", "j2")
-    assert arm.gauge_names == ("a", "b")
+    assert (arm.joint_names, arm.gauge_names) == (("j1", "j2"), ("a", "b"))
     assert arm.link("fore") is arm.links[1]
 
 
 def test_rotor_inertia_is_seen_through_the_gear_squared():
     joint = Joint("j", hub_inertia=0.1, rotor_inertia=2e-5, gear_ratio=-50.0)
     assert joint.inertia == pytest.approx(0.15, rel=1e-14)
-
-
-def test_mass_of_a_link_is_that_of_its_beam():
-    assert Link("l", 2.0, 0.3).mass == 0.6
 
 
 def test_arms_cannot_be_changed():
@@ -68,10 +56,7 @@ def test_more_modes_leave_gauges_and_observed_modes_as_they_are():
     assert more.gauges == arm.gauges
     assert replace(more, links=arm.links) == arm
     assert len(arm.modes) == 2  # the first arm is as it was
-
-
-def test_fewer_modes_are_not_observed_either():
-    assert arm_file.load("one_link").with_modes(1).observed_modes == ("link1_y_mode1",)
+    assert arm.with_modes(1).observed_modes == ("link1_y_mode1",)  # fewer are not observed either
 
 
 def test_every_flexible_direction_of_every_link_gets_the_modes():
@@ -81,14 +66,25 @@ def test_every_flexible_direction_of_every_link_gets_the_modes():
     assert rigid.with_modes(3) == rigid
 
 
-def test_measured_frequencies_bound_the_number_of_modes():
-    arm = arm_file.load("P3")
-    assert arm.with_modes(1).links[0].flexible["y"].frequencies == (2.12,)
-    with pytest.raises(
-        ModelError,
-        match="P3: link1 has 2 measured frequencies in y, so at most that many modes, not 3",
-    ):
-        arm.with_modes(3)
+@pytest.mark.parametrize(
+    ("name", "count", "limit"),
+    [
+        ("two_link", 0, "1 to 20"),
+        ("two_link", -1, "1 to 20"),
+        ("two_link", 21, "1 to 20"),
+        ("P3", 3, 2),
+    ],
+)
+def test_a_number_of_modes_out_of_range_is_refused(name, count, limit):
+    """Measured frequencies bound it too: P3 has two."""
+    with pytest.raises(ModelError) as error:
+        arm_file.load(name).with_modes(count)
+    assert (error.value.value, error.value.limit) == (count, limit)
+    assert error.value.field.startswith(f"modes of {name}")
+
+
+def test_fewer_modes_take_the_first_of_the_measured_frequencies():
+    assert arm_file.load("P3").with_modes(1).links[0].flexible["y"].frequencies == (2.12,)
 
 
 def test_the_first_modes_are_the_same_with_more(shipped):

@@ -5,6 +5,8 @@ import copy
 import math
 import re
 from dataclasses import fields, is_dataclass
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -17,7 +19,6 @@ from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import ArmFileError, ModelError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.models.beam import natural_frequencies
 
 FULL = """
 name: full
@@ -25,6 +26,8 @@ description: every field
 source: a test
 units: si
 model: one_link
+foreshortening: true
+finite_slope: true
 gravity: [0.0, -9.81, 0.0]
 joints:
   - name: shoulder
@@ -60,7 +63,8 @@ links:
       y: {modes: 1}
 payload: {mass: 0.2, inertia: [1.0e-3, 2.0e-3, 3.0e-3, 0.0, 0.0, 1.0e-4], offset: [0.05, 0.0, 0.0]}
 gauges:
-  - {name: g1, link: upper, position: 0.0, direction: y, surface_distance: 0.002, gain: 1.1, bias: 1.0e-6, noise: 2.0e-7}
+  - {name: g1, link: upper, position: 0.0, direction: y, surface_distance: 0.002, gain: 1.1, bias: 1.0e-6, noise: 2.0e-7,
+     bits: 12, full_scale: 2.0e-3, drift: 1.0e-8}
   - {name: g2, link: upper, position: 0.6, direction: y, surface_distance: -0.002}
   - {name: g3, link: fore, position: 0.1, surface_distance: 0.001}
 observed_modes: [fore_y_mode1, upper_y_mode1, upper_y_mode2]
@@ -68,22 +72,21 @@ observed_modes: [fore_y_mode1, upper_y_mode1, upper_y_mode2]
 TREE = yaml.safe_load(FULL)
 
 
+def parent(tree, path):
+    """The collection in which a path ends."""
+    return reduce(getitem, path[:-1], tree)
+
+
 def changed(path, value):
     """`FULL` with one field set; a path ends in a key or an index, value None-able."""
     tree = copy.deepcopy(TREE)
-    node = tree
-    for step in path[:-1]:
-        node = node[step]
-    node[path[-1]] = value
+    parent(tree, path)[path[-1]] = value
     return yaml.safe_dump(tree)
 
 
 def without(path):
     tree = copy.deepcopy(TREE)
-    node = tree
-    for step in path[:-1]:
-        node = node[step]
-    del node[path[-1]]
+    del parent(tree, path)[path[-1]]
     return yaml.safe_dump(tree)
 
 
@@ -109,6 +112,7 @@ def test_every_field_is_read():
     arm = arm_file.parse(FULL)
     assert (arm.name, arm.description, arm.source) == ("full", "every field", "a test")
     assert arm.gravity == (0.0, -9.81, 0.0)
+    assert (arm.foreshortening, arm.finite_slope, arm.model) == (True, True, "one_link")
     joint = arm.joints[0]
     assert joint.axis == (0.0, 0.0, 1.0)  # scaled to length one
     assert joint.origin_xyz == (0.1, 0.2, 0.3)
@@ -132,11 +136,9 @@ def test_every_field_is_read():
     assert arm.payload.inertia[1] == (0.0, 2e-3, 1e-4)
     gauge = arm.gauges[0]
     assert (gauge.gain, gauge.bias, gauge.noise) == (1.1, 1e-6, 2e-7)
-    assert arm.gauges[2].direction == "y"
-
-
-def test_one_number_for_the_payloads_inertia_holds_about_every_axis():
-    arm = arm_file.parse(changed(("payload", "inertia"), 2.0e-3))
+    assert (gauge.bits, gauge.full_scale, gauge.drift) == (12, 2e-3, 1e-8)
+    assert gauge.step == 4e-3 / 4096
+    arm = arm_file.parse(changed(("payload", "inertia"), 2.0e-3))  # one number for every axis
     np.testing.assert_array_equal(arm.payload.inertia, 2.0e-3 * np.eye(3))
 
 
@@ -152,7 +154,10 @@ def test_what_is_left_out_takes_its_default():
     assert joint.brake_torque is None
     assert arm.payload.mass == 0.0
     assert arm.modes == () and arm.observed_modes == () and arm.gauges == ()
-    assert arm.model == "chain"
+    assert (arm.foreshortening, arm.finite_slope, arm.model) == (False, False, "chain")
+    gauge = arm_file.parse(FULL).gauges[2]
+    assert (gauge.direction, gauge.bits, gauge.full_scale, gauge.drift) == ("y", 0, 1e-3, 0.0)
+    assert (gauge.step, gauge.range, gauge.uncertainty) == (0.0, (-1e-3, 1e-3), 0.0)
 
 
 def test_observed_modes_come_in_the_order_of_the_modal_coordinates():
@@ -165,16 +170,13 @@ def test_observed_modes_come_in_the_order_of_the_modal_coordinates():
         "fore_y_mode1",
     )
     assert arm.observed_modes == ("upper_y_mode1", "upper_y_mode2", "fore_y_mode1")
-
-
-def test_all_modes_are_observed_unless_the_file_says_otherwise():
-    tree = copy.deepcopy(TREE)
+    tree = copy.deepcopy(TREE)  # all, unless the file names some
     del tree["observed_modes"], tree["gauges"]
     arm = arm_file.parse(yaml.safe_dump(tree))
     assert arm.observed_modes == arm.mode_names
 
 
-def test_rectangular_section_has_the_stiffnesses_of_the_textbook():
+def test_sections_have_the_stiffnesses_of_the_textbook():
     link = arm_file.parse(FULL).links[1]
     b, h, E = 0.002, 0.02, 7.0e10  # along y, along z
     assert link.stiffness["y"] == pytest.approx(E * h * b**3 / 12.0, rel=1e-14)
@@ -183,27 +185,20 @@ def test_rectangular_section_has_the_stiffnesses_of_the_textbook():
     assert link.stiffness["twist"] == pytest.approx(E / 2.6 * 0.312 * h * b**3, rel=2e-3)
     assert link.polar_inertia_per_length == pytest.approx(2700.0 * b * h * (b**2 + h**2) / 12.0)
 
+    def link_of(**section):
+        return arm_file.parse(changed(("links", 1, "section"), section)).links[1]
 
-def test_square_section_has_the_torsion_constant_of_the_textbook():
-    section = {"shape": "rectangle", "size_y": 0.01, "size_z": 0.01, "density": 1.0}
-    text = changed(("links", 1, "section"), section | {"youngs_modulus": 2.6, "shear_modulus": 3.0})
-    stiffness = arm_file.parse(text).links[1].stiffness
-    assert stiffness["twist"] == pytest.approx(3.0 * 0.1406 * 0.01**4, rel=5e-3)
-    assert stiffness["y"] == stiffness["z"]
-
-
-def test_tubular_section_has_the_stiffnesses_of_the_textbook():
-    section = {"shape": "tube", "outer_diameter": 0.02, "wall": 0.002, "density": 1600.0}
-    link = arm_file.parse(
-        changed(("links", 1, "section"), section | {"youngs_modulus": 1e11})
-    ).links[1]
+    square = link_of(shape="rectangle", size_y=0.01, size_z=0.01, density=1.0,
+                     youngs_modulus=2.6, shear_modulus=3.0)  # fmt: skip
+    assert square.stiffness["twist"] == pytest.approx(3.0 * 0.1406 * 0.01**4, rel=5e-3)
+    assert square.stiffness["y"] == square.stiffness["z"]
+    material = {"shape": "tube", "density": 1600.0, "youngs_modulus": 1e11}
+    tube = link_of(outer_diameter=0.02, wall=0.002, **material)
     moment = math.pi * (0.02**4 - 0.016**4) / 64.0
-    assert link.stiffness["y"] == link.stiffness["z"] == pytest.approx(1e11 * moment, rel=1e-13)
-    assert link.stiffness["twist"] == pytest.approx(1e11 / 2.6 * 2.0 * moment, rel=1e-13)
-    assert link.mass_per_length == pytest.approx(1600 * math.pi * (0.01**2 - 0.008**2), rel=1e-12)
-    solid = arm_file.parse(
-        changed(("links", 1, "section"), section | {"youngs_modulus": 1e11, "wall": 0.01})
-    ).links[1]
+    assert tube.stiffness["y"] == tube.stiffness["z"] == pytest.approx(1e11 * moment, rel=1e-13)
+    assert tube.stiffness["twist"] == pytest.approx(1e11 / 2.6 * 2.0 * moment, rel=1e-13)
+    assert tube.mass_per_length == pytest.approx(1600 * math.pi * (0.01**2 - 0.008**2), rel=1e-12)
+    solid = link_of(outer_diameter=0.02, wall=0.01, **material)
     assert solid.mass_per_length == pytest.approx(1600 * math.pi * 0.01**2, rel=1e-13)
 
 
@@ -292,19 +287,13 @@ def test_imperial_section_is_converted():
 # --- shipped files -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["R", "P3", "one_link"])
-def test_shipped_arms_load_by_name_and_by_path(name):
-    arm = arm_file.load(name)
-    assert arm.name == name
-    assert arm_file.load(arm_file.find(name)) == arm
-    assert arm.description and arm.source
-
-
-def test_every_shipped_arm_is_valid():
+def test_every_shipped_arm_is_valid_and_loads_by_name_and_by_path():
     files = [p for d in arm_file.arms_directories() for p in d.glob("*.yaml")]
-    assert len(files) >= 3
+    assert {"R", "P3", "one_link"} <= {path.stem for path in files}
     for path in files:
-        assert arm_file.load(path).name == path.stem
+        arm = arm_file.load(path)
+        assert arm.name == path.stem and arm_file.load(path.stem) == arm
+        assert arm.description and arm.source
 
 
 def test_printed_masses_are_converted_with_the_rest():
@@ -340,12 +329,9 @@ def test_a_name_that_is_no_file_is_refused(name):
 def test_errors_of_a_file_name_the_file_first(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(changed(("links", 0, "length"), -1.0))
-    with pytest.raises(ArmFileError, match=r"^mine\.yaml: links\[0\]\.length: -1\.0 is too small"):
+    with pytest.raises(ArmFileError) as error:
         arm_file.load(path)
-
-
-def test_a_file_that_is_not_text_is_refused(tmp_path):
-    path = tmp_path / "mine.yaml"
+    assert error.value.field == "mine.yaml: links[0].length"
     path.write_bytes(b"name: \xff\xfe")
     with pytest.raises(ArmFileError, match="can't be read"):
         arm_file.load(path)
@@ -376,6 +362,8 @@ NUMBERS = [
     ("links", 1, "section", "youngs_modulus"),
     ("payload", "mass"),
     ("gauges", 0, "noise"),
+    ("gauges", 0, "full_scale"),
+    ("gauges", 0, "drift"),
 ]
 ANY_SIGN = [
     ("gauges", 0, "position"),
@@ -387,7 +375,17 @@ POSITIVE = [
     p
     for p in NUMBERS
     if p[-1]
-    in ("gear_ratio", "smoothing", "velocity", "torque", "length", "mass_per_length", "EI_y", "GJ")
+    in (
+        "gear_ratio",
+        "smoothing",
+        "velocity",
+        "torque",
+        "length",
+        "mass_per_length",
+        "EI_y",
+        "GJ",
+        "full_scale",
+    )
     or "section" in p
 ]
 IN_LISTS = [
@@ -400,7 +398,8 @@ IN_LISTS = [
     ("payload", "inertia", 5),
     ("payload", "offset", 0),
 ]
-named = pytest.mark.parametrize("path", NUMBERS + ANY_SIGN, ids=spelled)
+#: One of each reader: a number, and one in a list.
+READERS = [("links", 0, "length"), ("gravity", 1)]
 
 
 @pytest.mark.parametrize("path", NUMBERS, ids=spelled)
@@ -410,35 +409,34 @@ def test_a_negative_number_is_refused(path):
 
 @pytest.mark.parametrize("path", POSITIVE, ids=spelled)
 def test_zero_is_refused_where_it_has_no_meaning(path):
-    assert refused(changed(path, 0.0)).startswith(
-        f"{spelled(path)}: 0.0 is too small (greater than 0"
-    )
+    message = refused(changed(path, 0.0))
+    assert message.startswith(f"{spelled(path)}: 0.0 is too small (greater than 0")
     assert refused(changed(path, 1e-200)).endswith("is too small (at least 1e-30)")
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("path", NUMBERS + ANY_SIGN + IN_LISTS, ids=spelled)
-def test_a_number_that_is_not_finite_is_refused(path, value):
-    message = refused(changed(path, value))
-    assert message.startswith(f"{spelled(path)}: ")
-    assert message.endswith(f"{value} is not finite")
+def test_every_number_is_checked(path):
+    field = re.escape(spelled(path))
+    assert re.match(rf"{field}: nan is not finite$", refused(changed(path, math.nan)))
+    assert re.match(
+        rf"{field}: 1e\+31 is too large \(at most 1e\+30\)$", refused(changed(path, 1e31))
+    )
+    assert re.match(rf"{field}(\[0\])?: .*number", refused(changed(path, "1.0 m")))
 
 
-@pytest.mark.parametrize("value", [1e31, -1e200, 10**400])
-@pytest.mark.parametrize("path", NUMBERS + ANY_SIGN + IN_LISTS, ids=spelled)
-def test_a_number_beyond_all_measure_is_refused(path, value):
-    message = refused(changed(path, value))
-    assert message.startswith(f"{spelled(path)}: ")
-    assert message.endswith("is too large (at most 1e+30)")
-
-
+@pytest.mark.parametrize("path", READERS, ids=spelled)
 @pytest.mark.parametrize(
-    "value", ["long", "", True, {"a": 1}, [[1.0]], "1.0 m", "1,5", "2020-01-01"], ids=repr
+    ("values", "problem"),
+    [
+        ((math.inf, -math.inf), "is not finite"),
+        ((-1e200, 10**400), "is too large (at most 1e+30)"),
+        (("long", "", True, {"a": 1}, [[1.0]], "1,5", "2020-01-01"), "is not a number"),
+    ],
 )
-@pytest.mark.parametrize("path", NUMBERS + ANY_SIGN + IN_LISTS, ids=spelled)
-def test_what_is_not_a_number_is_refused(path, value):
-    message = refused(changed(path, value))
-    assert re.match(re.escape(spelled(path)) + r"(\[0\])?: .*number", message), message
+def test_what_is_not_a_number_of_an_arm_is_refused(path, values, problem):
+    for value in values:
+        message = refused(changed(path, value))
+        assert message.startswith(f"{spelled(path)}: ") and message.endswith(problem), message
 
 
 @pytest.mark.parametrize(
@@ -453,6 +451,7 @@ def test_what_is_not_a_number_is_refused(path, value):
         ("links", 0, "mass_per_length"),
         ("links", 0, "EI_y"),
         ("links", 0, "GJ"),
+        ("links", 0, "polar_inertia_per_length"),  # as the link twists
         ("links", 0, "flexible", "y", "modes"),
         ("links", 0, "flexible", "z", "frequencies"),
         ("links", 1, "section", "shape"),
@@ -481,6 +480,7 @@ def test_a_missing_field_is_named(path):
         (("links", 0, "flexible", "y", "damping"), "dampng", "'damping'"),
         (("payload", "mass"), "mas", "'mass'"),
         (("gauges", 0, "gain"), "gian", "'gain'"),
+        (("gauges", 0, "full_scale"), "full_scal", "'full_scale'"),
         (("observed_modes",), "observed_mode", "'observed_modes'"),
         (("gravity",), "gravitiy", "'gravity'"),
     ],
@@ -488,9 +488,7 @@ def test_a_missing_field_is_named(path):
 )
 def test_a_misspelt_field_is_named_with_what_is_meant(path, wrong, hint):
     tree = copy.deepcopy(TREE)
-    node = tree
-    for step in path[:-1]:
-        node = node[step]
+    node = parent(tree, path)
     node[wrong] = node.pop(path[-1])
     message = refused(yaml.safe_dump(tree))
     missing = spelled(path) + ": missing"
@@ -594,7 +592,18 @@ def test_a_field_given_twice_is_refused(text, start):
         (("gauges", 0, "position"), -0.1, "-0.1 m is outside upper"),
         (("gauges", 0, "direction"), "x", "'x' is not one of the choices (y, z, twist)"),
         (("gauges", 0, "surface_distance"), 0.0, "a gauge on the neutral axis sees nothing"),
+        (
+            ("gauges", 0, "surface_distance"),
+            2.0,
+            "at most half the length of upper, 0.6 m); in mm?",
+        ),
         (("gauges", 0, "gain"), 0.0, "such a gauge sees nothing"),
+        (("gauges", 0, "bits"), -1, "-1 is out of range (0 to 32)"),
+        (("gauges", 0, "bits"), 33, "33 is out of range (0 to 32)"),
+        (("gauges", 0, "full_scale"), 1e3, "1000.0 is too large (at most 0.1); in microstrain?"),
+        (("gauges", 0, "bias"), 20.0, "20.0 is not within full_scale (0.002); in microstrain?"),
+        (("gauges", 0, "bias"), -2e-3, "is not within full_scale"),
+        (("gauges", 0, "noise"), 0.5, "0.5 is not within full_scale"),
         (("observed_modes",), "upper_y_mode1", "a list of mode names is wanted"),
         (("observed_modes", 0), "upper_y_mode9", "'upper_y_mode9' is not a mode of this arm"),
         (("observed_modes", 1), "fore_y_mode1", "'fore_y_mode1' given twice"),
@@ -602,6 +611,8 @@ def test_a_field_given_twice_is_refused(text, start):
         (("observed_modes", 0), {"a": 1}, "a mapping is not a mode of this arm"),
         (("paper_appendix",), {"beam_mass": 1.0}, "belongs to model paper_appendix"),
         (("model",), 1, "1 is not text"),
+        (("foreshortening",), "yes please", "'yes please' is neither true nor false"),
+        (("finite_slope",), 1, "1 is neither true nor false"),
     ],
     ids=lambda v: spelled(v) if isinstance(v, tuple) else None,
 )
@@ -611,16 +622,13 @@ def test_a_value_without_meaning_is_refused(path, value, words):
     assert words in message
 
 
-def test_names_must_differ():
-    assert refused(changed(("joints", 1, "name"), "shoulder")) == (
-        "joints[1].name: 'shoulder' is the name of joints[0], too"
-    )
-    assert refused(changed(("links", 1, "name"), "upper")) == (
-        "links[1].name: 'upper' is the name of links[0], too"
-    )
-    assert refused(changed(("gauges", 2, "name"), "g1")) == (
-        "gauges[2].name: 'g1' is the name of gauges[0], too"
-    )
+@pytest.mark.parametrize(
+    ("things", "index", "taken"),
+    [("joints", 1, "shoulder"), ("links", 1, "upper"), ("gauges", 2, "g1")],
+)
+def test_names_must_differ(things, index, taken):
+    message = refused(changed((things, index, "name"), taken))
+    assert message == f"{things}[{index}].name: {taken!r} is the name of {things}[0], too"
 
 
 def test_joints_and_links_come_in_pairs():
@@ -754,9 +762,7 @@ KEYS = sorted({p[-1] for base in BASES for p in all_paths(base) if isinstance(p[
 def mutate(draw, tree):
     """Delete, replace, rename, add or repeat one node."""
     path = draw(st.sampled_from(list(all_paths(tree))))
-    node = tree
-    for step in path[:-1]:
-        node = node[step]
+    node = parent(tree, path)
     kind = draw(st.sampled_from(["delete", "replace", "rename", "add", "repeat"]))
     if kind == "delete":
         del node[path[-1]]
@@ -773,7 +779,7 @@ def mutate(draw, tree):
 
 
 @settings(
-    max_examples=400,
+    max_examples=250,
     deadline=None,
     derandomize=True,
     database=None,
@@ -786,7 +792,7 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
     for _ in range(data.draw(st.integers(1, 3))):
         if any(True for _ in all_paths(tree)):
             mutate(data.draw, tree)
-    text = yaml.safe_dump(tree, allow_unicode=True)
+    text = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True)
     try:
         arm = arm_file.parse(text)
     except ArmFileError as error:
@@ -797,6 +803,9 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
         for path, value in leaves(arm):
             if isinstance(value, float) and ".limits" not in path:
                 assert math.isfinite(value), path
+        for g in arm.gauges:
+            assert -g.full_scale <= g.range[0] < 0.0 <= g.range[1] <= g.full_scale <= 0.1
+            assert 0 <= g.bits <= 32 and g.drift >= 0.0 and abs(g.bias) < g.full_scale
 
 
 @settings(max_examples=300, deadline=None, derandomize=True, database=None)
@@ -825,57 +834,6 @@ def test_any_text_is_an_arm_file_error(text):
 # --- arms of several links ------------------------------------------------------------------------
 
 
-def two_links():
-    """The shipped two-link arm as plain data, to be spoilt."""
-    return yaml.safe_load(arm_file.find("two_link").read_text())
-
-
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (
-            lambda d: d["links"][0].update(mass_per_length=0),
-            r"^links\[0\]\.mass_per_length: 0\.0 is too small",
-        ),
-        (
-            lambda d: d["links"][0].update(EI_y=-1),
-            r"^links\[0\]\.EI_y: -1\.0 is too small",
-        ),
-        (lambda d: d["links"][1].update(EI_y=0), r"^links\[1\]\.EI_y: 0\.0 is too small"),
-        (lambda d: d["links"][1].update(length=-1), r"^links\[1\]\.length: -1\.0 is too small"),
-        (
-            lambda d: d["joints"][1].update(axis=[0, 0, 0]),
-            r"^joints\[1\]\.axis: \[0\.0, 0\.0, 0\.0\] is of length zero",
-        ),
-        (
-            lambda d: d["gauges"][3].update(position=0.6),
-            r"^gauges\[3\]\.position: 0\.6 m is outside",
-        ),
-        (lambda d: d["gauges"].pop(), r"^gauges: 1 on link2 in direction y for 2 observed modes"),
-        (lambda d: d["joints"][1].update(parent="link2"), r"^joints\[1\]\.parent: no such field"),
-        (
-            lambda d: d["links"][1].update(name="link1"),
-            r"^links\[1\]\.name: 'link1' is the name of links\[0\], too",
-        ),
-        (lambda d: d["joints"].append({"name": "joint3"}), r"^joints: 3 joints for 2 links"),
-        (
-            lambda d: d["links"][1].update(GJ=3.0, flexible={"twist": {"modes": 1}}),
-            r"^links\[1\]\.polar_inertia_per_length: missing",
-        ),
-        (
-            lambda d: d.update(foreshortening="yes please"),
-            r"^foreshortening: 'yes please' is neither",
-        ),
-        (lambda d: d.update(finite_slope=1), r"^finite_slope: 1 is neither true nor false"),
-    ],
-)
-def test_a_malformed_arm_of_two_links_is_refused_by_path(spoil, message):
-    data = two_links()
-    spoil(data)
-    with pytest.raises(ArmFileError, match=message):
-        arm_file.parse(yaml.safe_dump(data))
-
-
 @pytest.mark.parametrize("text", ["joints: &a [*a]", "joints: &a [{name: j, origin: *a}]"])
 def test_a_file_that_contains_itself_is_refused_by_path(text):
     with pytest.raises(ArmFileError, match=r"^joints\[0\].*a mapping is wanted, not a list"):
@@ -883,24 +841,12 @@ def test_a_file_that_contains_itself_is_refused_by_path(text):
 
 
 def test_a_joint_that_turns_without_moving_mass_is_refused_by_path():
-    data = two_links()
+    data = yaml.safe_load(arm_file.find("two_link").read_text())
     data["joints"][1] |= {"axis": [1, 0, 0], "hub_inertia": 0.0}
     data["payload"] = {}
-    with pytest.raises(ModelError, match=r"^joints\[1\]: joint2 can turn without moving any mass"):
+    with pytest.raises(ModelError) as error:
         model.build(arm_file.parse(yaml.safe_dump(data)))
-
-
-def test_model_levels_and_the_default_model_are_read():
-    data = two_links() | {"foreshortening": True, "finite_slope": True}
-    arm = arm_file.parse(yaml.safe_dump(data))
-    assert (arm.foreshortening, arm.finite_slope, arm.model) == (True, True, "chain")
-    assert not arm_file.load("two_link").foreshortening
-
-
-@pytest.mark.parametrize("count", [0, -1, 21])
-def test_a_number_of_modes_out_of_range_is_refused(count):
-    with pytest.raises(ModelError, match=rf"two_link: {count} modes; from 1 to 20"):
-        arm_file.load("two_link").with_modes(count)
+    assert (error.value.field, error.value.value) == ("joints[1]", "joint2")
 
 
 def test_the_published_frequencies_of_the_two_link_arm():
@@ -910,6 +856,6 @@ def test_the_published_frequencies_of_the_two_link_arm():
     found = []
     for link in arm.links:
         beta = chain.mode_shapes(link.name, "y").beta
-        omega = natural_frequencies(beta, link.length, link.mass_per_length, link.stiffness["y"])
+        omega = (beta / link.length) ** 2 * np.sqrt(link.stiffness["y"] / link.mass_per_length)
         found += list(omega / (2.0 * np.pi))
     np.testing.assert_allclose(found, [0.48, 1.80, 2.18, 15.91], atol=0.005)

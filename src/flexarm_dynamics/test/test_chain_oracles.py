@@ -70,12 +70,8 @@ def assert_vector(ours, theirs, tolerance, what="", scale=None):
 
 
 def rotation(rpy):
-    """URDF's fixed-axis roll, pitch, yaw, written out: R = Rz Ry Rx."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    Rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    Ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    Rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return Rz @ Ry @ Rx
+    """URDF's fixed-axis roll, pitch, yaw."""
+    return Rotation.from_euler("xyz", rpy).as_matrix()
 
 
 def random_inertia(rng, size):
@@ -153,12 +149,7 @@ class Planar:
         }
         in_plane = [gx, gy, 0.0 if others else across]
         self.chain = build(
-            {
-                "gravity": self.base @ in_plane,
-                "joints": joints,
-                "links": links,
-                "payload": payload,
-            }
+            {"gravity": self.base @ in_plane, "joints": joints, "links": links, "payload": payload}
         )
         data = [
             self._link(joint, link, direction) for joint, link in zip(joints, links, strict=True)
@@ -216,56 +207,53 @@ class Planar:
         return out[self.all]
 
 
-planar_arms = pytest.mark.parametrize(
-    ("seed", "shapes", "plane"),
-    [
-        (1, "clamped_free", "y"),
-        (2, "loaded", "y"),
-        (3, "from_frequencies", "y"),
-        (4, "loaded", "z"),
-        (5, "from_frequencies", "z"),
-    ],
-)
+PLANAR = [
+    (1, "clamped_free", "y"),
+    (2, "loaded", "y"),
+    (3, "from_frequencies", "y"),
+    (4, "loaded", "z"),
+    (5, "from_frequencies", "z"),
+]
+planar_arms = pytest.mark.parametrize(("seed", "shapes", "plane"), PLANAR)
 STATES = 5
 
 
-@pytest.mark.slow
-def test_symbolic_arm_against_quadrature():
-    errors = symbolic.check(states=2)
-    # h is differenced numerically there.
-    assert errors["M"] < 1e-13 and errors["g"] < 1e-13 and errors["h"] < 1e-10, errors
-
-
 @planar_arms
-def test_planar_mass_matrix(seed, shapes, plane):
+def test_planar_equations_of_motion(seed, shapes, plane):
     arm = Planar(seed, shapes, plane)
+    twin, still = arm.twin, (np.zeros(2), np.zeros(4))
     for _ in range(STATES):
         q, delta, qd, delta_d = arm.state()
-        terms = arm.chain.terms(q, qd, delta, delta_d)
-        theirs = arm.twin.M(q, delta)
-        assert_matrix(terms.M, theirs, 1e-10)
-        v = np.concatenate([qd, delta_d])
+        M, v = twin.M(q, delta), np.concatenate([qd, delta_d])
+        assert_matrix(arm.chain.terms(q, qd, delta, delta_d).M, M, 1e-10)
         energy = arm.chain.kinetic_energy(q, qd, delta, delta_d)
-        assert energy == pytest.approx(0.5 * v @ theirs @ v, rel=1e-10)
+        assert energy == pytest.approx(0.5 * v @ M @ v, rel=1e-10)
+        g, elastic = twin.g(q, delta), twin.K[:, 2:] @ delta
+        assert_vector(arm.force(q, delta, *still) - elastic, g, 1e-10, "g")
+        theirs = twin.h(q, delta, qd, delta_d) + g + elastic
+        assert_vector(arm.force(q, delta, qd, delta_d), theirs, 1e-10, "force")
+        torque, state = arm.rng.standard_normal(2), np.concatenate([q, delta, v])
+        rates = arm.chain.derivative(state, torque)
+        assert_vector(rates[:6], v, 1e-15, "rates")
+        pushed = np.concatenate([torque, np.zeros(4)]) - theirs
+        assert_vector(M @ rates[6:], pushed, 1e-9, "M acceleration")
+        tip = np.append(twin.tip(q, delta), 0.0)
+        assert_vector(arm.chain.tip_position(q, delta), arm.start + arm.base @ tip, 1e-12, "tip")
+        e = 1e-6
+        ahead, behind = (np.append(twin.tip(q + k * qd, delta + k * delta_d), 0) for k in (e, -e))
+        velocity = arm.base @ (ahead - behind) / (2 * e)
+        ours = arm.chain.tip_velocity(q, qd, delta, delta_d)
+        assert_vector(ours, velocity, 1e-7, "tip velocity")
 
 
 @planar_arms
-def test_planar_velocity_forces(seed, shapes, plane):
-    arm = Planar(seed, shapes, plane, gravity=False)
-    for _ in range(STATES):
-        q, delta, qd, delta_d = arm.state()
-        elastic = arm.twin.K[:, 2:] @ delta
-        h = arm.twin.h(q, delta, qd, delta_d)
-        assert_vector(arm.force(q, delta, qd, delta_d) - elastic, h, 1e-10, "h")
-
-
-@planar_arms
-def test_planar_velocity_forces_one_rate_at_a_time(seed, shapes, plane):
-    """Each rate alone and each pair: a wrong term can't hide behind a large one."""
+def test_planar_velocity_and_elastic_forces_by_themselves(seed, shapes, plane):
+    """Without gravity: elastic forces alone, then each rate alone and each pair, so that no term hides another."""
     arm = Planar(seed, shapes, plane, gravity=False)
     q, delta, qd, delta_d = arm.state()
     zd = np.concatenate([qd, delta_d])
     at_rest = arm.force(q, delta, np.zeros(2), np.zeros(4))
+    assert_vector(at_rest, arm.twin.K[:, 2:] @ delta, 1e-10, "K delta")
     for i in range(6):
         for j in range(i, 6):
             kept = np.zeros(6)
@@ -275,58 +263,6 @@ def test_planar_velocity_forces_one_rate_at_a_time(seed, shapes, plane):
             # Some are no more than the rounding of the elastic forces.
             scale = max(np.abs(h).max(), 1e-4 * np.abs(at_rest).max())
             assert_vector(ours, h, 1e-10, f"h of rates {i}, {j}", scale)
-
-
-@planar_arms
-def test_planar_gravity(seed, shapes, plane):
-    arm = Planar(seed, shapes, plane)
-    for _ in range(STATES):
-        q, delta, _, _ = arm.state()
-        elastic = arm.twin.K[:, 2:] @ delta
-        ours = arm.force(q, delta, np.zeros(2), np.zeros(4)) - elastic
-        assert_vector(ours, arm.twin.g(q, delta), 1e-10, "g")
-
-
-@planar_arms
-def test_planar_elastic_forces(seed, shapes, plane):
-    arm = Planar(seed, shapes, plane, gravity=False)
-    for _ in range(STATES):
-        q, delta, _, _ = arm.state()
-        ours = arm.force(q, delta, np.zeros(2), np.zeros(4))
-        assert_vector(ours, arm.twin.K[:, 2:] @ delta, 1e-10, "K delta")
-
-
-@planar_arms
-def test_planar_forces_together(seed, shapes, plane):
-    arm = Planar(seed, shapes, plane)
-    for _ in range(STATES):
-        q, delta, qd, delta_d = arm.state()
-        twin = arm.twin
-        theirs = twin.h(q, delta, qd, delta_d) + twin.g(q, delta) + twin.K[:, 2:] @ delta
-        assert_vector(arm.force(q, delta, qd, delta_d), theirs, 1e-10, "force")
-        torque = arm.rng.standard_normal(2)
-        state = np.concatenate([q, delta, qd, delta_d])
-        rates = arm.chain.derivative(state, torque)
-        pushed = np.concatenate([torque, np.zeros(4)]) - theirs
-        assert_vector(rates[:6], state[6:], 1e-15, "rates")
-        assert_vector(twin.M(q, delta) @ rates[6:], pushed, 1e-9, "M acceleration")
-
-
-@planar_arms
-def test_planar_tip(seed, shapes, plane):
-    arm = Planar(seed, shapes, plane)
-    for _ in range(STATES):
-        q, delta, qd, delta_d = arm.state()
-        tip = np.append(arm.twin.tip(q, delta), 0.0)
-        theirs = arm.start + arm.base @ tip
-        assert_vector(arm.chain.tip_position(q, delta), theirs, 1e-12, "tip")
-        e = 1e-6
-        ahead, behind = (
-            np.append(arm.twin.tip(q + k * qd, delta + k * delta_d), 0) for k in (e, -e)
-        )
-        velocity = arm.base @ (ahead - behind) / (2 * e)
-        ours = arm.chain.tip_velocity(q, qd, delta, delta_d)
-        assert_vector(ours, velocity, 1e-7, "tip velocity")
 
 
 @pytest.mark.parametrize("plane", ["y", "z"])
@@ -518,8 +454,6 @@ NONE = np.zeros(0)
 
 def test_mujoco_by_hand():
     """The double pendulum with hubs, geared rotors, motor and payload, from a textbook's formulae."""
-    rpy = [0.3, -1.1, 2.0]  # the two rotations used below mean the same
-    assert np.abs(Rotation.from_euler("xyz", rpy).as_matrix() - rotation(rpy)).max() < 1e-15
     joint = {"axis": [0, 0, 1.0], "motor_mass": 0.7}
     first = {**joint, "hub_inertia": 0.05, "rotor_inertia": 3e-3, "gear_ratio": 4.0}
     second = {**joint, "hub_inertia": 0.08, "rotor_inertia": 2e-3, "gear_ratio": 7.0}
@@ -590,40 +524,33 @@ def test_rigid_arm(count, without):
 # --- c) one link, against its closed form ------------------------------------------------------
 
 
-@pytest.mark.parametrize("damping", [None, [0.01, 0.02]])
-@pytest.mark.parametrize("modes", [1, 2, 4])
-@pytest.mark.parametrize("shape", ["clamped_free", "loaded", "from_frequencies"])
-def test_one_link_closed_form(shape, modes, damping):
-    rng = np.random.default_rng(7 + modes)
+ONE_LINK_SHAPES = ("clamped_free", "loaded", "from_frequencies")
+
+
+def one_link_data(rng, shape, modes=2, damping=None):
+    """A one-link arm with a tilted base and a geared rotor, as the file's dicts."""
     bending = {"modes": modes, "shape": shape}
     if shape == "from_frequencies":
         bending["frequencies"] = [3.1, 17.0, 52.0, 110.0][:modes]
     if damping:
         bending["damping"] = damping[:modes]
     rpy = rng.uniform(-1.5, 1.5, 3)
-    data = {
+    joint = {"hub_inertia": 0.04, "rotor_inertia": 2e-5, "gear_ratio": 50.0, "motor_mass": 1.3}
+    link = {"length": 0.9, "mass_per_length": 0.31, "EI_y": 6.5, "flexible": {"y": bending}}
+    return {
         "gravity": rotation(rpy) @ [1.7, -9.2, 0.0],
-        "joints": [
-            {
-                "name": "joint1",
-                "origin": {"xyz": [0.1, -0.2, 0.3], "rpy": rpy},
-                "hub_inertia": 0.04,
-                "rotor_inertia": 2e-5,
-                "gear_ratio": 50.0,
-                "motor_mass": 1.3,
-            }
-        ],
-        "links": [
-            {
-                "name": "link1",
-                "length": 0.9,
-                "mass_per_length": 0.31,
-                "EI_y": 6.5,
-                "flexible": {"y": bending},
-            }
-        ],
+        "joints": [{"name": "joint1", "origin": {"xyz": [0.1, -0.2, 0.3], "rpy": rpy}, **joint}],
+        "links": [{"name": "link1", **link}],
         "payload": {"mass": 0.21, "inertia": [1e-3, 2e-3, 3e-3, 0, 0, 0]},
     }
+
+
+@pytest.mark.parametrize("damping", [None, [0.01, 0.02]])
+@pytest.mark.parametrize("modes", [1, 2, 4])
+@pytest.mark.parametrize("shape", ONE_LINK_SHAPES)
+def test_one_link_closed_form(shape, modes, damping):
+    rng = np.random.default_rng(7 + modes)
+    data = one_link_data(rng, shape, modes, damping)
     chain, closed = build(data), build({**data, "model": "one_link"})
     assert type(chain) is not type(closed), "the default model is the closed form itself"
     energies = []
@@ -646,10 +573,7 @@ def test_one_link_closed_form(shape, modes, damping):
             assert_vector(a, b, 1e-12, name, max(np.abs(b).max(), 1e-3))
         for a, b in (
             (chain.tip_position(q, delta), closed.tip_position(q, delta)),
-            (
-                chain.tip_velocity(q, qd, delta, delta_d),
-                closed.tip_velocity(q, qd, delta, delta_d),
-            ),
+            (chain.tip_velocity(q, qd, delta, delta_d), closed.tip_velocity(q, qd, delta, delta_d)),
         ):
             assert_vector(a, b, 1e-12, "tip")
         energies.append((chain.potential_energy(q, delta), closed.potential_energy(q, delta)))
@@ -750,13 +674,18 @@ def differences(function, z, n):
 STEP = 1e-2
 
 
-@pytest.mark.parametrize("seed", [21, 22, 23])
-def test_spatial_arm_obeys_lagrange(seed):
+@pytest.mark.parametrize("which", [21, 22, 23, *ONE_LINK_SHAPES])
+def test_an_arm_obeys_lagrange(which):
     """Forces from the model's own mass matrix and potential energy; the tip's velocity from its position.
 
-    No second derivation: M itself is compared in the other tests.
+    No second derivation: M itself is compared in the other tests. A number: a random spatial chain; a shape: the
+    closed form of one link.
     """
-    chain, rng = spatial_arm(seed)
+    if which in ONE_LINK_SHAPES:
+        rng = np.random.default_rng(24)
+        chain = build({**one_link_data(rng, which), "model": "one_link"})
+    else:
+        chain, rng = spatial_arm(which)
     n, m = chain.n_joints, chain.n_modes
     zero = np.zeros(n + m)
 
@@ -858,10 +787,7 @@ def test_spatial_mass_and_gravity(seed):
     masses = np.concatenate(
         [
             np.concatenate(
-                [
-                    [joint["motor_mass"]],
-                    link["mass_per_length"] * link["length"] * weights,
-                ]
+                [[joint["motor_mass"]], link["mass_per_length"] * link["length"] * weights]
             )
             for joint, link in zip(data["joints"], data["links"], strict=True)
         ]

@@ -88,10 +88,9 @@ def heavy_one_link(shipped):
 
 def test_a_point_out_of_reach_is_refused_with_its_distance(shipped):
     arm = shipped("two_link")
-    with pytest.raises(
-        ModelError, match=r"two_link: the tip can't be at \[1\.2, 0, 0\] m.* 0\.2 m away"
-    ):
+    with pytest.raises(ModelError, match=r" 0\.2 m away") as error:
         ik.solve(arm, [1.2, 0.0, 0.0], [0.3, 0.2])
+    assert (error.value.field, error.value.value) == ("tip of two_link", [1.2, 0.0, 0.0])
     with pytest.raises(ModelError, match=r"0\.1 m away"):  # out of the plane
         ik.solve(arm, [0.5, 0.5, 0.1], [0.3, 0.2])
 
@@ -110,9 +109,13 @@ def test_joint_limits_are_kept(shipped):
 
 def test_wrong_shapes_and_numbers_are_refused(shipped):
     arm = shipped("two_link")
-    with pytest.raises(ShapeError, match=r"shape \(2,\), wanted \(3,\)"):
-        ik.solve(arm, [1.0, 0.0])
-    with pytest.raises(ShapeError, match=r"start has shape \(1,\), wanted \(2,\)"):
-        ik.solve(arm, [1.0, 0.0, 0.0], [0.0])
-    with pytest.raises(ModelError, match="it must be finite"):
+    for target, start, field, shapes in (
+        ([1.0, 0.0], None, "tip position", ((2,), (3,))),
+        ([1.0, 0.0, 0.0], [0.0], "start", ((1,), (2,))),
+    ):
+        with pytest.raises(ShapeError) as error:
+            ik.solve(arm, target, start)
+        assert error.value.field == field
+        assert (error.value.value, error.value.limit) == shapes
+    with pytest.raises(ModelError, match=r"tip position: .* is not finite"):
         ik.solve(arm, [np.nan, 0.0, 0.0])

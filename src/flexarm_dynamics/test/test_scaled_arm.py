@@ -60,14 +60,15 @@ def test_damping_is_scaled_alone(name):
 
 
 @pytest.mark.parametrize(
-    ("factors", "message"),
+    ("name", "value", "limit"),
     [
-        ({"payload": -1.0}, r"R: payload times -1\.0: a finite factor not below 0"),
-        ({"stiffness": 0.0}, r"R: stiffness times 0\.0: a finite factor above 0"),
-        ({"damping": np.inf}, r"R: damping times inf"),
-        ({"payload": np.nan}, r"R: payload times nan"),
+        ("payload", -1.0, "not below 0, finite"),
+        ("stiffness", 0.0, "above 0, finite"),
+        ("damping", np.inf, "not below 0, finite"),
+        ("payload", np.nan, "not below 0, finite"),
     ],
 )
-def test_impossible_factors_are_refused_by_name(factors, message):
-    with pytest.raises(ModelError, match=message):
-        scaled(arm_file.load("R"), **factors)
+def test_impossible_factors_are_refused_by_name(name, value, limit):
+    with pytest.raises(ModelError) as error:
+        scaled(arm_file.load("R"), **{name: value})
+    assert (error.value.field, error.value.limit) == (f"factor of the {name} of R", limit)

@@ -10,8 +10,7 @@ from scipy.linalg import solve_continuous_are
 from flexarm_dynamics import singular_perturbation as sp
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Friction
-from flexarm_dynamics.arm.units import POUND_FORCE, POUND_FORCE_FOOT
-from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.arm.units import POUND_FORCE
 from flexarm_dynamics.models.model import Terms, build
 from flexarm_dynamics.models.one_link import OneLink
 
@@ -146,10 +145,7 @@ def test_state_space_of_several_joints_is_the_solution_of_the_equations_of_motio
     s = sp.state_space(t)
     qd, delta, delta_d, u = (rng.standard_normal(k) for k in (2, 3, 3, 2))
     force = np.concatenate(
-        [
-            u - t.f1 - t.C1 @ delta_d - t.K1 @ delta,
-            -t.f2 - t.C2 @ delta_d - t.K2 @ delta,
-        ]
+        [u - t.f1 - t.C1 @ delta_d - t.K1 @ delta, -t.f2 - t.C2 @ delta_d - t.K2 @ delta]
     )
     acceleration = np.linalg.solve(t.M, force)
     x, z = np.concatenate([rng.standard_normal(2), qd]), np.concatenate([delta, delta_d])
@@ -197,15 +193,12 @@ def test_case_study_is_stabilisable(name, shipped):
 
 
 def test_a_mode_that_the_torque_does_not_reach_is_not_stabilisable():
-    assert sp.is_stabilisable(*sp.fast_subsystem(two_modes(0.2)))[0]
+    A2, B2 = sp.fast_subsystem(two_modes(0.2))
+    assert sp.is_stabilisable(A2, B2)[0]
+    assert not sp.is_stabilisable(A2, 0.0 * B2)[0]
     ok, worst = sp.is_stabilisable(*sp.fast_subsystem(two_modes(0.0)))
     assert ok is False
     assert worst < 1e-14
-
-
-def test_no_torque_at_all_is_not_stabilisable():
-    A2, B2 = sp.fast_subsystem(two_modes(0.2))
-    assert not sp.is_stabilisable(A2, 0.0 * B2)[0]
 
 
 def test_a_mode_that_decays_by_itself_matters_only_within_the_margin():
@@ -260,6 +253,9 @@ def test_time_scales_of_the_case_study(shipped, errata):
     slowest = float(errata["R"]["open_omega_rad_per_s"][0])
     assert scales.mu == pytest.approx(2.5 / slowest, rel=1e-4)
     assert scales.separation == pytest.approx(1.0 / scales.mu, rel=1e-14)
+    opened = sp.time_scales(t)
+    np.testing.assert_array_equal(opened.slow, [0.0, 0.0])
+    assert (opened.mu, opened.separation) == (0.0, np.inf)
 
 
 def test_time_scales_of_the_closed_fast_loop(shipped):
@@ -269,28 +265,6 @@ def test_time_scales_of_the_closed_fast_loop(shipped):
     omega, zeta = sp.frequencies_and_damping(closed.fast)
     np.testing.assert_allclose(omega, [18.578, 90.402], rtol=1e-4)
     np.testing.assert_allclose(zeta, [0.7755, 0.4052], rtol=1e-3)
-
-
-def test_open_loop_joints_are_infinitely_slow(shipped):
-    scales = sp.time_scales(shipped("R").terms(REST, REST))
-    np.testing.assert_array_equal(scales.slow, [0.0, 0.0])
-    assert scales.mu == 0.0
-    assert scales.separation == np.inf
-
-
-def test_perturbation_parameter_is_the_worst_along_the_way(shipped):
-    arm_model = shipped("one_link")
-    along = [arm_model.terms(REST, np.array([w])) for w in (0.0, 5.0, 2.0)]
-    smallest = np.abs(np.linalg.eigvals(sp.fast_subsystem(along[1])[0])).min()
-    mu = sp.perturbation_parameter(2.5, iter(along))
-    assert mu == pytest.approx(2.5 / smallest, rel=1e-13)
-    assert mu > sp.perturbation_parameter(2.5, along[:1])
-
-
-def test_a_mode_without_stiffness_has_no_time_scale(shipped):
-    t = replace(two_modes(0.2), K2=np.zeros((2, 2)))
-    with pytest.raises(DesignError, match="a fast eigenvalue is zero"):
-        sp.perturbation_parameter(2.5, [t])
 
 
 # --- full order closed loop --------------------------------------------------------------------
@@ -405,55 +379,22 @@ def pair(omega, zeta):
     return np.roots([1.0, 2.0 * zeta * omega, omega**2])
 
 
-def test_frequency_and_damping_of_known_polynomials():
-    poles = np.concatenate([pair(90.0, 0.4), pair(3.0, 0.05), pair(20.0, 0.75)])
-    omega, zeta = sp.frequencies_and_damping(poles)
-    np.testing.assert_allclose(omega, [3.0, 20.0, 90.0], rtol=1e-13)
-    np.testing.assert_allclose(zeta, [0.05, 0.75, 0.4], rtol=1e-12)
-
-
-def test_two_real_poles_are_an_overdamped_pair():
-    omega, zeta = sp.frequencies_and_damping(np.concatenate([pair(5.0, 1.7), pair(2.0, 0.3)]))
-    np.testing.assert_allclose(omega, [2.0, 5.0], rtol=1e-13)
-    np.testing.assert_allclose(zeta, [0.3, 1.7], rtol=1e-13)
-
-
-def test_undamped_and_unstable_poles_show_as_such():
-    omega, zeta = sp.frequencies_and_damping(np.array([7j, -7j]))
-    assert (omega[0], zeta[0]) == (7.0, 0.0)
-    assert sp.frequencies_and_damping(pair(4.0, -0.2))[1][0] == pytest.approx(-0.2, rel=1e-13)
-    omega, zeta = sp.frequencies_and_damping(np.array([2.0, 8.0]))
-    assert (omega[0], zeta[0]) == (4.0, -1.25)
-    assert sp.frequencies_and_damping(np.array([-2.0, 8.0]))[1][0] < 0.0
-
-
-def test_a_single_real_pole_is_not_lost():
-    omega, zeta = sp.frequencies_and_damping(np.concatenate([pair(4.0, 0.2), [-9.0]]))
-    np.testing.assert_allclose(omega, [4.0, 9.0], rtol=1e-13)
-    np.testing.assert_allclose(zeta, [0.2, 1.0], rtol=1e-13)
-
-
-def test_integrators_have_frequency_zero():
-    omega, zeta = sp.frequencies_and_damping(np.zeros(2))
-    assert (omega[0], zeta[0]) == (0.0, 1.0)
-
-
-def test_torque_and_deflection_units_do_not_matter_to_the_poles(shipped, errata):
-    """Gains converted to SI close the same loop as the paper's units do."""
-    K, kp, kv = gains(shipped("R"), errata)
-    t = shipped("R").terms(REST, REST)
-    A = sp.full_order_matrix(t, kp, kv, t.M[:1, :1], K)
-    M = t.M / np.block(
-        [
-            [np.full((1, 1), POUND_FORCE_FOOT), np.full((1, 2), POUND_FORCE)],
-            [np.full((2, 1), POUND_FORCE), np.full((2, 2), POUND_FORCE / 0.3048)],
-        ]
-    )
-    imperial = replace(t, M=M, K2=t.K2 * 0.3048 / POUND_FORCE)
-    same = sp.full_order_matrix(imperial, kp, kv, M[:1, :1], K / POUND_FORCE)
-    np.testing.assert_allclose(
-        np.sort_complex(np.linalg.eigvals(A)), np.sort_complex(np.linalg.eigvals(same)), rtol=1e-8
-    )
+@pytest.mark.parametrize(
+    ("poles", "omega", "zeta"),
+    [
+        ([*pair(90.0, 0.4), *pair(3.0, 0.05), *pair(20.0, 0.75)], [3.0, 20.0, 90.0], [0.05, 0.75, 0.4]),
+        ([*pair(5.0, 1.7), *pair(2.0, 0.3)], [2.0, 5.0], [0.3, 1.7]),  # two real ones are a pair
+        ([7j, -7j], [7.0], [0.0]),
+        (pair(4.0, -0.2), [4.0], [-0.2]),
+        ([2.0, 8.0], [4.0], [-1.25]),
+        ([-2.0, 8.0], [4.0], [-0.75]),
+        ([*pair(4.0, 0.2), -9.0], [4.0, 9.0], [0.2, 1.0]),  # a single one is not lost
+        ([0.0, 0.0], [0.0], [1.0]),  # integrators
+    ],
+)  # fmt: skip
+def test_frequencies_and_damping_of_known_poles(poles, omega, zeta):
+    found = sp.frequencies_and_damping(np.array(poles))
+    np.testing.assert_allclose(found, [omega, zeta], rtol=1e-12)
 
 
 @pytest.mark.parametrize("gravity", [True, False])

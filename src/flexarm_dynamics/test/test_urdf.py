@@ -110,7 +110,7 @@ def test_sections_of_a_linear_picture_grow_with_what_they_are_multiplied_by():
 
 
 def test_sections_refuse_a_state_of_another_arm(shipped):
-    with pytest.raises(ShapeError, match="delta has shape"):
+    with pytest.raises(ShapeError, match="delta: "):
         Sections(shipped("two_link"), 2).frames([0.0, 0.0], [0.0])
 
 
@@ -234,9 +234,9 @@ def test_inertials_are_those_of_the_arm(shipped, name):
 
 def test_names_that_meet_and_no_pieces_are_refused(shipped):
     m = shipped("two_link")
-    with pytest.raises(ModelError, match="0 pieces"):
+    with pytest.raises(ModelError, match="pieces of a link of two_link: 0 is too few"):
         urdf.PieceChain(m, 0)
     first, second = m.arm.links
     arm = replace(m.arm, links=(first, replace(second, name="link1_tip")), gauges=())
-    with pytest.raises(ModelError, match="link1_tip; give"):
+    with pytest.raises(ModelError, match="'link1_tip' is the name of two parts"):
         urdf.PieceChain(model.build(arm), 2).urdf()

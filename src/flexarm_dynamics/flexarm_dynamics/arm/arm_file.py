@@ -97,6 +97,10 @@ class _Section:
         name = number(key) if isinstance(key, str) else show(key)
         return f"{self.path}.{name}" if self.path else name
 
+    def error(self, key, problem, **more):
+        """The error about one of its fields."""
+        return ArmFileError(self.at(key), problem, **more)
+
     def has(self, key):
         self.read.add(key)
         return self.data.get(key) is not None
@@ -104,7 +108,7 @@ class _Section:
     def raw(self, key, default=None, required=False):
         if not self.has(key):
             if required:
-                raise ArmFileError(self.at(key), "missing", hint=self._near(key))
+                raise self.error(key, "missing", hint=self._near(key))
             return default
         return self.data[key]
 
@@ -122,9 +126,9 @@ class _Section:
         if positive and not value >= 1.0 / MAX_NUMBER:
             unit = "" if SI_UNIT[dimension] == "-" else f" {SI_UNIT[dimension]}"
             limit = f"at least {1.0 / MAX_NUMBER:g}" if value > 0.0 else f"greater than 0{unit}"
-            raise ArmFileError(self.at(key), "is too small", value=value, limit=limit)
+            raise self.error(key, "is too small", value=value, limit=limit)
         if low is not None and value < low:
-            raise ArmFileError(self.at(key), "is too small", value=value, limit=f"at least {low:g}")
+            raise self.error(key, "is too small", value=value, limit=f"at least {low:g}")
         return value * to_si(self.system, dimension)
 
     def vector(self, key, length, dimension="none", default=None):
@@ -134,7 +138,7 @@ class _Section:
             return value
         if not isinstance(value, list) or len(value) != length:
             what = f"{len(value)} values" if isinstance(value, list) else _kind(value)
-            raise ArmFileError(self.at(key), f"a list of {length} numbers is wanted, not {what}")
+            raise self.error(key, f"a list of {length} numbers is wanted, not {what}")
         factor = to_si(self.system, dimension)
         return tuple(_number(v, f"{self.at(key)}[{i}]") * factor for i, v in enumerate(value))
 
@@ -153,7 +157,7 @@ class _Section:
         if choices and value not in choices:
             limit, hint = ", ".join(choices), _meant(value, choices)
             problem = "is not one of the choices"
-            raise ArmFileError(self.at(key), problem, value=value, limit=limit, hint=hint)
+            raise self.error(key, problem, value=value, limit=limit, hint=hint)
         return value
 
     def flag(self, key):
@@ -165,7 +169,7 @@ class _Section:
     def name(self):
         value = self.text("name")
         if not value.strip():
-            raise ArmFileError(self.at("name"), "empty")
+            raise self.error("name", "empty")
         return value
 
     def section(self, key):
@@ -174,7 +178,7 @@ class _Section:
     def sections(self, key, required=False):
         value = self.raw(key, [], required)
         if not isinstance(value, list):
-            raise ArmFileError(self.at(key), f"a list is wanted, not {_kind(value)}")
+            raise self.error(key, f"a list is wanted, not {_kind(value)}")
         return [_Section(v, f"{self.at(key)}[{i}]", self.system) for i, v in enumerate(value)]
 
     def done(self):
@@ -183,7 +187,7 @@ class _Section:
             if key not in self.read:
                 known = sorted(self.read)
                 limit, hint = f"known here: {', '.join(known)}", _meant(str(key), known)
-                raise ArmFileError(self.at(key), "no such field", limit=limit, hint=hint)
+                raise self.error(key, "no such field", limit=limit, hint=hint)
 
 
 def _meant(name, known):
@@ -249,10 +253,8 @@ def _limits(joint):
     )
     s.done()
     if not out.position[0] < out.position[1]:
-        low_high = list(out.position)
-        raise ArmFileError(
-            s.at("position"), "is empty", value=low_high, hint="low must be below high"
-        )
+        low_high, hint = list(out.position), "low must be below high"
+        raise s.error("position", "is empty", value=low_high, hint=hint)
     return out
 
 
@@ -260,7 +262,7 @@ def _joint(s):
     axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
     norm = math.hypot(*axis)
     if norm == 0.0:
-        raise ArmFileError(s.at("axis"), "is of length zero", value=list(axis))
+        raise s.error("axis", "is of length zero", value=list(axis))
     origin = {"xyz": (0.0,) * 3, "rpy": (0.0,) * 3}
     if s.has("origin"):
         o = s.section("origin")
@@ -303,10 +305,10 @@ def _flexibility(s):
         frequencies = s.vector("frequencies", count, "frequency")
     if shape == "from_frequencies" and len(frequencies) < modes:
         problem = f"{len(frequencies)} frequencies for {modes} modes"
-        raise ArmFileError(s.at("frequencies"), problem, hint="give one each")
+        raise s.error("frequencies", problem, hint="give one each")
     if any(f <= 0.0 for f in frequencies) or list(frequencies) != sorted(set(frequencies)):
         problem = "must be positive and ascending"
-        raise ArmFileError(s.at("frequencies"), problem, value=list(frequencies))
+        raise s.error("frequencies", problem, value=list(frequencies))
     damping = ()
     if s.has("damping"):
         given = s.raw("damping")
@@ -317,7 +319,7 @@ def _flexibility(s):
         )
     if any(not 0.0 <= z < 1.0 for z in damping):
         limit = "from 0 to below 1"
-        raise ArmFileError(s.at("damping"), "is out of range", value=list(damping), limit=limit)
+        raise s.error("damping", "is out of range", value=list(damping), limit=limit)
     s.done()
     return Flexibility(modes, shape, frequencies, damping)
 
@@ -341,7 +343,7 @@ def _section_properties(s):
         wall = s.number("wall", "length", positive=True)
         if 2.0 * wall > outer:
             problem = "m is more than the radius"
-            raise ArmFileError(s.at("wall"), problem, value=wall, limit=f"{outer / 2} m")
+            raise s.error("wall", problem, value=wall, limit=f"{outer / 2} m")
         inner = outer - 2.0 * wall
         area = math.pi * (outer**2 - inner**2) / 4.0
         inertia_y = inertia_z = math.pi * (outer**4 - inner**4) / 64.0
@@ -358,7 +360,7 @@ def _link(s):
         for key in ("EI_y", "EI_z", "GJ", "mass_per_length"):
             if s.has(key):
                 hint = "give either a section or the stiffnesses"
-                raise ArmFileError(s.at(key), "beside a section", hint=hint)
+                raise s.error(key, "beside a section", hint=hint)
         per_length, stiffness, polar = _section_properties(s.section("section"))
     else:
         per_length = s.number("mass_per_length", "mass_per_length", positive=True)
@@ -376,11 +378,11 @@ def _link(s):
                 flexible[direction] = _flexibility(f.section(direction))
                 if direction not in stiffness:
                     hint = f"the link is flexible in {direction}"
-                    raise ArmFileError(s.at(key), "missing", hint=hint)
+                    raise s.error(key, "missing", hint=hint)
         f.done()
     if "twist" in flexible and not polar > 0.0:
-        raise ArmFileError(
-            s.at("polar_inertia_per_length"),
+        raise s.error(
+            "polar_inertia_per_length",
             "missing",
             hint="a link that twists needs the polar inertia of its sections (rho I_p), or a section",
         )
@@ -399,7 +401,7 @@ def _payload(s):
         else:
             inertia = s.number("inertia", "inertia") * np.eye(3)
     if np.linalg.eigvalsh(inertia).min() < -1e-12 * np.abs(inertia).max():
-        raise ArmFileError(s.at("inertia"), "not positive semi-definite")
+        raise s.error("inertia", "not positive semi-definite")
     offset = s.vector("offset", 3, "length", (0.0,) * 3)
     s.done()
     return Payload(mass, tuple(map(tuple, inertia.tolist())), offset)
@@ -408,28 +410,12 @@ def _payload(s):
 def _gauge(s, links):
     name = s.name()
     link = s.text("link", choices=tuple(links))
-    position = s.number("position", "length")
-    if not 0.0 <= position <= links[link].length:
-        limit = f"0 to {links[link].length:.6g} m"
-        raise ArmFileError(s.at("position"), f"m is outside {link}", value=position, limit=limit)
-    distance = s.number("surface_distance", "length")
-    if distance == 0.0:
-        hint = "a gauge on the neutral axis sees nothing"
-        raise ArmFileError(s.at("surface_distance"), "is too small", value=distance, hint=hint)
-    if abs(distance) > 0.5 * links[link].length:
-        raise ArmFileError(
-            s.at("surface_distance"),
-            "m is too far from the neutral axis",
-            value=distance,
-            limit=f"at most half the length of {link}, {0.5 * links[link].length:.6g} m",
-            hint="in mm?",
-        )
     gauge = Gauge(
         name=name,
         link=link,
-        position=position,
+        position=s.number("position", "length"),
         direction=s.text("direction", "y", DIRECTIONS),
-        surface_distance=distance,
+        surface_distance=s.number("surface_distance", "length"),
         gain=s.number("gain", "none", 1.0),
         bias=s.number("bias", "none", 0.0),
         noise=s.number("noise", "none", 0.0, low=0.0),
@@ -437,28 +423,27 @@ def _gauge(s, links):
         full_scale=s.number("full_scale", "none", Gauge.full_scale, positive=True),
         drift=s.number("drift", "none", 0.0, low=0.0),
     )
-    if gauge.gain == 0.0:
-        hint = "such a gauge sees nothing"
-        raise ArmFileError(s.at("gain"), "is too small", value=gauge.gain, hint=hint)
-    if gauge.full_scale > MAX_STRAIN:
-        raise ArmFileError(
-            s.at("full_scale"),
-            "is too large",
-            value=gauge.full_scale,
-            limit=f"at most {MAX_STRAIN}",
-            hint="in microstrain?",
-        )
-    for key in ("bias", "noise"):
-        if not abs(getattr(gauge, key)) < gauge.full_scale:
-            raise ArmFileError(
-                s.at(key),
-                "is not within full_scale",
-                value=getattr(gauge, key),
-                limit=f"{gauge.full_scale:g}",
-                hint="in microstrain?",
-            )
     s.done()
+    _check_gauge(s, gauge, links[link].length)
     return gauge
+
+
+def _check_gauge(s, gauge, length):
+    """Refuse a gauge that its link of this length can't carry, or that sees nothing."""
+    scale, near = gauge.full_scale, 0.5 * length
+    for key, fits, problem, limit, hint in (
+        ("position", 0.0 <= gauge.position <= length, f"m is outside {gauge.link}", f"0 to {length:.6g} m", ""),
+        ("surface_distance", gauge.surface_distance != 0.0, "is too small", None,
+         "a gauge on the neutral axis sees nothing"),
+        ("surface_distance", abs(gauge.surface_distance) <= near, "m is too far from the neutral axis",
+         f"at most half the length of {gauge.link}, {near:.6g} m", "in mm?"),
+        ("gain", gauge.gain != 0.0, "is too small", None, "such a gauge sees nothing"),
+        ("full_scale", scale <= MAX_STRAIN, "is too large", f"at most {MAX_STRAIN}", "in microstrain?"),
+        ("bias", abs(gauge.bias) < scale, "is not within full_scale", f"{scale:g}", "in microstrain?"),
+        ("noise", gauge.noise < scale, "is not within full_scale", f"{scale:g}", "in microstrain?"),
+    ):  # fmt: skip
+        if not fits:
+            raise s.error(key, problem, value=getattr(gauge, key), limit=limit, hint=hint)
 
 
 def _unique(things, path):

@@ -204,13 +204,16 @@ class Arm:
         does to the gauges is spill-over.
         """
         if not 1 <= count <= MAX_MODES:
-            raise ModelError(f"{self.name}: {count} modes; from 1 to {MAX_MODES} are possible")
+            field, limit = f"modes of {self.name}", f"1 to {MAX_MODES}"
+            raise ModelError("is out of range", field=field, value=count, limit=limit)
         for link in self.links:
             for direction, f in link.flexible.items():
                 if f.shape == "from_frequencies" and len(f.frequencies) < count:
                     raise ModelError(
-                        f"{self.name}: {link.name} has {len(f.frequencies)} measured frequencies in"
-                        f" {direction}, so at most that many modes, not {count}"
+                        "is more than the measured frequencies",
+                        field=f"modes of {self.name}: {link.name} in {direction}",
+                        value=count,
+                        limit=len(f.frequencies),
                     )
         links = tuple(
             replace(
@@ -256,10 +259,9 @@ def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
     for name, value in (("payload", payload), ("stiffness", stiffness), ("damping", damping)):
         low = value > 0.0 if name == "stiffness" else value >= 0.0
         if not (low and np.isfinite(value)):
-            wanted = "above 0" if name == "stiffness" else "not below 0"
-            raise ModelError(
-                f"{arm.name}: {name} times {value}: a finite factor {wanted} is wanted"
-            )
+            limit = "above 0, finite" if name == "stiffness" else "not below 0, finite"
+            field = f"factor of the {name} of {arm.name}"
+            raise ModelError("is out of range", field=field, value=value, limit=limit)
     body = replace(
         arm.payload,
         mass=payload * arm.payload.mass,

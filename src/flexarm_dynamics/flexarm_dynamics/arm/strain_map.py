@@ -18,7 +18,7 @@ Modes that the arm has but does not observe leak into the estimate by :math:`R_o
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, check_shape
 
 
 def gauge_rows(model, gauges, mode_names=None):
@@ -132,8 +132,10 @@ class StrainMap:
         self.mode_names = arm.observed_modes
         if len(arm.gauges) < len(self.mode_names):
             raise ModelError(
-                f"{arm.name}: {len(arm.gauges)} gauges can't give {len(self.mode_names)} modal"
-                " amplitudes; add gauges or list fewer observed_modes"
+                f"can't give {len(self.mode_names)} modal amplitudes",
+                field=f"gauges of {arm.name}",
+                value=len(arm.gauges),
+                hint="add gauges or list fewer observed_modes",
             )
         gains = np.array([g.gain for g in arm.gauges])
         self.rows = gains[:, None] * gauge_rows(model, arm.gauges, self.mode_names)
@@ -142,14 +144,16 @@ class StrainMap:
         self.condition = float(np.linalg.cond(weighted)) if weighted.size else 1.0
         if not self.condition < self.WORST_CONDITION:
             raise ModelError(
-                f"{arm.name}: the gauges can't tell {', '.join(self.mode_names)} apart (condition number"
-                f" {self.condition:.3g}); move one away from a point where a mode has no curvature"
+                f"can't tell {', '.join(self.mode_names)} apart: condition number {self.condition:.3g}",
+                field=f"gauges of {arm.name}",
+                limit=f"at most {self.WORST_CONDITION:g}",
+                hint="move one away from a point where a mode has no curvature",
             )
         self.inverse = np.linalg.pinv(weighted) / self.noise[None, :]
         self.bias = [g.bias for g in arm.gauges]
         self._inverses = {}
         for i in range(len(arm.gauges)):
-            self._inverse_without((i,))
+            self.inverse_without((i,))
 
     @property
     def bias(self):
@@ -159,8 +163,7 @@ class StrainMap:
     @bias.setter
     def bias(self, bias):
         bias = np.array(bias, float)
-        if bias.shape != (len(self.gauge_names),):
-            raise ShapeError(f"bias has shape {bias.shape}, wanted {(len(self.gauge_names),)}")
+        check_shape(bias, (len(self.gauge_names),), "bias")
         self._bias, self._offset = bias, self.inverse @ bias
 
     @property
@@ -178,7 +181,7 @@ class StrainMap:
 
     def possible_without(self, lost):
         """Whether the gauges that are not in `lost`, a tuple of indices, give all modes."""
-        return not lost or self._inverse_without(lost) is not None
+        return self.inverse_without(lost) is not None
 
     def amplitudes_without(self, lost, strain, out=None):
         """Modal amplitudes from the other gauges alone; the lost ones' strains may be anything.
@@ -199,18 +202,16 @@ class StrainMap:
             return self.amplitudes(strain, out)
         difference = np.subtract(strain, self._bias)
         difference[list(lost)] = 0.0
-        return np.dot(self._inverse_without(lost), difference, out=out)
+        return np.dot(self.inverse_without(lost), difference, out=out)
 
     def inverse_without(self, lost):
-        """`inverse` of the gauges that are not in `lost`, with zeros for the others; None where they don't suffice."""
-        return self._inverse_without(lost) if lost else self.inverse
-
-    def _inverse_without(self, lost):
-        """Weighted pseudo-inverse with zero columns for the lost; None where they are needed.
+        """`inverse` of the gauges that are not in `lost`, with zeros for the others; None where they don't suffice.
 
         Each single loss is prepared at the start; several at once are worked out when they first come, about
         0.1 ms, and kept.
         """
+        if not lost:
+            return self.inverse
         if lost not in self._inverses:
             if len(self._inverses) >= self.KEPT:
                 self._inverses.clear()

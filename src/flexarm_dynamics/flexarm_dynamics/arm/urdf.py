@@ -64,7 +64,8 @@ class PieceChain:
 
     def __init__(self, model, pieces=8):
         if pieces < 1:
-            raise ModelError(f"{model.arm.name}: {pieces} pieces a link; at least 1 is needed")
+            field = f"pieces of a link of {model.arm.name}"
+            raise ModelError("is too few", field=field, value=pieces, limit="at least 1")
         self.arm, self.pieces = model.arm, int(pieces)
         self._sections = Sections(model, 2 * self.pieces)
         self._junctions = [self._of(link) for link in self.arm.links]
@@ -148,9 +149,8 @@ def _check_unique(arm, names):
     seen = set()
     for name in names:
         if name in seen:
-            raise ModelError(
-                f"{arm}: two parts of the URDF are called {name}; give that joint or link another name"
-            )
+            problem, hint = "is the name of two parts", "give that joint or link another name"
+            raise ModelError(problem, field=f"URDF of {arm}", value=name, hint=hint)
         seen.add(name)
 
 

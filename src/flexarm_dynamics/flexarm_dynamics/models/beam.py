@@ -83,12 +83,9 @@ class ModeShapes:
         a, b = -(c + d * edge), c - d * edge
         cos, sin = np.cos(beta * x), np.sin(beta * x)
         # d/dxi turns (cos, sin) into beta * (-sin, cos): four derivatives make the circle.
-        wave = (
-            a * cos + b * sin,
-            -a * sin + b * cos,
-            -a * cos - b * sin,
-            a * sin - b * cos,
-        )[derivative % 4]
+        wave = (a * cos + b * sin, -a * sin + b * cos, -a * cos - b * sin, a * sin - b * cos)[
+            derivative % 4
+        ]
         decay = (-1.0) ** derivative * c * np.exp(-beta * x)
         growth = d * np.exp(-beta * (1.0 - x))
         return beta**derivative * (wave + decay + growth)
@@ -253,8 +250,11 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
 
     if max(mass, inertia) > MAX_LOAD:
         raise ModelError(
-            f"loaded beam: its load is {mass:.3g} times its mass and {inertia:.3g} times m L^2; at most"
-            f" {MAX_LOAD:g}, or call the link rigid"
+            "is too heavy, in units of the beam's m and m L^2",
+            field="tip load",
+            value=[float(mass), float(inertia)],
+            limit=f"at most {MAX_LOAD:g}",
+            hint="call the link rigid",
         )
 
     def determinant(beta):
@@ -275,8 +275,10 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
             roots.append(brentq(determinant, grid[k], grid[k + 1], xtol=1e-15, rtol=8.9e-16))
     if len(roots) < modes:
         raise ModelError(
-            f"loaded beam: {modes} modes asked for, {len(roots)} roots of the frequency equation found"
-            f" below beta = {grid[-1]:.1f} (tip mass ratio {mass:.3g}, inertia ratio {inertia:.3g})"
+            f"gives {len(roots)} roots of the frequency equation below beta = {grid[-1]:.1f}",
+            field="tip load",
+            value=[float(mass), float(inertia)],
+            limit=f"{modes} are needed",
         )
     c, d = np.empty(modes), np.empty(modes)
     for i, beta in enumerate(roots):
@@ -284,11 +286,6 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
         row = m[np.argmax(np.abs(m).max(axis=1))]
         c[i], d[i] = row[1], -row[0]
     return _shapes(roots, c, d)
-
-
-def natural_frequencies(beta, length, mass_per_length, stiffness):
-    r""":math:`\omega_i = (\beta_i/L)^2\sqrt{EI/\rho A}` [rad/s], shape (m,)."""
-    return (np.asarray(beta) / length) ** 2 * np.sqrt(stiffness / mass_per_length)
 
 
 def overlap(one, other):

@@ -21,7 +21,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..arm.description import scaled
+from ..errors import ModelError, check_shape
 from ..kernels import chain as plain
 from ..kernels import generated, integrators, load
 from .assembly import (
@@ -35,7 +36,7 @@ from .assembly import (
     shapes_of,
     work_space,
 )
-from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation, scaled_payload
+from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
 
@@ -118,26 +119,20 @@ class Chain(ArmModel):
                 worst = np.abs(vectors[:, 0])
                 i = int(weightless[0] if weightless.size else np.argmax(worst[:n]))
                 raise ModelError(
-                    f"joints[{i}]: {self.joint_names[i]} can turn without moving any mass; give it a hub_inertia,"
-                    " or its link a polar_inertia_per_length"
+                    "can turn without moving any mass",
+                    field=f"joints[{i}]",
+                    value=self.joint_names[i],
+                    hint="give it a hub_inertia, or its link a polar_inertia_per_length",
                 )
 
     def mode_shapes(self, link, direction):
         try:
             return self._shapes[link, direction]
         except KeyError:
-            raise ModelError(f"{link} has no modes in direction {direction}") from None
+            raise ModelError("has no modes", field=f"{link} in {direction}") from None
 
     def with_payload(self, scale):
-        return type(self)(scaled_payload(self.arm, scale), self._compiled, self._shapes)
-
-    def friction_table(self):
-        return np.array(
-            [
-                [j.friction.viscous, j.friction.coulomb, j.friction.smoothing]
-                for j in self.arm.joints
-            ]
-        )
+        return type(self)(scaled(self.arm, payload=scale), self._compiled, self._shapes)
 
     # Equations of motion -----------------------------------------------------------------------
 
@@ -241,8 +236,7 @@ class Chain(ArmModel):
     def derivative(self, state, torque):
         n, m = self.n_joints, self.n_modes
         state = np.asarray(state, float)
-        if state.shape != (2 * (n + m),):
-            raise ShapeError(f"state has shape {state.shape}, wanted {(2 * (n + m),)}")
+        check_shape(state, (2 * (n + m),), "state")
         out = np.empty_like(state)
         net = np.asarray(torque, float) - self.friction(state[n + m : 2 * n + m])
         self.kernel.derivative(state, net, (self._data, self._work, *self._none), out)
@@ -349,7 +343,8 @@ class Chain(ArmModel):
         """The data with link `index` ending at `position`, for the kinematics of that section."""
         link = self.arm.links[index]
         if not 0.0 <= position <= link.length * (1.0 + 1e-12):
-            raise ModelError(f"{link.name}: {position} m is not on a link of {link.length} m")
+            field, limit = f"position on {link.name}", f"0 to {link.length} m"
+            raise ModelError("m is not on the link", field=field, value=position, limit=limit)
         d = self.data
         xi = position / link.length
         tip, slope, length = d.tip.copy(), d.slope.copy(), d.length.copy()
@@ -482,12 +477,10 @@ class Chain(ArmModel):
 
     def _joint(self, value, name):
         value = np.ascontiguousarray(value, float)
-        if value.shape != (self.n_joints,):
-            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_joints,)}")
+        check_shape(value, (self.n_joints,), name)
         return value
 
     def _modal(self, value, name):
         value = np.zeros(self.n_modes) if value is None else np.ascontiguousarray(value, float)
-        if value.shape != (self.n_modes,):
-            raise ShapeError(f"{name} has shape {value.shape}, wanted {(self.n_modes,)}")
+        check_shape(value, (self.n_modes,), name)
         return value

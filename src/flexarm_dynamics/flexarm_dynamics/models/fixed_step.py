@@ -61,7 +61,10 @@ def substeps(model, period, method="dop853"):
     count = max(1, int(np.ceil(highest * period / PHASE_PER_STEP[method])))
     if count > MAX_SUBSTEPS:
         raise ModelError(
-            f"{model.arm.name}: its highest mode, {highest:.3g} rad/s, needs {count} substeps per sample"
-            f" of {period:g} s (at most {MAX_SUBSTEPS}): fewer modes, or integrator implicit"
+            f"rad/s needs {count} substeps per sample of {period:g} s",
+            field=f"highest mode of {model.arm.name}",
+            value=highest,
+            limit=f"at most {MAX_SUBSTEPS}",
+            hint="take fewer modes, or integrator implicit",
         )
     return count

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, check_shape
 from ..linear import jacobian
 from .chain import Chain
 
@@ -161,19 +161,18 @@ def solve(model, target, start=None, bent=True) -> Solution:
         best = min(best, kinematics.search(target, near), key=lambda s: s.distance)
     if best.distance <= TOLERANCE:
         return best
-    raise ModelError(f"{model.arm.name}: the tip can't be at {show(target)} m: {nearest(best)}")
+    problem, field = f"m is out of reach: {nearest(best)}", f"tip of {model.arm.name}"
+    raise ModelError(problem, field=field, value=target.tolist())
 
 
 def checked(model, target, start):
     """`target` and `start` as arrays of the right shapes."""
     target = np.array(target, float)
-    if target.shape != (3,):
-        raise ShapeError(f"the tip's position has shape {target.shape}, wanted (3,)")
+    check_shape(target, (3,), "tip position")
     if not np.isfinite(target).all():
-        raise ModelError(f"the tip's position is {show(target)} m: it must be finite")
+        raise ModelError("is not finite", field="tip position", value=target.tolist())
     start = np.zeros(model.n_joints) if start is None else np.array(start, float)
-    if start.shape != (model.n_joints,):
-        raise ShapeError(f"start has shape {start.shape}, wanted {(model.n_joints,)}")
+    check_shape(start, (model.n_joints,), "start")
     return target, start
 
 

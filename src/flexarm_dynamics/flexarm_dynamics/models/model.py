@@ -10,13 +10,13 @@ r"""What every model of an arm offers, and the terms of the equations of motion 
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 
 from .. import registry
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, check_shape
 from ..kernels import chain as kernel
 
 
@@ -118,9 +118,10 @@ class ArmModel(ABC):
     def mode_shapes(self, link, direction):
         """`beam.ModeShapes` of a link in a direction."""
 
-    @abstractmethod
     def friction_table(self):
-        """Viscous, Coulomb and smoothing speed of each joint, shape (n, 3)."""
+        """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing speed; shape (n, 3)."""
+        frictions = [joint.friction for joint in self.arm.joints]
+        return np.array([[f.viscous, f.coulomb, f.smoothing] for f in frictions])
 
     @abstractmethod
     def stepper(self, method):
@@ -147,7 +148,9 @@ class ArmModel(ABC):
             Where the model has none.
         """
         raise ModelError(
-            f"model {self.arm.model} can't lock joints: take safe_action damp or zero, or model chain"
+            "can't lock joints",
+            field=f"model {self.arm.model}",
+            hint="take safe_action damp or zero, or model chain",
         )
 
     def with_payload(self, scale):
@@ -168,7 +171,8 @@ class ArmModel(ABC):
         ModelError
             Where the model takes no other payload.
         """
-        raise ModelError(f"model {self.arm.model} takes no other payload than its arm file's")
+        problem = "takes no other payload than its arm file's"
+        raise ModelError(problem, field=f"model {self.arm.model}")
 
     def friction(self, qd):
         """Friction torque of the joints, shape (n,) [N m]: ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
@@ -193,8 +197,7 @@ class ArmModel(ABC):
             For a state of another length.
         """
         n, m = self.n_joints, self.n_modes
-        if np.shape(state) != (2 * (n + m),):
-            raise ShapeError(f"state has shape {np.shape(state)}, wanted {(2 * (n + m),)}")
+        check_shape(state, (2 * (n + m),), "state")
         q, delta, qd, delta_d = np.split(np.asarray(state, float), [n, n + m, 2 * n + m])
         t = self.terms(q, qd, delta, delta_d)
         force = np.concatenate(
@@ -267,7 +270,9 @@ class ArmModel(ABC):
             if np.abs(change).max() <= 1e-12 * max(np.abs(delta).max(), 1e-12):
                 return delta
         raise ModelError(
-            f"{self.arm.name}: no rest under gravity near the straight arm at q = {list(q)}"
+            "is no place of rest: under gravity the arm buckles or folds there",
+            field=f"joint position of {self.arm.name}",
+            value=[float(angle) for angle in q],
         )
 
 
@@ -329,16 +334,9 @@ class Stepper:
         change : ndarray, shape (n,), optional
             What the torque changes by until the end, linearly; nothing if not given [N m].
         """
-        self._step(
-            state,
-            torque,
-            self._none if change is None else change,
-            step,
-            substeps,
-            *self._arguments,
-            self.friction if friction is None else friction,
-            self._data,
-        )
+        change = self._none if change is None else change
+        friction = self.friction if friction is None else friction
+        self._step(state, torque, change, step, substeps, *self._arguments, friction, self._data)
 
     def trajectory(self, states, starts, ends, step, substeps=1, friction=None):
         """Fill ``states[1:]`` from ``states[0]`` in one compiled loop.
@@ -352,15 +350,9 @@ class Stepper:
         step, substeps, friction
             As for a call.
         """
+        friction = self.friction if friction is None else friction
         self._trajectory(
-            states,
-            starts,
-            ends,
-            step,
-            substeps,
-            *self._arguments,
-            self.friction if friction is None else friction,
-            self._data,
+            states, starts, ends, step, substeps, *self._arguments, friction, self._data
         )
 
 
@@ -377,13 +369,6 @@ def explicit_stepper(module, method, data, model, lock=None):
     arguments = (method.A, *coefficients, np.zeros((method.weights.size + 1, size)), net)
     functions = (module.runge_kutta, module.runge_kutta_trajectory)
     return Stepper(model, *functions, arguments, data, lock)
-
-
-def scaled_payload(arm, scale):
-    """The arm with its payload's mass and inertia scaled, its centre of mass where it is."""
-    load = arm.payload
-    inertia = tuple(tuple(scale * x for x in row) for row in load.inertia)
-    return replace(arm, payload=replace(load, mass=scale * load.mass, inertia=inertia))
 
 
 def build(arm):
@@ -451,6 +436,7 @@ def damping_matrix(M22, K, ratios):
     zeta = np.array([ratios[min(i, len(ratios) - 1)] for i in range(m)])
     squares, psi = eigh(K, M22)
     if squares.min() <= 0.0:
-        raise ModelError(f"stiffness is not positive definite (eigenvalue {squares.min():.3g})")
+        problem, value = "is an eigenvalue that is not positive", float(squares.min())
+        raise ModelError(problem, field="modal stiffness", value=value)
     left = M22 @ psi
     return left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T

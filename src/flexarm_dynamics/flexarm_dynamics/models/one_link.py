@@ -29,11 +29,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arm.description import scaled
 from ..errors import ModelError
 from ..kernels import integrators, load
 from ..kernels import one_link as kernel
-from . import beam
-from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation, scaled_payload
+from .assembly import outboard, shapes_of
+from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
 
 #: Cosine and sine of an angle that is no number, as numpy has them.
 NOWHERE = (math.nan, math.nan)
@@ -88,8 +89,9 @@ class OneLinkEquations(ArmModel):
         _check_planar(arm)
         self.link, self.joint = arm.links[0], arm.joints[0]
         self.flexibility = self.link.flexible["y"]
-        own = shapes_of(self.link, self.flexibility, arm.payload) if shapes is None else shapes
-        self.shapes = own
+        if shapes is None:
+            shapes = shapes_of(self.link, "y", self.flexibility, outboard(arm)[0])
+        self.shapes = shapes
         self.phi_tip = self.shapes(1.0)  # [-]
         self.slope_tip = self.shapes(1.0, 1) / self.link.length  # [1/m]
         self.coefficients = self.derive()
@@ -100,7 +102,7 @@ class OneLinkEquations(ArmModel):
         self._terms_at_rest = self._constant_terms()
 
     def with_payload(self, scale):
-        return type(self)(scaled_payload(self.arm, scale), self.shapes)
+        return type(self)(scaled(self.arm, payload=scale), self.shapes)
 
     def derive(self):
         """Return the `Coefficients` of this derivation."""
@@ -108,7 +110,7 @@ class OneLinkEquations(ArmModel):
 
     def mode_shapes(self, link, direction):
         if (link, direction) != (self.link.name, "y"):
-            raise ModelError(f"{link} has no modes in direction {direction}")
+            raise ModelError("has no modes", field=f"{link} in {direction}")
         return self.shapes
 
     def _constant_terms(self):
@@ -137,15 +139,7 @@ class OneLinkEquations(ArmModel):
             M = M.copy()
             M[0, 0] += delta @ c.G @ delta
             C1 = 2.0 * speed * (delta @ c.G)[None, :]
-        return Terms(
-            M=M,
-            f1=np.array([f1]),
-            f2=f2,
-            C1=C1,
-            C2=c.D,
-            K1=K1,
-            K2=c.K - speed**2 * c.G,
-        )
+        return Terms(M=M, f1=np.array([f1]), f2=f2, C1=C1, C2=c.D, K1=K1, K2=c.K - speed**2 * c.G)
 
     def kinetic_energy(self, q, qd, delta, delta_d):
         v = np.concatenate([qd, delta_d])
@@ -175,18 +169,9 @@ class OneLinkEquations(ArmModel):
         cos, sin = np.cos(q[0]), np.sin(q[0])
         length, w = self.link.length, qd[0]
         local = np.array(
-            [
-                (-length * sin - y * cos) * w - yd * sin,
-                (length * cos - y * sin) * w + yd * cos,
-                0.0,
-            ]
+            [(-length * sin - y * cos) * w - yd * sin, (length * cos - y * sin) * w + yd * cos, 0.0]
         )
         return self._rotation @ local
-
-    def friction_table(self):
-        """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing; shape (n, 3)."""
-        f = self.joint.friction
-        return np.array([[f.viscous, f.coulomb, f.smoothing]])
 
     def stepper(self, method):
         return self._stepper(method, self._data())
@@ -196,9 +181,8 @@ class OneLinkEquations(ArmModel):
         scalars, rigid = data[0], data[0][0]
 
         def lock(mask):
-            scalars[0] = (
-                np.inf if mask[0] else rigid
-            )  # a hub of infinite inertia: no acceleration at all
+            # A hub of infinite inertia: no acceleration at all.
+            scalars[0] = np.inf if mask[0] else rigid
 
         return self._stepper(method, data, lock)
 
@@ -213,7 +197,9 @@ class OneLinkEquations(ArmModel):
     def _stepper(self, method, data, lock=None):
         if method is None:
             raise ModelError(
-                f"model {self.arm.model} has no implicit integrator: take an explicit one, or model chain"
+                "has no implicit integrator",
+                field=f"model {self.arm.model}",
+                hint="take an explicit one, or model chain",
             )
         sources = (load.source(kernel), load.source(integrators))
         module = load.joined(
@@ -248,44 +234,20 @@ class OneLink(OneLinkEquations):
         )
 
 
-def shapes_of(link, flexibility, payload):
-    """Mode shapes of a link bending along y, of the kind that the arm file names."""
-    if flexibility.shape == "clamped_free":
-        return beam.clamped_free(flexibility.modes)
-    if flexibility.shape == "from_frequencies":
-        return beam.from_frequencies(
-            flexibility.frequencies[: flexibility.modes],
-            link.length,
-            link.mass_per_length,
-            link.stiffness["y"],
-        )
-    return beam.loaded(
-        flexibility.modes,
-        link.length,
-        link.mass_per_length,
-        payload.mass,
-        payload.inertia[2][2],
-        payload.offset[0],
-    )
-
-
 def _check_planar(arm):
-    if len(arm.links) != 1:
-        raise ModelError(
-            f"model {arm.model}: {arm.name} has {len(arm.links)} links; this model is for one"
-        )
+    """Refuse an arm that is not one link bending along y in the plane in which its joint turns it."""
     link, joint = arm.links[0], arm.joints[0]
-    if set(link.flexible) != {"y"}:
-        raise ModelError(
-            f"model {arm.model}: {link.name} must be flexible in y and in nothing else, not in"
-            f" {', '.join(link.flexible) or 'nothing'}"
-        )
-    if not np.allclose(joint.axis, (0.0, 0.0, 1.0), atol=1e-12):
-        raise ModelError(
-            f"model {arm.model}: axis of {joint.name} is {list(joint.axis)}; bending along y is in the"
-            " plane of motion only for [0, 0, 1] (turn the base with origin.rpy)"
-        )
-    if np.any(np.abs(arm.payload.offset[1:]) > 0.0):
-        raise ModelError(
-            f"model {arm.model}: payload.offset {list(arm.payload.offset)} must lie along x"
-        )
+    for field, value, fits, limit in (
+        ("links", [link.name for link in arm.links], len(arm.links) == 1, "one link"),
+        (f"flexible of {link.name}", list(link.flexible), set(link.flexible) == {"y"}, "y alone"),
+        (
+            f"axis of {joint.name}",
+            list(joint.axis),
+            np.allclose(joint.axis, (0.0, 0.0, 1.0), atol=1e-12),
+            "[0, 0, 1]; turn the base with origin.rpy",
+        ),
+        ("payload.offset", list(arm.payload.offset), not any(arm.payload.offset[1:]), "along x"),
+    ):
+        if not fits:
+            problem = f"is not for model {arm.model}"
+            raise ModelError(problem, field=field, value=value, limit=limit)

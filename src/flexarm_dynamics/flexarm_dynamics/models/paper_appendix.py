@@ -38,11 +38,11 @@ class PaperAppendix(OneLinkEquations):
 
     def __init__(self, arm, shapes=None):
         if arm.model != "paper_appendix" or not arm.model_options:
-            raise ModelError(f"{arm.name}: the arm file has no section paper_appendix")
+            hint = "this model needs that section of the arm file"
+            raise ModelError("missing", field=f"paper_appendix of {arm.name}", hint=hint)
         if any(arm.gravity):
-            raise ModelError(
-                "paper_appendix: the published model has no gravity; use model one_link"
-            )
+            problem, gravity = "is not in the published model", list(arm.gravity)
+            raise ModelError(problem, field="gravity", value=gravity, hint="use model one_link")
         super().__init__(arm, shapes)
 
     def derive(self):
@@ -59,7 +59,7 @@ class PaperAppendix(OneLinkEquations):
             M22[1, 0] += options["m23_fit"]
         elif options["m23_fit"]:
             raise ModelError(
-                f"{self.arm.name}: paper_appendix.m23_fit needs two modes, not {count}"
+                "needs two modes", field="paper_appendix.m23_fit", limit=f"{count} given"
             )
         # k_ei, diagonal in the published model.
         K = link.stiffness["y"] / L**3 * np.diag(np.diag(shapes.gram(2)))
