@@ -3,12 +3,9 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from flexarm_studies.plotting import STYLE, plt, save
 
 COLOURS = {"own": "#1f5a94", "hand": "#8a8a8a", "peer": "#c1502e"}
 KINDS = {"own": "flexarm", "hand": "loops written for these two arms", "peer": "other codes"}
@@ -17,19 +14,6 @@ TITLES = {
     "one_link_pulse": "One link, torque pulse",
     "two_link_torque_x0p1": "Two links, small torque",
     "two_link_torque": "Two links, large torque",
-}
-STYLE = {
-    "figure.dpi": 100,
-    "savefig.dpi": 150,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.3,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "legend.frameon": False,
-    "svg.hashsalt": "flexarm",
 }
 
 
@@ -48,10 +32,8 @@ def draw(summary, directory):
     list of Path
         The PNG files.
     """
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
     made = []
-    with plt.rc_context(STYLE):
+    with plt.rc_context(STYLE | {"axes.axisbelow": True, "lines.linewidth": 1.5}):
         for name, figure in (
             ("codes", _codes(summary["cases"])),
             ("links", _links(summary["links"])),
@@ -59,11 +41,7 @@ def draw(summary, directory):
             ("cores", _cores(summary["throughput"])),
         ):
             figure.tight_layout()
-            for suffix in ("png", "svg"):
-                metadata = {"Date": None} if suffix == "svg" else {"Software": None}
-                figure.savefig(directory / f"{name}.{suffix}", metadata=metadata)
-            made.append(directory / f"{name}.png")
-            plt.close(figure)
+            made.append(save(figure, *(Path(directory, f"{name}.{s}") for s in ("png", "svg"))))
     return made
 
 

@@ -3,14 +3,9 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 
-from ..case_study.figures import COMPOSITE, REFERENCE, SLOW, STYLE
+from ..plotting import COMPOSITE, REFERENCE, SLOW, STYLE, plt, save
 
 
 def draw(found, directory):
@@ -23,22 +18,20 @@ def draw(found, directory):
     directory : Path
         Made if it is not there.
     """
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    made = []
+    made, parts = (
+        [],
+        {
+            "scales": ("mu", _mu),
+            "gain_sweep": ("slow_gain", _slow_gain),
+            "bound": ("bound", _bound),
+        },
+    )
     with plt.rc_context(STYLE):
-        for part, name, figure in (
-            ("scales", "mu", _mu),
-            ("gain_sweep", "slow_gain", _slow_gain),
-            ("bound", "bound", _bound),
-        ):
-            if found[part].get("reason"):
-                continue
-            drawn = figure(found)
-            drawn.tight_layout()
-            made.append(directory / f"{name}.png")
-            drawn.savefig(made[-1], metadata={"Software": None})
-            plt.close(drawn)
+        for part, (name, draw_part) in parts.items():
+            if not found[part].get("reason"):
+                figure = draw_part(found)
+                figure.tight_layout()
+                made.append(save(figure, Path(directory, f"{name}.png")))
     return made
 
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from .options import check_file
+from .options import chain_of, check_file
 
 #: Maximum number of drawn modes.
 MAX_MODES = 4
@@ -19,18 +19,10 @@ def draw(arm_model, q, path):
     path : str
         PNG, SVG or PDF.
     """
-    from dataclasses import replace
-
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from flexarm_dynamics.models.chain import Chain
+    from ..plotting import plt, save
 
     path = check_file(path)
-    arm = arm_model.arm
-    chain = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
+    arm, chain = arm_model.arm, chain_of(arm_model)
     omega, shapes = arm_model.normal_modes(q, locked=True)
     shown = min(MAX_MODES, omega.size)
     straight = axis_points(chain, q, np.zeros(chain.n_modes))
@@ -39,26 +31,16 @@ def draw(arm_model, q, path):
     figure, axes = plt.subplots(
         1, shown + 1, figsize=(3.2 * (shown + 1), 3.4), squeeze=False, layout="constrained"
     )
-    rest = axis_points(chain, q, arm_model.static_deflection(q))
+    rest = arm_model.static_deflection(q)
     for k, ax in enumerate(axes[0]):
-        lines = rest
         if k:
-            delta = shapes[chain.n_joints :, k - 1]
-            scale = (
-                0.12
-                * reach
-                / max(
-                    np.abs(
-                        np.concatenate(axis_points(chain, q, 1e-6 * delta))
-                        - np.concatenate(straight)
-                    ).max()
-                    / 1e-6,
-                    1e-12,
-                )
-            )
+            delta, small = shapes[chain.n_joints :, k - 1], 1e-6
+            moved = np.subtract(axis_points(chain, q, small * delta), straight)
+            scale = 0.12 * reach / max(np.abs(moved).max() / small, 1e-12)
             lines = axis_points(chain, q, scale * delta)
             ax.set_title(f"mode {k}: {omega[k - 1] / (2.0 * np.pi):.3g} Hz", fontsize=10)
         else:
+            lines = axis_points(chain, q, rest)
             ax.set_title(f"{arm.name}, at rest", fontsize=10)
         # The view is along the direction in which the arm neither extends nor moves.
         moves = np.abs(np.concatenate(lines) - np.concatenate(straight)).max(axis=0)
@@ -68,11 +50,11 @@ def draw(arm_model, q, path):
             ax.plot(line[:, a], line[:, b], color="0.75", lw=2.0)
         if not k:
             for gauge in arm.gauges:
-                p = chain.point(gauge.link, gauge.position, q, arm_model.static_deflection(q))
+                p = chain.point(gauge.link, gauge.position, q, rest)
                 ax.plot(p[a], p[b], "s", color="tab:orange", ms=4)
         for line in lines:
             ax.plot(line[:, a], line[:, b], color="tab:blue", lw=1.5)
-        for line in lines:
+        for line in lines:  # over all links
             ax.plot(line[0, a], line[0, b], "o", color="black", ms=4)
         ax.plot(lines[-1][-1, a], lines[-1][-1, b], "D", color="tab:red", ms=4)
         ax.set_aspect("equal", adjustable="datalim")
@@ -83,9 +65,7 @@ def draw(arm_model, q, path):
         "joints locked; grey: straight, dots: joints, diamond: tip, squares: gauges; modes scaled to be visible",
         fontsize=8,
     )
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-    return str(path)
+    return str(save(figure, path, dpi=120))
 
 
 def axis_points(chain, q, delta, count=25):

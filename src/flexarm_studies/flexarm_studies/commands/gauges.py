@@ -364,10 +364,7 @@ def _line(label, positions, quality, unit):
 
 def draw(d, path):
     """Draw each observed mode's strain along the links, present and best positions; the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from ..plotting import plt, save
 
     path = check_file(path)
     places = d["places"]
@@ -378,14 +375,8 @@ def draw(d, path):
         x, rows = p["curvature"]["position"], p["curvature"]["rows"]
         for name, row in zip(p["modes"], rows.T, strict=True):
             ax.plot(x, row / np.abs(row).max(), lw=1.5, label=name)
-        ax.plot(
-            p["present"]["positions"],
-            [0.0] * len(p["present"]["positions"]),
-            "s",
-            ms=7,
-            color="black",
-            label="now",
-        )
+        now = p["present"]["positions"]
+        ax.plot(now, [0.0] * len(now), "s", ms=7, color="black", label="now")
         if p["best"]:
             best = p["best"][0]["positions"]
             ax.plot(best, [0.0] * len(best), "D", ms=7, mfc="none", color="tab:red", label="best")
@@ -394,6 +385,4 @@ def draw(d, path):
         ax.set_xlabel("position [m]")
         ax.legend(fontsize=8, ncols=2)
     figure.suptitle(f"{d['arm']}: strain of each mode along the links")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-    return str(path)
+    return str(save(figure, path, dpi=120))

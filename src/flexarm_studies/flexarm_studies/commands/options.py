@@ -52,6 +52,15 @@ def load_arm(options):
     return arm
 
 
+def chain_of(arm_model):
+    """The model itself if it is a chain, otherwise the chain of the same arm, for its kinematics."""
+    from flexarm_dynamics.models.chain import Chain
+
+    if isinstance(arm_model, Chain):
+        return arm_model
+    return Chain(replace(arm_model.arm, model="chain"))
+
+
 def numbers(option, text, separator=","):
     """Read the finite numbers of an option's list."""
     try:

@@ -255,12 +255,7 @@ def breaks(rows):
 
 def draw(rows, path, title):
     """Draw the worst joint error and tip error at rest over both disturbances; crosses are unstable runs."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from ..case_study.figures import STYLE
+    from ..plotting import STYLE, plt, save
 
     kinds = list(dict.fromkeys((r["disturbance"], r["unit"]) for r in rows))
     measures = {
@@ -286,9 +281,7 @@ def draw(rows, path, title):
             f"{title}: worst of {rows[0]['of']} runs; crosses: not stable in all", size=11
         )
         figure.tight_layout()
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
-        plt.close(figure)
+        save(figure, path)
 
 
 def _curve(axes, rows, key, colour, name):

@@ -7,7 +7,6 @@ With ``--controller`` the arm is in a closed loop: `run_controller`.
 import itertools
 import json
 import sys
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from flexarm_sim.integrators import METHODS, substeps
 from .. import tables
 from ..progress import Progress
 from . import run_controller
-from .options import add_arm_arguments, add_model_arguments, angles, load_arm
+from .options import add_arm_arguments, add_model_arguments, angles, chain_of, load_arm
 
 #: More rows must be a mistake in --rate or --duration.
 MAX_ROWS = 10_000_000
@@ -97,7 +96,7 @@ def simulate(options, recorder=None):
             setattr(options, name, value)
     arm = load_arm(options)
     arm_model = model.build(arm)
-    kinematics = arm_model if isinstance(arm_model, Chain) else Chain(replace(arm, model="chain"))
+    kinematics = chain_of(arm_model)
     if options.torque and options.prescribed:
         raise FlexarmError("exclude each other", field="--torque and --prescribed")
     drive = None

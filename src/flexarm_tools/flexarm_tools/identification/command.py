@@ -176,12 +176,8 @@ def text_of(result):
 
 def draw(found, measured, path):
     """Draw measured, fitted and residual signals; the path."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     from flexarm_studies.commands.options import check_file
+    from flexarm_studies.plotting import plt, save
 
     path = check_file(path)
     n = len(found.arm.joints)
@@ -206,6 +202,4 @@ def draw(found, measured, path):
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     figure.suptitle(f"{found.arm.name}: measured and fitted")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-    return str(path)
+    return str(save(figure, path, dpi=120))

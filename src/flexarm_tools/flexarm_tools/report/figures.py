@@ -11,14 +11,10 @@ import re
 from dataclasses import dataclass
 
 import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 
-from flexarm_studies.case_study.figures import COMPOSITE, REFERENCE, SLOW
-from flexarm_studies.case_study.figures import STYLE as PAPER_STYLE
+from flexarm_studies.plotting import COMPOSITE, REFERENCE, SLOW, plt
+from flexarm_studies.plotting import STYLE as PAPER_STYLE
 
 from . import analysis
 from .run import FAULT, STATES
