@@ -155,21 +155,14 @@ class Driver(ArmNode):
         self.gate = self.make_gate()
         self.gate.begin(new_session())
         self.writer = StateWriter(self.arm)
-        options = {"qos_overriding_options": qos.overridable()}
-        self.state_publisher = self.make_publisher(
-            ArmState, "arm_state", qos.CONTROL_PATH, **options
-        )
+        self.state_publisher = self.make_publisher(ArmState, "arm_state")
         self._joint_state = JointState(name=list(self.arm.joint_names))
         rate = parameters.group("").get("joint_states_rate")
         self._joint_publisher = rate and self.make_publisher(
-            JointState, "joint_states", 10, **options
+            JointState, "joint_states", 10, qos_overriding_options=qos.overridable()
         )
         self._joint_period, self._joint_due = rate and round(SECOND / rate), 0  # [ns]
-        self.connect(
-            self.make_subscription(
-                JointTorque, "joint_torque", self._on_torque, qos.CONTROL_PATH, **options
-            )
-        )
+        self.connect(self.make_subscription(JointTorque, "joint_torque", self._on_torque))
 
     def make_gate(self):
         """The rules with this driver's timeout."""

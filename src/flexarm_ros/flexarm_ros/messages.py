@@ -4,6 +4,7 @@
 Numbers are cast here: a Python int or numpy scalar assigned to a float64 field is published as garbage.
 """
 
+import os
 import struct
 from array import array
 
@@ -172,9 +173,18 @@ class StateWriter:
 
 
 class TorqueWriter:
-    """A `JointTorque` message whose torque is written in place."""
+    """A `JointTorque` message whose torque is written in place.
 
-    def __init__(self, arm, controller_id):
+    Parameters
+    ----------
+    arm : Arm
+    controller_id : int, optional
+        Tells two controllers of one arm apart: a random one at each start, if not given.
+    """
+
+    def __init__(self, arm, controller_id=None):
+        if controller_id is None:
+            controller_id = int.from_bytes(os.urandom(4), "little")
         self.message = msg = JointTorque()
         msg.joint_names = list(arm.joint_names)
         msg.controller_id = controller_id

@@ -7,6 +7,7 @@ import signal
 import sys
 import traceback
 from collections import deque
+from functools import partial
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -87,21 +88,18 @@ class ArmNode(LifecycleNode):
 
     # Made and unmade with the configuration ----------------------------------------------------
 
-    def make_publisher(self, kind, topic, profile, **kwargs):
-        """A publisher that lives until clean-up; incompatible subscriptions are shown in diagnostics."""
+    def make_publisher(self, kind, topic, profile=None, **kwargs):
+        """A publisher that lives until clean-up; incompatible subscriptions are shown in diagnostics.
+
+        `topic` and message `kind`, and `kwargs`, are as in rclpy. A `profile` that is not given is that of the control
+        path, which the user may override.
+        """
         return self._keep(self.destroy_publisher, self._publisher(kind, topic, profile, **kwargs))
 
-    def make_subscription(self, kind, topic, callback, profile, **kwargs):
-        """A subscription that lives until clean-up; incompatible publishers are shown in diagnostics."""
-        events, take = self._mismatches.callbacks(False, "qos_overriding_options" in kwargs)
-
-        def create(own):
-            return self.create_subscription(
-                kind, topic, callback, own, event_callbacks=events, **kwargs
-            )
-
-        subscription = qos.made(create, topic, profile)
-        take(subscription)
+    def make_subscription(self, kind, topic, callback, profile=None, **kwargs):
+        """A subscription that calls `callback`; otherwise as `make_publisher`."""
+        create = partial(self.create_subscription, kind, topic, callback)
+        subscription = self._topic_end(False, create, topic, profile, kwargs)
         return self._keep(self.destroy_subscription, subscription)
 
     def make_service(self, *args, **kwargs):
@@ -119,14 +117,18 @@ class ArmNode(LifecycleNode):
         self._control_path = ControlPath(subscription, period, on_period)
 
     def _publisher(self, kind, topic, profile, **kwargs):
-        events, take = self._mismatches.callbacks(True, "qos_overriding_options" in kwargs)
+        return self._topic_end(
+            True, partial(self.create_publisher, kind, topic), topic, profile, kwargs
+        )
 
-        def create(own):
-            return self.create_publisher(kind, topic, own, event_callbacks=events, **kwargs)
-
-        publisher = qos.made(create, topic, profile)
-        take(publisher)
-        return publisher
+    def _topic_end(self, publishes, create, topic, profile, kwargs):
+        """A publisher or subscription that notices when the other end is incompatible."""
+        if profile is None:
+            profile, kwargs["qos_overriding_options"] = qos.CONTROL_PATH, qos.overridable()
+        events, take = self._mismatches.callbacks(publishes, "qos_overriding_options" in kwargs)
+        end = qos.made(lambda own: create(own, event_callbacks=events, **kwargs), topic, profile)
+        take(end)
+        return end
 
     def _keep(self, destroy, thing):
         self._made.append((destroy, thing))

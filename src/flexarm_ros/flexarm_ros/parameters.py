@@ -117,8 +117,9 @@ class NodeParameters:
         """All values by their full names."""
         return dict(self._values)
 
-    def group(self, prefix, names=None):
-        """Values under a prefix, without it; only `names` where given."""
+    def group(self, prefix, declared=None):
+        """Values under a prefix, without it; only those of the parameters `declared`, where given."""
+        names = None if declared is None else {p.name for p in declared}
         return {
             p.name: self._values[full]
             for full, (of, p) in self._declared.items()

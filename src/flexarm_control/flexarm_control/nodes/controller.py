@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controller node: `arm_state_estimate` and `joint_trajectory` in, `joint_torque` and `controller/state` out."""
 
-import os
 import sys
 from time import perf_counter
 
@@ -59,8 +58,7 @@ class ControllerNode(ArmNode):
         self._make_workers()
         self._reader = StateReader(arm)
         self._sample = ArmSample(len(arm.joints), len(arm.modes))
-        # Another one at each start: it tells two controllers of one arm apart.
-        self._torque = TorqueWriter(arm, int.from_bytes(os.urandom(4), "little"))
+        self._torque = TorqueWriter(arm)
         self._state = CompositeStateWriter(self.model)
         self._synchronised = parameters["synchronised_clocks"]
         self._ticks, self._seen = 0, False
@@ -68,12 +66,8 @@ class ControllerNode(ArmNode):
 
     def _make_workers(self):
         self._close_workers()
-        designer = Designer(
-            self.model,
-            self.get_logger().warning,
-            self.parameters["design_process"],
-            scheduling.spare(),
-        )
+        warn, process = self.get_logger().warning, self.parameters["design_process"]
+        designer = Designer(self.model, warn, process, scheduling.spare())
         self._inbox = TrajectoryInbox(self, self.core, designer)
         self._workers = designer, Designs(self, self.core, designer), self._inbox
 
@@ -83,20 +77,14 @@ class ControllerNode(ArmNode):
         self._workers = ()
 
     def _make_topics(self):
-        options = qos.overridable()
-        self._torque_pub = self.make_publisher(
-            JointTorque, "joint_torque", qos.CONTROL_PATH, qos_overriding_options=options
-        )
-        self._state_pub = self.make_publisher(
-            CompositeState, "controller/state", qos.CONTROL_PATH, qos_overriding_options=options
-        )
+        self._torque_pub = self.make_publisher(JointTorque, "joint_torque")
+        self._state_pub = self.make_publisher(CompositeState, "controller/state")
+        states = self.make_subscription(ArmState, "arm_state_estimate", self._on_state)
+        self.make_control_path(states)
         # fmt: off
-        self.make_control_path(self.make_subscription(
-            ArmState, "arm_state_estimate", self._on_state, qos.CONTROL_PATH, qos_overriding_options=options
-        ))
         self.make_subscription(
             JointTrajectory, "joint_trajectory", self._inbox.receive, qos.COMMAND, raw=True,
-            qos_overriding_options=options,
+            qos_overriding_options=qos.overridable(),
         )
         # fmt: on
         self.make_service(Trigger, "~/stop", self._on_stop)

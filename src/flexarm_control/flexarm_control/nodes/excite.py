@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excitation node: `arm_state` in, `joint_torque` out in place of the controller, for identification."""
 
-import os
-
 from rclpy.duration import Duration
 
 from flexarm_dynamics.arm import arm_file
@@ -10,7 +8,6 @@ from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import parameter
 from flexarm_msgs.msg import ArmState, JointTorque
-from flexarm_ros import qos
 from flexarm_ros.messages import StateReader, TorqueWriter
 from flexarm_ros.node import ARM, ERROR, OK, ArmNode, run
 from flexarm_ros.start import leave
@@ -49,25 +46,14 @@ class ExciteNode(ArmNode):
     def build(self):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
-        names = {p.name for p in excitation_run.PARAMETERS}
-        self.core = ExcitationRun(model.build(self.arm), parameters.group("", names))
+        settings = parameters.group("", excitation_run.PARAMETERS)
+        self.core = ExcitationRun(model.build(self.arm), settings)
         self._reader, self._sample = StateReader(self.arm), ArmSample(len(self.arm.joints))
-        self._torque = TorqueWriter(self.arm, int.from_bytes(os.urandom(4), "little"))
+        self._torque = TorqueWriter(self.arm)
         self._ticks, self._seen, self._reported_end = 0, False, False
         self._connected = False
-        options = qos.overridable()
-        self._torque_pub = self.make_publisher(
-            JointTorque, "joint_torque", qos.CONTROL_PATH, qos_overriding_options=options
-        )
-        self.make_control_path(
-            self.make_subscription(
-                ArmState,
-                "arm_state",
-                self._on_state,
-                qos.CONTROL_PATH,
-                qos_overriding_options=options,
-            )
-        )
+        self._torque_pub = self.make_publisher(JointTorque, "joint_torque")
+        self.make_control_path(self.make_subscription(ArmState, "arm_state", self._on_state))
         self.make_timer(parameters["state_timeout"] / 5.0, self._watch)
 
     def _on_state(self, msg):

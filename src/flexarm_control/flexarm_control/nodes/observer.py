@@ -5,13 +5,11 @@ from time import perf_counter
 
 from std_srvs.srv import Trigger
 
-from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import sizes
 from flexarm_msgs.msg import ArmState, ObserverState
-from flexarm_ros import qos
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
 from flexarm_ros.node import ARM, ArmNode, run
 from flexarm_ros.start import leave
@@ -46,45 +44,21 @@ class ObserverNode(ArmNode):
         self._sample = ArmSample(len(arm.joints), len(arm.modes), len(arm.gauges))
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
         self._statistics = ObserverStatistics(len(arm.modes))
-        options = qos.overridable()
-        self._estimate_pub = self.make_publisher(
-            ArmState, "arm_state_estimate", qos.CONTROL_PATH, qos_overriding_options=options
-        )
-        self._state_pub = self.make_publisher(
-            ObserverState, "observer/state", qos.CONTROL_PATH, qos_overriding_options=options
-        )
+        self._estimate_pub = self.make_publisher(ArmState, "arm_state_estimate")
+        self._state_pub = self.make_publisher(ObserverState, "observer/state")
         self.make_service(Trigger, "~/calibrate_gauges", self._on_calibrate)
-        self.make_control_path(
-            self.make_subscription(
-                ArmState,
-                "arm_state",
-                self._on_state,
-                qos.CONTROL_PATH,
-                qos_overriding_options=options,
-            )
-        )
+        self.make_control_path(self.make_subscription(ArmState, "arm_state", self._on_state))
 
     def _new_core(self):
-        return arm_observer.ArmObserver(self.model, self._design(), **self._common())
-
-    def _design(self):
-        name = self.parameters["observer.type"]
-        law = registry.find(arm_observer.OBSERVERS, name)
-        declared = {p.name for p in law.PARAMETERS}
-        values = self.parameters.group("observer.", declared)
-        return arm_observer.design_observer(name, self.model, values)
-
-    def _common(self):
-        """Parameters that belong to no single law."""
-        return self.parameters.group("observer.", {p.name for p in arm_observer.PARAMETERS})
+        return assembly.observer(self.model, assembly.chosen("observer", self.parameters.values()))
 
     def _changed(self, names):
         """Replace the observer by a new one, which continues from the old one's estimate."""
-        common = self._common()
+        common = self.parameters.group("observer.", arm_observer.PARAMETERS)
         self.core.bandwidth, self.core.delay = common["joint_velocity_bandwidth"], common["delay"]
         self.core.smooth_position = common["smooth_position"]
         if names - {"observer." + name for name in common}:
-            observer = self._design()
+            observer = self._new_core().observer
             observer.resume(self.core.observer)
             self.core.observer = observer
 

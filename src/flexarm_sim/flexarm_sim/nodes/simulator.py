@@ -31,8 +31,7 @@ class SimulatorNode(Driver):
 
     def open(self):
         parameters = self.parameters
-        names = {p.name for p in simulator.PARAMETERS}
-        self.sim = sim = simulator.Simulator(parameters.group("", names))
+        self.sim = sim = simulator.Simulator(parameters.group("", simulator.PARAMETERS))
         self.period = 1e-9 * sim.period_ns
         self.faults = faults.Faults(self.arm, parameters)
         self.pacing = (pacing.Lockstep if parameters["lockstep"] else pacing.RealTime)(self)
@@ -73,10 +72,6 @@ class SimulatorNode(Driver):
         """Simulated time: a torque gets older with the samples, not while they wait [s]."""
         return self.sim.time
 
-    def read(self):
-        self._sample.number, self._sample.stamp_ns = self.sim.sequence, self.sim.stamp_ns
-        return [self._sample]
-
     def apply(self, torque):
         self.sim.advance(torque)
 
@@ -113,7 +108,8 @@ class SimulatorNode(Driver):
         self._publish_sample()
 
     def _publish_sample(self):
-        self.publish(*self.read())
+        self._sample.number, self._sample.stamp_ns = self.sim.sequence, self.sim.stamp_ns
+        self.publish(self._sample)
 
     def publish(self, sample):
         self.fill(sample)
@@ -166,8 +162,7 @@ class SimulatorNode(Driver):
         return values | ({"faults": str(self.faults)} if str(self.faults) else {})
 
     def judge(self, samples):
-        several = self.gate.controllers.several(self.now())
-        if self.fault or several:
+        if self.fault or self.gate.controllers.several(self.now()):
             return ERROR, self.fault or self.gate.SEVERAL
         if self.paused:
             return OK, "paused: call ~/pause with data false"
