@@ -42,19 +42,12 @@ def state(core):
 # --------------------------------------------------------------------------- strains
 
 
-def test_strains_are_mapped_to_the_amplitudes_that_bend_the_gauges_so(arm_r):
-    core = observed(arm_r)
-    delta = np.array([0.012, -0.003])
-    core.step(sample(strain=gauge_rows(arm_r, arm_r.arm.gauges) @ delta, amplitude=None))
-    assert_allclose(core.observer.amplitude, delta, rtol=1e-12)
-
-
-def test_gain_and_bias_of_the_gauges_are_taken_out(arm_r):
-    gauges = tuple(replace(g, gain=2.0, bias=1e-4) for g in arm_r.arm.gauges)
+@pytest.mark.parametrize(("gain", "bias"), [(1.0, 0.0), (2.0, 1e-4)])
+def test_strains_are_mapped_to_the_amplitudes_that_bend_the_gauges_so(arm_r, gain, bias):
+    gauges = tuple(replace(g, gain=gain, bias=bias) for g in arm_r.arm.gauges)
     arm = model.build(replace(arm_r.arm, gauges=gauges))
     core, delta = observed(arm), np.array([0.012, -0.003])
-    strain = 2.0 * gauge_rows(arm, gauges) @ delta + 1e-4
-    core.step(sample(strain=strain, amplitude=None))
+    core.step(sample(strain=gain * gauge_rows(arm, gauges) @ delta + bias, amplitude=None))
     assert_allclose(core.observer.amplitude, delta, rtol=1e-11)
 
 
@@ -64,15 +57,12 @@ def test_given_amplitudes_come_before_strains(arm_r):
     assert_array_equal(core.observer.amplitude, [0.012, -0.003])
 
 
-def test_strains_without_gauges_in_the_arm_file_are_refused(arm_r):
+def test_without_amplitudes_strains_and_gauges_are_needed(arm_r):
+    with pytest.raises(MessageError, match="neither strain nor modal_amplitude"):
+        observed(arm_r).step(sample(strain=None, amplitude=None))
     core = observed(model.build(replace(arm_r.arm, gauges=())))
     with pytest.raises(MessageError, match="arm file of R has no gauges"):
         core.step(sample(strain=[0.0, 0.0], amplitude=None))
-
-
-def test_neither_strain_nor_amplitude_is_refused(arm_r):
-    with pytest.raises(MessageError, match="neither strain nor modal_amplitude"):
-        observed(arm_r).step(sample(strain=None, amplitude=None))
 
 
 def test_an_arm_with_a_mode_that_it_does_not_observe_is_refused():
@@ -226,13 +216,6 @@ def test_whatever_an_observer_raises_becomes_a_refusal_that_names_it(arm_r):
 
 
 # --------------------------------------------------------------------------- joint velocity
-
-
-def test_a_given_joint_velocity_is_passed_on(arm_r):
-    core = observed(arm_r)
-    for k in range(3):
-        core.step(sample(k, velocity=[0.2 * k]))
-        assert_array_equal(core.velocity, [0.2 * k])
 
 
 def test_an_absent_joint_velocity_is_the_filtered_derivative_of_the_position(arm_r):

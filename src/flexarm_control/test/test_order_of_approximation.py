@@ -20,7 +20,7 @@ from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 KP, KV = 6.25, 5.0
-TIMES = np.linspace(0.0, 0.75, 61)
+TIMES = np.linspace(0.0, 0.5, 41)
 #: Tracking error at the start [rad], [rad/s].
 ERROR = np.array([0.05, -0.1])
 
