@@ -118,6 +118,15 @@ class _Paper:
         )
         return figure, axes
 
+    def _panels(self, names, height, **kwargs):
+        """A grid of axes, two in a row, for the first `MAX_PANELS` names: figure, axes, (axis, name) of each."""
+        shown = names[:MAX_PANELS]
+        columns = min(len(shown), 2)
+        figure, axes = self._grid(-(-len(shown) // columns), columns, height, **kwargs)
+        for ax in axes.ravel()[len(shown) :]:
+            ax.axis("off")
+        return figure, axes, list(zip(axes.ravel(), shown, strict=False))
+
     def _series(self, axes, run, values, bins=BINS, **style):
         if values is None or not np.isfinite(values).any():
             return False
@@ -156,12 +165,15 @@ class _Paper:
             if len(self.runs) > 1
         ]
 
-    def _finish(self, figure, name, title, caption, times=None):
+    def _finish(self, figure, name, title, caption, times=None, entries=()):
+        self._legend(figure, entries)
+        if times is not None:
+            self._times(times)
         image = "" if self.png else _svg(figure, name)
         if self.png or len(image) > MAX_SVG:
             image = _png(figure, title)
         places = []  # known only after saving, which does the layout
-        for ax in [] if times is None else np.asarray(times).ravel():
+        for ax in () if times is None else times.ravel():
             box = ax.get_position()
             places.append((box.x0, box.x1, box.y0, box.y1, *ax.get_xlim()))
         plt.close(figure)
@@ -198,7 +210,6 @@ class _Paper:
             for s in sorted(seen)
         ]
         figure.legend(handles=handles, loc="outside upper left", ncols=7)
-        self._times(axes)
         caption = (
             "State of the controller's supervisor. INACTIVE and FAULT send no torque; a fault stays until ~/recover is"
             " called. Reasons are in the table below. A black line: the source of states restarted."
@@ -231,58 +242,48 @@ class _Paper:
                 axes[j, 1].axhline(0.0, color="black", linewidth=0.5)
         if len(self.runs) == 1 and errors:
             entries = [("measured", (("color", colour(0)),)), *entries]
-        self._legend(figure, entries)
-        self._times(axes)
         caption = "Joint angles" + (
             ": reference and measurement on the left, reference less measurement on the right. The error is"
             " drawn from the first torque on; the summary's peak and rms are over the motions and the rests after them."
             if errors
             else " as measured; without controller/state there is no reference in the bag."
         )
-        return self._finish(figure, "tracking", "Tracking", caption, axes)
+        return self._finish(figure, "tracking", "Tracking", caption, axes, entries)
 
     def modes(self):
         runs = [r for r in self.runs if r.amplitude_source]
         if not runs:
             return None
         names = max((r.mode_names for r in runs), key=len)
-        shown = names[:MAX_PANELS]
-        columns = 2 if len(shown) > 1 else 1
-        rows = -(-len(shown) // columns)
-        figure, axes = self._grid(rows, columns, 1.6, sharex=True)
-        entries = self._entries()
-        for j, name in enumerate(shown):
-            ax = axes[j // columns, j % columns]
+        figure, axes, panels = self._panels(names, 1.6, sharex=True)
+        bins, entries = BINS // axes.shape[1], self._entries()
+        for ax, name in panels:
             scale, unit = (DEGREES, "deg") if "twist" in name else (1e3, "mm")
             for i, run in enumerate(self.runs):
                 if name not in run.mode_names or not run.amplitude_source:
                     continue
                 k = run.mode_names.index(name)
                 style = {"color": colour(i)}
-                self._series(ax, run, run.amplitude(k) * scale, BINS // columns, **style)
+                self._series(ax, run, run.amplitude(k) * scale, bins, **style)
                 quasi = run.column("controller/state", "quasi_steady_amplitude", k)
                 if quasi is not None:
                     quasi = np.where((run.state >= 1) & (run.state < FAULT), quasi, np.nan)
                     line = {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 0.9}
                     if len(self.runs) > 1:
                         line["color"] = _darker(colour(i))
-                    self._series(ax, run, quasi * scale, BINS // columns, **line)
+                    self._series(ax, run, quasi * scale, bins, **line)
                     entries.append(("quasi-steady", (("color", "black"), ("linestyle", "--"))))
             ax.set_ylabel(f"{plain(name)}\n[{unit}]")
-        for ax in axes.ravel()[len(shown) :]:
-            ax.axis("off")
         if len(self.runs) == 1:
             entries = [(_source(runs[0]), (("color", colour(0)),)), *entries]
-        self._legend(figure, entries)
-        self._times(axes)
         sources = ", ".join(dict.fromkeys(_source(r) for r in runs))
         caption = (
             f"Amplitude of each mode: {sources}. Dashed: the quasi-steady amplitude, which the arm would have if it"
             " only followed its slow motion. The oscillation about it is vibration, which the fast control damps."
         )
-        if len(names) > len(shown):
-            caption += f" The first {len(shown)} of {len(names)} modes."
-        return self._finish(figure, "modes", "Modal amplitudes", caption, axes)
+        if len(names) > len(panels):
+            caption += f" The first {len(panels)} of {len(names)} modes."
+        return self._finish(figure, "modes", "Modal amplitudes", caption, axes, entries)
 
     def spectra(self, spectra):
         there = [
@@ -292,15 +293,13 @@ class _Paper:
         ]
         if not there:
             return None
-        names = max((s.names for _, _, s in there), key=len)[:MAX_PANELS]
-        columns = 2 if len(names) > 1 else 1
-        figure, axes = self._grid(-(-len(names) // columns), columns, 2.3)
+        names = max((s.names for _, _, s in there), key=len)
+        figure, _, panels = self._panels(names, 2.3)
         lines = [(i, r, analysis.predicted(r, s.configuration)) for i, r, s in there]
         top = min(analysis.highest(r, cases) for _, r, cases in lines)
         low = max(min(s.frequency[0] for _, _, s in there) * analysis.PADDED / 2.0, 0.05)
         entries = self._entries()
-        for j, name in enumerate(names):
-            ax = axes[j // columns, j % columns]
+        for ax, name in panels:
             for i, _, s in there:
                 if name in s.names:
                     inside = (s.frequency <= top) & (s.frequency >= low)
@@ -313,11 +312,8 @@ class _Paper:
             ax.set_xlim(low, top)
             ax.set_ylabel(f"{plain(name)}\n[mm/√Hz]")
             ax.set_xlabel("frequency [Hz]")
-        for ax in axes.ravel()[len(names) :]:
-            ax.axis("off")
-        self._legend(figure, entries)
         caption = self._about_spectra(there)
-        return self._finish(figure, "spectra", "Vibration spectra", caption)
+        return self._finish(figure, "spectra", "Vibration spectra", caption, entries=entries)
 
     def _predictions(self, ax, lines, low, top):
         """Draw the frequencies that the model predicts; returns entries for the legend."""
@@ -374,15 +370,13 @@ class _Paper:
             axes[j, 0].set_ylabel(f"{plain(name)} [N m]")
         for ax, title in zip(axes[0], ("sent", "slow part", "fast part"), strict=False):
             ax.set_title(title)
-        self._legend(figure, entries)
-        self._times(axes)
         caption = "The torque that was sent" + (
             ", and its two parts: the slow control follows the motion, the fast one damps the bending."
             if split
             else "."
         )
         caption += " Limits are drawn where they are near; all are in the summary."
-        return self._finish(figure, "torques", "Torques", caption, axes)
+        return self._finish(figure, "torques", "Torques", caption, axes, entries)
 
     def _limits(self, ax, j):
         """Draw the torque limits that are near the curves; returns entries for the legend."""
@@ -404,25 +398,18 @@ class _Paper:
         if not runs:
             return None
         names = max((r.gauge_names for r in runs), key=len)
-        shown = names[:MAX_PANELS]
-        columns = 2 if len(shown) > 1 else 1
-        figure, axes = self._grid(-(-len(shown) // columns), columns, 1.55, sharex=True)
+        figure, axes, panels = self._panels(names, 1.55, sharex=True)
         bad = 0
-        for j, name in enumerate(shown):
-            ax = axes[j // columns, j % columns]
+        for ax, name in panels:
             for i, run in enumerate(self.runs):
                 if name not in run.gauge_names:
                     continue
                 k = run.gauge_names.index(name)
                 strain = run.column(run.base, "strain", k)
                 if strain is not None:
-                    self._series(ax, run, 1e6 * strain, BINS // columns, color=colour(i))
+                    self._series(ax, run, 1e6 * strain, BINS // axes.shape[1], color=colour(i))
                 bad += self._health(ax, run, k, colour(i))
             ax.set_ylabel(f"{plain(name)} [µm/m]")
-        for ax in axes.ravel()[len(shown) :]:
-            ax.axis("off")
-        self._legend(figure, self._entries())
-        self._times(axes)
         watched = any(r.has("observer/state", "gauge_health") for r in runs)
         health = "The background is red where the observer did not trust a gauge."
         if not watched:
@@ -430,7 +417,7 @@ class _Paper:
         elif not bad:
             health = "The observer trusted all gauges all the time."
         caption = f"Readings of the strain gauges, in millionths. {health}"
-        return self._finish(figure, "strains", "Strain gauges", caption, axes)
+        return self._finish(figure, "strains", "Strain gauges", caption, axes, self._entries())
 
     def _health(self, ax, run, k, face):
         """Mark where a gauge was not good; returns how often."""
@@ -469,13 +456,11 @@ class _Paper:
         for period in periods if len(periods) == 1 else ():
             axes[0, 1].axvline(period, color="#c62828", linestyle="-.", linewidth=0.9)
             axes[0, 1].text(period, 1.0, " period", color="#c62828", va="top", fontsize=8)
-        self._legend(figure, self._entries())
-        self._times(axes[:, :1])
         caption = (
             "Time from a state's arrival in the controller to the torque's departure, for every sample. On the right:"
             " the fraction of samples that took longer."
         )
-        return self._finish(figure, "timing", "Compute time", caption, axes[:, :1])
+        return self._finish(figure, "timing", "Compute time", caption, axes[:, :1], self._entries())
 
 
 def _spans(run, state, limits):
