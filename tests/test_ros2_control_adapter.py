@@ -115,7 +115,7 @@ def test_a_torque_becomes_efforts_in_the_controllers_order_until_it_is_late(arm)
 
 def _refuse(arm):
     arm.torques.publish(answer(arm.sample(), [math.nan, 0.0]))
-    return "torque of joint1 is nan" in arm.bench.log("adapter")
+    return "torque of joint1: nan" in arm.bench.log("adapter")
 
 
 def test_strains_that_stop_are_missing_and_not_the_last_ones(arm):

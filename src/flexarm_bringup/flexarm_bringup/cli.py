@@ -61,9 +61,8 @@ def _find_benchmarks():
     """The benchmarks are part of a checkout, not of an installed package."""
     root = os.environ.get("FLEXARM_ROOT", "")
     if not os.path.isdir(os.path.join(root, "benchmarks")):
-        raise FlexarmError(
-            "the benchmarks are not installed: run this command as ./flexarm in a checkout of flexarm"
-        )
+        hint = "run this command as ./flexarm in a checkout of flexarm"
+        raise FlexarmError("the benchmarks are not installed", hint=hint)
     if root not in sys.path:
         sys.path.append(root)
 
@@ -72,14 +71,12 @@ COMMANDS = {
     "demo": Command(
         "flexarm_tools.case_study.demo",
         "run_demo",
-        (
-            "run the paper's case study with three nodes; figures, bags and a table beside the published numbers"
-        ),
+        "run the paper's case study with three nodes; figures, bags and a table beside the published numbers",
     ),
     "simulate": Command(
         "flexarm_tools.simulate",
         "simulate",
-        ("simulate an arm under given torques, moved as prescribed, or under a controller"),
+        "simulate an arm under given torques, moved as prescribed, or under a controller",
     ),
     "frequencies": Command(
         "flexarm_studies.commands.inspect_arm",
@@ -90,7 +87,7 @@ COMMANDS = {
     "show": Command(
         "flexarm_studies.commands.inspect_arm",
         "show",
-        ("masses, inertias, modes, frequencies, gauges and warnings of an arm file"),
+        "masses, inertias, modes, frequencies, gauges and warnings of an arm file",
         "add_show_arguments",
     ),
     "urdf": Command(
@@ -101,7 +98,7 @@ COMMANDS = {
     "gauges": Command(
         "flexarm_studies.commands.gauges",
         "gauges",
-        ("how well the strain gauges tell the modes, and where they would do it best"),
+        "how well the strain gauges tell the modes, and where they would do it best",
     ),
     "observers": Command(
         "flexarm_studies.commands.observer_table",
@@ -116,15 +113,12 @@ COMMANDS = {
     "analyze": Command(
         "flexarm_studies.analysis.command",
         "analyze",
-        ("time scales, a bound on mu, margins, domain of attraction and Monte Carlo of a design"),
+        "time scales, a bound on mu, margins, domain of attraction and Monte Carlo of a design",
     ),
     "compare": Command(
         "flexarm_studies.comparison.command",
         "compare",
-        (
-            "composite control beside joint PID, input shaping, LQR and rigid adaptive control, "
-            "all tuned alike"
-        ),
+        "composite control beside joint PID, input shaping, LQR and rigid adaptive control, all tuned alike",
     ),
     "publish": Command(
         "flexarm_tools.publish_trajectory",
@@ -134,10 +128,7 @@ COMMANDS = {
     "check_driver": Command(
         "flexarm_tools.check_driver.command",
         "check_driver",
-        (
-            "whether a running driver keeps its contract; with --allow-motion, whether its arm "
-            "moves rightly"
-        ),
+        "whether a running driver keeps its contract; with --allow-motion, whether its arm moves rightly",
     ),
     "identify": Command(
         "flexarm_tools.identification.command",
@@ -152,23 +143,17 @@ COMMANDS = {
     "record": Command(
         "flexarm_tools.recording.record",
         "record",
-        ("record the topics of a running arm to a bag, driver or simulator, until Ctrl-C"),
+        "record the topics of a running arm to a bag, driver or simulator, until Ctrl-C",
     ),
     "report": Command(
         "flexarm_tools.report.command",
         "report",
-        (
-            "what recorded runs show, on one page of HTML: numbers, figures, animation; several "
-            "are compared"
-        ),
+        "what recorded runs show, on one page of HTML: numbers, figures, animation; several are compared",
     ),
     "view": Command(
         "flexarm_tools.view.command",
         "view",
-        (
-            "an arm in the browser, live: its shape, errors, torques; gains, motions and stops "
-            "by hand"
-        ),
+        "an arm in the browser, live: its shape, errors, torques; gains, motions and stops by hand",
     ),
     "run": Command(
         "flexarm_tools.running.processes",
@@ -178,7 +163,7 @@ COMMANDS = {
     "latency": Command(
         "benchmarks.latency.command",
         "latency",
-        ("measurement to torque of the running loop, beside a bare relay of the same messages"),
+        "measurement to torque of the running loop, beside a bare relay of the same messages",
     ),
     "parameters": Command(
         "flexarm_tools.parameter_tables",
@@ -246,13 +231,10 @@ def main(argv=None):
         # An unknown command or --help needs no command's arguments.
         options = parser(only=name).parse_args(words)
         code = options.function(options)
-    except FlexarmError as error:
-        print(f"flexarm {name}: {error}", file=sys.stderr)
-        sys.exit(1)
     except BrokenPipeError:  # the reader has enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
-    except OSError as error:
+    except (FlexarmError, OSError) as error:
         print(f"flexarm {name}: {error}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files start: arguments with their descriptions, and from their values the nodes, without launch.
+"""What the launch files start: their arguments, and the nodes that follow from the arguments' values.
 
-`description` makes a launch description of both; only there is `launch` imported, which a machine without a ROS
-installation lacks.
+Only `description`, which makes a launch description of both, imports `launch`: a machine without a ROS installation
+does not have it.
 """
 
 from dataclasses import dataclass, field
@@ -111,7 +111,7 @@ def one_arm(values):
     Raises
     ------
     ParameterError
-        For a controller file that is not there, or a value that is none of an argument's choices.
+        For a controller file that does not exist, or a value that is not one of an argument's choices.
     """
     values = {"with_shape": SHAPE.default, **values}  # not an argument of every launch file
     check(values, ONE_ARM)
@@ -124,7 +124,7 @@ def one_arm(values):
         Start("flexarm_control", "controller", parameters=list(common), **own),
     ]
     if is_true(values["with_simulator"]):
-        # Not paused at its start, because nothing would unpause it.
+        # It must not start paused: nothing would unpause it.
         pace = {"lockstep": is_true(values["lockstep"]), "pause_at": -1.0}
         starts.insert(0, Start("flexarm_sim", "simulator", parameters=[*common, pace], **own))
     if is_true(values["with_shape"]):
@@ -137,8 +137,10 @@ def two_arms(values):
     check(values, TWO_ARMS)
     if values["left_namespace"].strip("/") == values["right_namespace"].strip("/"):
         raise ParameterError(
-            f"left_namespace and right_namespace are both {values['left_namespace']!r}: two arms on the same topics;"
-            " give each its own"
+            "is that of both arms: they would share their topics",
+            field="left_namespace, right_namespace",
+            value=values["left_namespace"],
+            hint="give each arm its own",
         )
     starts = []
     for side in ("left_", "right_"):
@@ -148,7 +150,7 @@ def two_arms(values):
 
 
 def beside_a_driver(values):
-    """Observer and controller, and a driver if it is named; see `one_arm`."""
+    """Observer and controller, and the driver if its package is given; see `one_arm`."""
     check(values, BESIDE_A_DRIVER)
     starts = one_arm({**values, "with_simulator": "false", "lockstep": "false"})
     starts[-1].parameters.append({"autostart": is_true(values["autostart"])})
@@ -166,9 +168,8 @@ def case_study(values):
     more = {"with_simulator": values["simulate"], "lockstep": "false", "log_level": "info"}
     starts = one_arm({**values, **more})
     if is_true(values["move"]):
-        words = ["paper", "--arm", values["arm"], "--timeout", "30"]
         publisher = Start("flexarm_bringup", "publish_trajectory", values["namespace"])
-        publisher.arguments = words
+        publisher.arguments = ["paper", "--arm", values["arm"], "--timeout", "30"]
         starts.append(publisher)
     return starts
 
@@ -179,19 +180,16 @@ def is_true(text):
 
 
 def check(values, arguments):
-    """Refuse what is none of an argument's choices.
-
-    Raises
-    ------
-    ParameterError
-    """
+    """Refuse a value that is not one of its argument's choices."""
     for name, argument in arguments.items():
         if argument.choices and values[name] not in argument.choices:
-            raise ParameterError(f"{name}:={values[name]} is none of {', '.join(argument.choices)}")
+            limit = ", ".join(argument.choices)
+            problem = "is not one of the choices"
+            raise ParameterError(problem, field=name, value=values[name], limit=limit)
 
 
 def description(arguments, starts):
-    """A launch description of arguments and of what follows from their values.
+    """A launch description of some arguments, and of the nodes that follow from their values.
 
     Parameters
     ----------

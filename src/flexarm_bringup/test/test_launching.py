@@ -108,7 +108,7 @@ def test_two_arms_have_all_their_nodes_in_namespaces_of_their_own():
     ]
     files = {s.namespace: s.parameters[0] for s in starts}
     assert files["left"].endswith("composite.yaml") and files["r"].endswith("two_link.yaml")
-    with pytest.raises(ParameterError, match="same topics"):
+    with pytest.raises(ParameterError, match="share their topics"):
         launching.two_arms(values(launching.TWO_ARMS, right_namespace="/left"))
 
 
@@ -128,8 +128,8 @@ def test_beside_a_driver_the_controller_may_wait_and_the_driver_is_started_where
     ("given", "reason"),
     [
         ({"controller": "nonsense"}, "neither a file nor shipped"),
-        ({"lockstep": "True"}, "lockstep:=True is none of true, false"),
-        ({"log_level": "loud"}, "log_level:=loud is none of debug"),
+        ({"lockstep": "True"}, r"lockstep: 'True' is not one of the choices \(true, false\)"),
+        ({"log_level": "loud"}, "log_level: 'loud' is not one of the choices"),
     ],
 )
 def test_a_value_that_cannot_be_used_is_refused(given, reason):

@@ -11,7 +11,7 @@ from array import array
 import numpy as np
 
 from flexarm_dynamics.errors import MessageError
-from flexarm_dynamics.shown import listed, show
+from flexarm_dynamics.shown import listed
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 
 SECOND = 1_000_000_000
@@ -45,8 +45,10 @@ class _Columns:
             wrong = [f"missing {listed(missing)}"] if missing else []
             wrong += [f"unknown {listed(unknown)}"] if unknown else []
             raise MessageError(
-                f"{self.field} {show(list(names))}: {'; '.join(wrong) or 'a name twice'} (this arm has"
-                f" {self.names})"
+                f"are not this arm's: {'; '.join(wrong) or 'a name twice'}",
+                field=self.field,
+                value=list(names),
+                limit=listed(self.names),
             )
         self._seen = list(names)
         self._order = (
@@ -60,12 +62,18 @@ class _Columns:
         if size == 0:
             return False
         if size != len(self.names):
-            raise MessageError(
-                f"{field} has {size} values for {len(self.names)} names in {self.field}"
-            )
+            limit = f"{len(self.names)} names in {self.field}"
+            raise MessageError("values", field=field, value=size, limit=limit)
         values = np.asarray(values)
         out[:] = values if order is None else values[order]
         return True
+
+    def optional(self, names, field, values, out):
+        """`out` with the values of an array copied into it; None for an empty one, whose names don't count."""
+        if len(values) == 0:
+            return None
+        self.read(field, values, self.order(names), out)
+        return out
 
 
 class StateReader:
@@ -99,33 +107,26 @@ class StateReader:
         sample.session, sample.sequence = msg.session, msg.sequence
         if stamp.nanosec >= SECOND:
             raise MessageError(
-                f"header.stamp.nanosec is {stamp.nanosec}: it must be below {SECOND}"
+                "is no part of a second",
+                field="header.stamp.nanosec",
+                value=stamp.nanosec,
+                limit=f"below {SECOND}",
             )
         joints = self._joints
         order = joints.order(msg.joint_names)
         if not joints.read("joint_position", msg.joint_position, order, sample.position):
-            raise MessageError("joint_position is empty")
+            raise MessageError("is empty", field="joint_position")
         sample.velocity_known = joints.read(
             "joint_velocity", msg.joint_velocity, order, sample.velocity
         )
         if not joints.read("joint_torque", msg.joint_torque, order, sample.torque):
             sample.torque[:] = np.nan
-        sample.strain = self._optional(
-            self._gauges, msg.gauge_names, "strain", msg.strain, self._strain
+        sample.strain = self._gauges.optional(msg.gauge_names, "strain", msg.strain, self._strain)
+        modes, names = self._modes, msg.mode_names
+        sample.amplitude = modes.optional(
+            names, "modal_amplitude", msg.modal_amplitude, self._amplitude
         )
-        sample.amplitude = self._optional(
-            self._modes, msg.mode_names, "modal_amplitude", msg.modal_amplitude, self._amplitude
-        )
-        sample.rate = self._optional(
-            self._modes, msg.mode_names, "modal_rate", msg.modal_rate, self._rate
-        )
-
-    @staticmethod
-    def _optional(columns, names, field, values, out):
-        if len(values) == 0:
-            return None
-        columns.read(field, values, columns.order(names), out)
-        return out
+        sample.rate = modes.optional(names, "modal_rate", msg.modal_rate, self._rate)
 
 
 def _floats(msg, field, size):
@@ -226,14 +227,20 @@ class TorqueReader:
         if msg.mode == JointTorque.DISABLED:
             return None
         if msg.mode != JointTorque.ENABLED:
-            raise MessageError(f"mode is {msg.mode}: neither DISABLED (0) nor ENABLED (1)")
+            limit = "DISABLED (0) or ENABLED (1)"
+            raise MessageError("is no mode", field="mode", value=msg.mode, limit=limit)
         if not self._joints.read(
             "torque", msg.torque, self._joints.order(msg.joint_names), self._torque
         ):
-            raise MessageError("torque is empty")
+            raise MessageError("is empty", field="torque")
         if not np.abs(self._torque).max() < self.HUGE:
             i = int(np.argmin(np.abs(self._torque) < self.HUGE))
-            raise MessageError(f"torque of {self._joints.names[i]} is {self._torque[i]}")
+            raise MessageError(
+                "N m is no torque",
+                field=f"torque of {self._joints.names[i]}",
+                value=float(self._torque[i]),
+                limit=f"finite, below {self.HUGE:g}",
+            )
         return self._torque
 
 
@@ -291,15 +298,11 @@ class ObserverStateWriter:
         msg.innovation = array("d", observer.innovation)
         msg.covariance_diagonal = array("d", observer.covariance_diagonal)
         if strain is None:
-            judged = [ObserverState.GAUGE_MISSING] * len(msg.gauge_names)
-        elif health is not None:
-            judged = health
-        else:
-            judged = [
-                ObserverState.GAUGE_GOOD if ok else ObserverState.GAUGE_MISSING
-                for ok in np.isfinite(strain)
-            ]
-        msg.gauge_health = array("B", judged)
+            health = [ObserverState.GAUGE_MISSING] * len(msg.gauge_names)
+        elif health is None:
+            good, missing = ObserverState.GAUGE_GOOD, ObserverState.GAUGE_MISSING
+            health = np.where(np.isfinite(strain), good, missing).tolist()
+        msg.gauge_health = array("B", health)
         msg.converged = observer.converged
         return msg
 
@@ -307,14 +310,7 @@ class ObserverStateWriter:
 def trajectory_points(raw):
     """Number of points of a serialised `JointTrajectory`, without reading them.
 
-    Parameters
-    ----------
-    raw : bytes
-        XCDR1 with its encapsulation header: the stamp, frame_id, joint_names, the points' number.
-
-    Returns
-    -------
-    int
+    `raw` is XCDR1 with its encapsulation header: the stamp, frame_id, joint_names, the points' number.
 
     Raises
     ------

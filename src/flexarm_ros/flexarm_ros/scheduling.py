@@ -61,13 +61,13 @@ def apply(cpus, priority, warn):
 
 def _pin(cpus):
     if not hasattr(os, "sched_setaffinity"):
-        raise ParameterError("cpu_affinity: this system can't bind a process to CPUs: leave it out")
-    count = os.cpu_count() or 1
+        problem = "this system can't bind a process to CPUs"
+        raise ParameterError(problem, field="cpu_affinity", hint="leave it out")
+    last = (os.cpu_count() or 1) - 1
     for cpu in cpus:
-        if cpu >= count:
-            raise ParameterError(
-                f"cpu_affinity: {cpu} is not a CPU of this machine, whose CPUs are 0 to {count - 1}"
-            )
+        if cpu > last:
+            problem = "is not a CPU of this machine"
+            raise ParameterError(problem, field="cpu_affinity", value=cpu, limit=f"0 to {last}")
     try:
         before = os.sched_getaffinity(0) | _spare
         _each(lambda thread: os.sched_setaffinity(thread, cpus))
@@ -76,8 +76,10 @@ def _pin(cpus):
         refused = set(cpus)
     if refused:
         raise ParameterError(
-            f"cpu_affinity: this process may not run on CPU {', '.join(map(str, sorted(refused)))}: its container"
-            " or cpuset leaves it out"
+            "are CPUs that this process may not run on",
+            field="cpu_affinity",
+            value=sorted(refused),
+            hint="its container or cpuset leaves them out",
         )
     _spare.clear()
     _spare.update(before - set(cpus))

@@ -133,13 +133,13 @@ def test_names_in_another_order_are_put_in_the_arms_and_the_next_message_in_its_
         ({"joint_names": ["joint1", "joint2", "joint2"]}, "missing joint3"),
         ({"gauge_names": ["gauge1", "gauge2", "gauge3", "x"]}, "missing gauge4; unknown x"),
         ({"mode_names": ["mode1", "mode3"]}, "missing mode2; unknown mode3"),
-        ({"joint_position": [1.0, 2.0]}, "joint_position has 2 values for 3 names"),
-        ({"joint_position": []}, "joint_position is empty"),
-        ({"joint_velocity": [1.0] * 4}, "joint_velocity has 4 values for 3 names"),
-        ({"joint_torque": [1.0]}, "joint_torque has 1 values for 3 names"),
-        ({"strain": [0.1]}, "strain has 1 values for 4 names"),
-        ({"modal_amplitude": [0.1]}, "modal_amplitude has 1 values for 2 names"),
-        ({"modal_rate": [0.1] * 3}, "modal_rate has 3 values for 2 names"),
+        ({"joint_position": [1.0, 2.0]}, r"joint_position: 2 values \(3 names in joint_names\)"),
+        ({"joint_position": []}, "joint_position: is empty"),
+        ({"joint_velocity": [1.0] * 4}, r"joint_velocity: 4 values \(3 names"),
+        ({"joint_torque": [1.0]}, r"joint_torque: 1 values \(3 names"),
+        ({"strain": [0.1]}, r"strain: 1 values \(4 names in gauge_names"),
+        ({"modal_amplitude": [0.1]}, r"modal_amplitude: 1 values \(2 names in mode_names"),
+        ({"modal_rate": [0.1] * 3}, r"modal_rate: 3 values \(2 names"),
     ),
     ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
@@ -275,22 +275,23 @@ def test_torques_come_in_the_arms_order_and_disabled_is_none():
 
 
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    ("changes", "field"),
     (
-        ({"mode": 7}, "mode is 7"),
-        ({"torque": [1.0, NAN, 3.0]}, "torque of joint2 is nan"),
-        ({"torque": [1.0, 2.0, -INF]}, "torque of joint3 is -inf"),
-        ({"torque": [1e9, 2.0, 3.0]}, "torque of joint1 is 1000000000"),
-        ({"torque": []}, "torque is empty"),
-        ({"torque": [1.0]}, "torque has 1 values for 3 names"),
-        ({"joint_names": ["a", "b", "c"]}, "missing joint1, joint2, joint3; unknown a, b, c"),
+        ({"mode": 7}, "mode"),
+        ({"torque": [1.0, NAN, 3.0]}, "torque of joint2"),
+        ({"torque": [1.0, 2.0, -INF]}, "torque of joint3"),
+        ({"torque": [1e9, 2.0, 3.0]}, "torque of joint1"),
+        ({"torque": []}, "torque"),
+        ({"torque": [1.0]}, "torque"),
+        ({"joint_names": ["a", "b", "c"]}, "joint_names"),
     ),
     ids=str,
 )
-def test_a_torque_that_is_none_is_refused_by_name(changes, reason):
+def test_a_torque_that_is_none_is_refused_by_name(changes, field):
     reader = TorqueReader(ARM)
-    with pytest.raises(MessageError, match=reason):
+    with pytest.raises(MessageError) as error:
         reader.read(torque(**changes))
+    assert error.value.field == field
     assert reader.read(torque()).tolist() == [1.0, 2.0, 3.0]
 
 
@@ -398,15 +399,9 @@ def test_what_a_writer_wrote_a_reader_reads():
     writer.head(2**60, 1, 2)
     sample = read(over_the_wire(writer.message))
     assert sample.stamp_ns == 2**60
-    for got, field in (
-        (sample.position, "joint_position"),
-        (sample.velocity, "joint_velocity"),
-        (sample.torque, "joint_torque"),
-        (sample.strain, "strain"),
-        (sample.amplitude, "modal_amplitude"),
-        (sample.rate, "modal_rate"),
-    ):
-        np.testing.assert_array_equal(got, values[field])
+    names = ("position", "velocity", "torque", "strain", "amplitude", "rate")
+    for name, value in zip(names, values.values(), strict=True):
+        np.testing.assert_array_equal(getattr(sample, name), value)
 
 
 def test_what_a_torque_writer_wrote_a_torque_reader_reads():
@@ -428,8 +423,9 @@ def test_stamps_are_nanoseconds_to_the_last_one(ns):
 def test_a_stamp_with_a_second_of_nanoseconds_is_refused_and_its_answer_can_be_sent(sec, nanosec):
     message, sample = good(), ArmSample(3, 2, 4)
     message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-    with pytest.raises(MessageError, match=f"nanosec is {nanosec}: it must be below 1000000000"):
+    with pytest.raises(MessageError) as error:
         StateReader(ARM).read(message, sample)
+    assert (error.value.field, error.value.value) == ("header.stamp.nanosec", nanosec)
     answer = over_the_wire(TorqueWriter(ARM, 5).answer(sample, False, np.zeros(3)))
     assert (answer.header.stamp.sec, answer.sequence) == (sec, message.sequence)
 

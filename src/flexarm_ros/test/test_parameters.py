@@ -3,6 +3,7 @@
 
 import math
 import os
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -98,28 +99,27 @@ def test_defaults_and_overrides_are_read_by_full_name_and_by_group(make):
 
 
 @pytest.mark.parametrize(
-    ("given", "reason"),
+    ("given", "field", "problem"),
     (
-        ({"slow__kp": [6]}, r"slow\.kp: .*write \[6\.0\]"),
-        ({"slow__kp": [-1.0]}, r"slow\.kp\[0\]: -1\.0 1/s\^2 is below its lower limit \(0\.0\)"),
-        ({"slow__kp": [math.nan]}, r"slow\.kp\[0\]: nan is not finite"),
-        ({"slow__kp": 6.25}, r"slow\.kp: 6\.25 is not a list"),
-        ({"fast__alpha": -1.0}, r"^fast\.alpha: -1\.0 1/s is below its lower limit \(0\.0\)$"),
-        ({"fast__alpha": 1e4}, r"^fast\.alpha: 10000\.0 1/s is above its upper limit"),
-        ({"fast__alpha": 5}, r"fast\.alpha: .*write 5\.0"),
-        ({"fast__alpha": True}, r"fast\.alpha: True is not a number"),
-        ({"count": 21}, r"^count: 21 is above its upper limit \(20\)"),
-        ({"count": 2.0}, r"count: 2\.0 is not an integer"),
-        ({"slow__gain": "m12"}, r"slow\.gain: 'm12' is not one of the choices \(m11, h11\)"),
-        ({"arm": 3}, "arm: 3 is not a string"),
-        ({"switch": "yes"}, "switch: 'yes' is not a boolean"),
-        ({"labels": "a"}, "labels: 'a' is not a list of strings"),
+        ({"slow__kp": [6]}, "slow.kp", "is a list of integers where floats are needed"),
+        ({"slow__kp": [-1.0]}, "slow.kp[0]", "1/s^2 is below its lower limit"),
+        ({"slow__kp": 6.25}, "slow.kp", "is not a list of numbers"),
+        ({"fast__alpha": -1.0}, "fast.alpha", "1/s is below its lower limit"),
+        ({"fast__alpha": 1e4}, "fast.alpha", "1/s is above its upper limit"),
+        ({"fast__alpha": 5}, "fast.alpha", "is an integer where a float is needed"),
+        ({"count": 21}, "count", "is above its upper limit"),
+        ({"slow__gain": "m12"}, "slow.gain", "is not one of the choices"),
+        ({"arm": 3}, "arm", "is not a string"),
+        ({"switch": "yes"}, "switch", "is not a boolean"),
     ),
     ids=str,
 )
-def test_a_value_given_at_the_start_that_cannot_be_used_is_refused_by_name(make, given, reason):
-    with pytest.raises(ParameterError, match=reason):
+def test_a_value_given_at_the_start_that_cannot_be_used_is_refused_by_name(
+    make, given, field, problem
+):
+    with pytest.raises(ParameterError) as error:
         make(**given)
+    assert (error.value.field, error.value.problem) == (field, problem)
 
 
 def test_lengths_are_checked_once_the_arm_is_known_and_one_value_is_spread(make):
@@ -142,19 +142,15 @@ def test_lengths_are_checked_once_the_arm_is_known_and_one_value_is_spread(make)
     ("name", "value", "reason"),
     (
         ("slow.kp", [6], "write [6.0]"),
-        ("slow.kp", [6, 7], "write [6.0, 7.0]"),
         ("slow.kp", "six", "'six' is not a list of numbers"),
         ("slow.kp", [-1.0], "below its lower limit"),
         ("slow.kp", [math.inf], "not finite"),
-        ("slow.kp", [True], "not a number"),
         ("fast.alpha", 5, "write 5.0"),
         ("fast.alpha", 1e4, "fast.alpha out of range"),
         ("fast.alpha", math.nan, "fast.alpha"),
         ("count", 21, "count out of range"),
         ("count", True, "count"),
         ("slow.gain", "m12", "not one of the choices"),
-        ("slow.gain", 3, "not a string"),
-        ("switch", 1, "not a boolean"),
         ("labels", [1.0], "labels"),
         ("arm", "P3", "read-only"),
     ),
@@ -221,16 +217,6 @@ def test_a_value_that_is_set_later_does_not_change_what_was_read_before(make):
 # Misspelt names ----------------------------------------------------------------------------------
 
 
-class Ear:
-    """A logger that keeps what it gets."""
-
-    def __init__(self):
-        self.warnings = []
-
-    def warning(self, text):
-        self.warnings.append(text)
-
-
 @pytest.mark.parametrize(
     ("given", "warnings"),
     (
@@ -238,21 +224,16 @@ class Ear:
             {"slow__kpp": [1.0]},
             ["parameter slow.kpp is not one of this node's; did you mean slow.kp?"],
         ),
-        (
-            {"fast__alhpa": 1.0},
-            ["parameter fast.alhpa is not one of this node's; did you mean fast.alpha?"],
-        ),
         ({"observer__bandwidth": 1.0}, []),  # another node's, in a file for all
         ({"slow__kp": [1.0]}, []),
     ),
     ids=str,
 )
 def test_a_misspelt_name_is_warned_of_and_another_nodes_is_not(make, monkeypatch, given, warnings):
-    ear = Ear()
-    monkeypatch.setattr(Node, "get_logger", lambda self: ear)
-    _, parameters = make(**given)
-    assert ear.warnings == warnings
-    assert parameters["fast.alpha"] == 5.0
+    log = []
+    monkeypatch.setattr(Node, "get_logger", lambda self: SimpleNamespace(warning=log.append))
+    make(**given)
+    assert log == warnings
 
 
 def test_the_warning_goes_to_the_log_of_the_node(make, capfd):

@@ -55,8 +55,9 @@ def test_affinity_binds_every_thread(restored):
 
 def test_a_cpu_that_is_not_there_is_refused_by_its_number():
     before = os.sched_getaffinity(0)
-    with pytest.raises(ParameterError, match=rf"cpu_affinity: {os.cpu_count()} is not a CPU of"):
+    with pytest.raises(ParameterError) as error:
         scheduling.apply([0, os.cpu_count()], 0, never)
+    assert (error.value.field, error.value.value) == ("cpu_affinity", os.cpu_count())
     assert os.sched_getaffinity(0) == before
 
 
@@ -64,8 +65,9 @@ def test_a_cpu_that_the_cpuset_leaves_out_is_refused(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     monkeypatch.setattr(os, "sched_setaffinity", lambda thread, cpus: None)
     monkeypatch.setattr(os, "sched_getaffinity", lambda thread: {1})
-    with pytest.raises(ParameterError, match="may not run on CPU 3: "):
+    with pytest.raises(ParameterError, match="may not run on") as error:
         scheduling.apply([1, 3], 0, never)
+    assert error.value.value == [3]
 
 
 def test_nothing_is_changed_by_default(monkeypatch):

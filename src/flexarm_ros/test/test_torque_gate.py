@@ -71,10 +71,10 @@ def test_a_torque_for_a_state_older_than_the_timeout_is_left_aside(gate):
     ("changes", "reason"),
     [
         ({"mode": JointTorque.DISABLED}, "the controller says DISABLED"),
-        ({"mode": 7}, "mode is 7"),
-        ({"torque": [math.nan]}, "torque of joint1 is nan"),
-        ({"torque": [math.inf]}, "torque of joint1 is inf"),
-        ({"torque": []}, "torque is empty"),
+        ({"mode": 7}, "mode: 7 is no mode"),
+        ({"torque": [math.nan]}, "torque of joint1: nan N m is no torque"),
+        ({"torque": [math.inf]}, "torque of joint1: inf"),
+        ({"torque": []}, "torque: is empty"),
         ({"joint_names": ["elbow"]}, "missing joint1; unknown elbow"),
     ],
 )

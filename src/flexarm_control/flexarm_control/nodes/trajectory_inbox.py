@@ -38,8 +38,11 @@ def read(raw, arm):
         count = trajectory_points(raw)
         if count > MAX_POINTS:
             raise TrajectoryError(
-                f"{count} points, at most {MAX_POINTS} are taken: send fewer, a quintic polynomial joins them, or"
-                " one trajectory after another"
+                "are too many",
+                field="points",
+                value=count,
+                limit=f"at most {MAX_POINTS}",
+                hint="send fewer: a quintic polynomial joins them; or send one trajectory after another",
             )
         msg = deserialize_message(raw, JointTrajectory)
         points = [
@@ -59,7 +62,8 @@ def read(raw, arm):
     except TrajectoryError:
         raise
     except Exception as error:  # untrusted bytes
-        raise TrajectoryError(f"no JointTrajectory: {type(error).__name__}: {error}") from error
+        problem = f"can't be read: {type(error).__name__}: {error}"
+        raise TrajectoryError(problem, field="JointTrajectory") from error
 
 
 class TrajectoryInbox:

@@ -42,9 +42,8 @@ def installed(*parts):
         path = Path(prefix, *parts)
         if prefix and path.is_file():
             return path
-    raise ProcessError(
-        f"{'/'.join(parts)} is not installed: run `make build`, then source install/setup.bash"
-    )
+    hint = "run `make build`, then source install/setup.bash"
+    raise ProcessError("is not installed", field="/".join(parts), hint=hint)
 
 
 def executable(package, name):
@@ -171,7 +170,7 @@ class Processes:
         for name, process in self.running.items():
             if name not in self._ending and process.poll() is not None:
                 tail = _tail(self.logs / f"{name}.log", 15)
-                raise ProcessError(f"{name} ended with code {process.returncode}:\n{tail}")
+                raise ProcessError(f"ended with code {process.returncode}:\n{tail}", field=name)
 
     def stop(self, number=signal.SIGINT):
         """Signal all, wait, and kill what does not end; exit codes by name."""
