@@ -15,17 +15,13 @@ def groups():
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
 
-    common = {"": COMMON}
-    return {
-        "simulator": {"": (*common[""], *simulator.PARAMETERS, *simulator_node.PARAMETERS)},
-        "observer": _with(observer.parameter_groups(), common),
-        "controller": _with(controller.parameter_groups(), common),
-        "excite": _with(excite.parameter_groups(), common),
+    given = {
+        "simulator": {"": (*simulator.PARAMETERS, *simulator_node.PARAMETERS)},
+        "observer": observer.parameter_groups(),
+        "controller": controller.parameter_groups(),
+        "excite": excite.parameter_groups(),
     }
-
-
-def _with(given, common):
-    return {**given, "": (*common[""], *given[""])}
+    return {node: {**groups, "": (*COMMON, *groups[""])} for node, groups in given.items()}
 
 
 def tables():
@@ -42,19 +38,10 @@ def tables():
 
 def plain():
     """The declarations as plain data: node to a list of parameters."""
+    fields = ("default", "unit", "low", "high", "choices", "read_only", "description")
     return {
         node: [
-            {
-                "name": prefix + p.name,
-                "type": p.kind,
-                "default": p.default,
-                "unit": p.unit,
-                "low": p.low,
-                "high": p.high,
-                "choices": list(p.choices),
-                "read_only": p.read_only,
-                "description": p.description,
-            }
+            {"name": prefix + p.name, "type": p.kind} | {f: getattr(p, f) for f in fields}
             for prefix, declared in by_prefix.items()
             for p in declared
         ]

@@ -10,20 +10,14 @@ import numpy as np
 
 from flexarm_control.trajectory import files, specs
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
+from flexarm_studies.commands.options import numbers
 
 #: Points of the message; quintics between them follow the first two exactly, or nearly so, with few.
 POINTS = {"paper": 101, "quintic": 101}
-#: Settings of the families as options: what they are for messages; None: as they are written.
-_LISTS = {
-    "from": "angles",
-    "to": "angles",
-    "tip": "coordinates",
-    "via": "coordinates",
-    "torque-limit": "torques",
-    "velocity-limit": "speeds",
-}
+#: Settings of the families as options: lists of numbers, and those that are taken as they are written.
+_LISTS = ("from", "to", "tip", "via", "torque-limit", "velocity-limit")
 _PLAIN = ("duration", "smoothness", "shaper", "shape-modes")
 
 
@@ -33,92 +27,71 @@ def add_arguments(parser):
         "Publishes a motion on joint_trajectory once, and waits until it is received."
     )
     parser.epilog = "example: flexarm publish quintic --to 1.57 --duration 3"
-    parser.add_argument("profile", choices=tuple(specs.FAMILIES), help="which motion")
-    parser.add_argument("--arm", default="R", help="arm file, for the joint names (default R)")
-    parser.add_argument(
+    add = parser.add_argument
+    add("profile", choices=tuple(specs.FAMILIES), help="which motion")
+    add("--arm", default="R", help="arm file, for the joint names (default R)")
+    add(
         "--from",
         dest="start",
         help="joint angles where the motion starts, comma separated [rad] (default: where the reference is)",
     )
-    parser.add_argument(
-        "--to", help="joint angles where it ends, comma separated [rad] (default 90 deg)"
-    )
-    parser.add_argument("--tip", metavar="x,y,z", help="line, arc: where the tip ends [m]")
-    parser.add_argument("--via", metavar="x,y,z", help="arc: a point on the way [m]")
-    parser.add_argument("--duration", type=float, default=2.0, help="[s] (default 2)")
-    parser.add_argument(
+    add("--to", help="joint angles where it ends, comma separated [rad] (default 90 deg)")
+    add("--tip", metavar="x,y,z", help="line, arc: where the tip ends [m]")
+    add("--via", metavar="x,y,z", help="arc: a point on the way [m]")
+    add("--duration", type=float, default=2.0, help="[s] (default 2)")
+    add(
         "--smoothness",
         type=int,
         help="smooth, line, arc: derivatives that vanish at the ends, from 2 (default 3)",
     )
-    parser.add_argument(
+    each = "one or one per joint"
+    add(
         "--torque-limit",
-        help="least-exciting: largest slow torque, one or one per joint [N m] (default: the arm file's)",
+        help=f"least-exciting: largest slow torque, {each} [N m] (default: the arm file's)",
     )
-    parser.add_argument(
+    add(
         "--velocity-limit",
-        help="least-exciting: largest speed, one or one per joint [rad/s] (default: the arm file's)",
+        help=f"least-exciting: largest speed, {each} [rad/s] (default: the arm file's)",
     )
-    parser.add_argument("--shaper", choices=("zv", "zvd"), help="shape the motion; it gets longer")
-    parser.add_argument(
+    add("--shaper", choices=("zv", "zvd"), help="shape the motion; it gets longer")
+    add(
         "--shape-modes",
         type=int,
         help=f"how many of the lowest modes the shaper is for (default {specs.SHAPE_MODES}, or all there are)",
     )
-    parser.add_argument(
+    add(
         "--points",
         type=int,
         help=f"points of the message (default 101 for paper and quintic, else {specs.POINTS})",
     )
-    parser.add_argument(
+    add(
         "--dry-run",
         action="store_true",
         help="say what the motion is and excites, publish nothing; it starts at zero unless --from is given",
     )
-    parser.add_argument(
+    add(
         "--out",
         metavar="FILE",
         help="write it to a .csv or .yaml file for later, publish nothing; starts as --dry-run does",
     )
-    parser.add_argument("--json", action="store_true", help="say it as JSON")
-    parser.add_argument("--topic", default="joint_trajectory", help="topic to publish on")
-    parser.add_argument(
-        "--timeout", type=float, default=10.0, help="longest wait for a controller [s] (default 10)"
+    add("--json", action="store_true", help="say it as JSON")
+    add("--topic", default="joint_trajectory", help="topic to publish on")
+    add(
+        "--timeout",
+        type=float,
+        default=10.0,
+        help="longest wait for a controller [s] (default 10)",
     )
 
 
-def _list(text, count, name):
-    what, spread = _LISTS[name], count != 3 or _LISTS[name] != "coordinates"
-    try:
-        values = [float(v) for v in text.split(",")]
-    except ValueError:
-        raise TrajectoryError(
-            "is not a list of numbers",
-            field=f"--{name}",
-            value=text,
-            hint="separate them by commas",
-        ) from None
-    values = values * count if spread and len(values) == 1 else values
-    if len(values) != count or not all(map(math.isfinite, values)):
-        each = "x,y,z" if what == "coordinates" else "one per joint"
-        raise TrajectoryError(
-            "does not fit",
-            field=f"--{name}",
-            value=text,
-            limit=f"{count} finite {what}, {each}",
-        )
-    return values
-
-
-def settings_of(options, count):
-    """What the options set, as `specs.motion` takes it, for `count` joints."""
+def settings_of(options):
+    """What the options set, as `specs.motion` takes it."""
     given = {key: getattr(options, key.replace("-", "_"), None) for key in (*_LISTS, *_PLAIN)}
     given["from"] = options.start
     out = {key: str(given[key]) for key in _PLAIN if given[key] is not None}
-    for key, what in _LISTS.items():
+    for key in _LISTS:
         if given[key] is not None:
-            values = _list(given[key], 3 if what == "coordinates" else count, key)
-            out[key] = ";".join(map(repr, values))
+            out[key] = ";".join(map(repr, numbers(f"--{key}", given[key])))
     return out
 
 
@@ -133,7 +106,7 @@ def profile_of(options, reference, arm=None):
     arm : ArmModel, optional
         Built from the options where it is needed and not given.
     """
-    settings = settings_of(options, len(reference))
+    settings = settings_of(options)
     if arm is None and specs.needs_model(options.profile, settings):
         arm = model.build(arm_file.load(options.arm))
     return specs.motion(options.profile, settings, arm, list(reference))
@@ -246,8 +219,7 @@ def publish(options, ros_args=None):
 
     arm = arm_file.load(options.arm)
     names = arm.joint_names
-    settings = settings_of(options, len(names))
-    built = model.build(arm) if specs.needs_model(options.profile, settings) else None
+    built = model.build(arm) if specs.needs_model(options.profile, settings_of(options)) else None
     if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
         profile_of(options, [0.0] * len(names), built)  # refuse wrong options before waiting
     with Session("publish_trajectory", args=ros_args or (), patience=options.timeout) as session:
@@ -280,19 +252,15 @@ def publish(options, ros_args=None):
         )
         after = states.newest
     if after.accepted_trajectory_id == before.accepted_trajectory_id:
-        raise FlexarmError(f"the controller refused the trajectory: {after.rejected_reason}")
+        raise FlexarmError(after.rejected_reason, field="the controller refused the trajectory")
     found = {
         "profile": options.profile,
         "trajectory_id": after.accepted_trajectory_id,
         "points": len(message.points),
         "duration_s": profile.duration,
     }
-    print(
-        json.dumps(found)
-        if options.json
-        else f"{options.profile}: accepted as trajectory {found['trajectory_id']}, {found['points']} points,"
-        f" {profile.duration:g} s"
-    )
+    text = f"{options.profile}: accepted as trajectory {found['trajectory_id']}, {found['points']} points"
+    print(json.dumps(found) if options.json else f"{text}, {profile.duration:g} s")
 
 
 def main(args=None):

@@ -81,12 +81,12 @@ def test_an_interrupt_exits_130(monkeypatch):
 def test_ros_arguments_are_passed_on_apart(monkeypatch):
     seen = []
     monkeypatch.setattr(publish_trajectory, "publish", lambda o, r: seen.append((o.to, r)))
-    for words in (["quintic", "--to", "1.0", "--ros-args", "-r", "__ns:=/left"], ["paper"]):
+    ros = ["--ros-args", "-r", "__ns:=/left"]
+    for words in (["quintic", "--to", "1.0", *ros], ["paper"]):
         with pytest.raises(SystemExit) as end:
             publish_trajectory.main(words)
         assert end.value.code == 0
-    assert seen[0] == ("1.0", ["--ros-args", "-r", "__ns:=/left"])
-    assert seen[1][1] == []
+    assert seen == [("1.0", ros), (None, [])]
 
 
 # --------------------------------------------------------------------------- publish: the motion
@@ -119,24 +119,24 @@ def test_one_angle_stands_for_all_joints_and_a_list_for_each():
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "field", "value"),
     [
-        (["--to", "ninety"], r"--to: 'ninety' is not a list of numbers"),
-        (["--to", ""], r"--to: '' is not a list of numbers"),
-        (["--to", "1,"], r"--to: '1,' is not a list of numbers"),
-        (["--to", "1,2"], r"--to: '1,2' does not fit \(1 finite angles"),
-        (["--to", "nan"], r"--to: 'nan' does not fit \(1 finite angles"),
-        (["--from", "inf"], r"--from: 'inf' does not fit \(1 finite angles"),
-        (["--from", "0;1"], r"--from: '0;1' is not a list of numbers"),
-        (["--duration", "0"], r"duration: 0\.0 s"),
-        (["--duration", "-2"], r"duration: -2\.0 s"),
-        (["--duration", "nan"], r"duration: nan s"),
+        (["--to", "ninety"], "--to", "ninety"),
+        (["--to", ""], "--to", ""),
+        (["--to", "1,"], "--to", "1,"),
+        (["--to", "1,2"], "to", "1.0;2.0"),
+        (["--to", "nan"], "--to", "nan"),
+        (["--from", "inf"], "--from", "inf"),
+        (["--from", "0;1"], "--from", "0;1"),
+        (["--duration", "0"], "duration", 0.0),
+        (["--duration", "-2"], "duration", -2.0),
     ],
 )
 @pytest.mark.parametrize("kind", ["paper", "quintic"])
-def test_an_unusable_option_is_refused_naming_it(kind, words, message):
-    with pytest.raises(TrajectoryError, match=message):
+def test_an_unusable_option_is_refused_naming_it(kind, words, field, value):
+    with pytest.raises(FlexarmError) as error:
         profile(kind, *words)
+    assert (error.value.field, error.value.value) == (field, value)
 
 
 def test_smooth_and_shaped_motions_are_their_families_and_shapers():
@@ -161,27 +161,23 @@ def test_a_line_leads_the_tip_from_where_the_reference_is():
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "field"),
     [
-        (["smooth", "--smoothness", "1"], "smoothness: 1 is not possible"),
-        (["quintic", "--smoothness", "3"], "quintic: 'smoothness' is no setting"),
-        (["quintic", "--torque-limit", "3"], "quintic: 'torque-limit' is no setting"),
-        (["paper", "--shape-modes", "1"], "shape-modes: is given without shaper"),
-        (
-            ["paper", "--shaper", "zv", "--shape-modes", "3"],
-            "shaper modes: 3 are not possible for R",
-        ),
-        (["line"], "line: tip is missing"),
-        (["line", "--tip", "1,2"], r"--tip: '1,2' does not fit \(3 finite coordinates"),
-        (["line", "--tip", "1"], r"--tip: '1' does not fit \(3 finite coordinates"),
-        (["line", "--tip", "1,0,0", "--to", "1"], "line: 'to' is no setting"),
-        (["line", "--tip", "3,0,0"], "tip path: R can't follow it|is where the tip is already"),
-        (["least-exciting", "--torque-limit", "-1"], r"torque_limit\[0\]: -1"),
+        (["smooth", "--smoothness", "1"], "smoothness"),
+        (["quintic", "--torque-limit", "3"], "quintic"),
+        (["paper", "--shape-modes", "1"], "shape-modes"),
+        (["line"], "line"),
+        (["line", "--tip", "1,2"], "tip"),
+        (["line", "--tip", "1"], "tip"),  # one number stands for all joints, but not for x, y and z
+        (["line", "--tip", "3,0,0"], "tip path"),
+        (["least-exciting", "--torque-limit", "-1"], "torque_limit[0]"),
     ],
 )
-def test_families_that_cant_be_are_refused_naming_the_option(words, message):
-    with pytest.raises(FlexarmError, match=message):
+def test_options_become_the_settings_of_their_families(words, field):
+    """Each is refused by the family, by the setting's name."""
+    with pytest.raises(FlexarmError) as error:
         profile(*words)
+    assert error.value.field == field
 
 
 def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, capsys):

@@ -3,7 +3,6 @@
 
 import json
 import re
-import struct
 from dataclasses import replace
 from functools import partial
 from html.parser import HTMLParser
@@ -11,20 +10,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 
 from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
+from flexarm_ros.messages import set_stamp
 from flexarm_studies.commands import arm_figure
 from flexarm_studies.loop import metrics, scenario
 from flexarm_tools.identification import recording as recordings
 from flexarm_tools.recording import mcap
 from flexarm_tools.recording import record as recording
 from flexarm_tools.recording.loop_bag import LoopBag
-from flexarm_tools.recording.recorder import BagWriter
+from flexarm_tools.recording.recorder import BagWriter, raw_stamp_ns
 from flexarm_tools.recording.serialised import Decoder
 from flexarm_tools.report import analysis, animation, command, figures, page, timeline
 from flexarm_tools.report import run as run_module
@@ -33,18 +34,24 @@ from flexarm_tools.report.run import HOLDING, TRACKING
 PERIOD = 5_000_000  # of the bags that are made up here [ns]
 
 
+def flexarm(*words, code=0):
+    """Run a command, which must end with this exit code."""
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(word) for word in words])
+    assert end.value.code == code
+
+
+def scenario_of(file="paper_slow", arm="R", **more):
+    return scenario.Scenario(arm, scenario.parameters(file), **more)
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """Two short runs of arm R, name to (bag, record, loop)."""
     folder, out = tmp_path_factory.mktemp("report"), {}
     for name, file in (("composite", "paper_composite"), ("slow", "paper_slow")):
-        of = scenario.Scenario(
-            "R",
-            scenario.parameters(file),
-            "quintic:to=0.3,duration=0.5",
-            rate=500.0,
-            duration=2.5,
-        )
+        motion = "quintic:to=0.3,duration=0.5"
+        of = scenario_of(file, trajectory=motion, rate=500.0, duration=2.5)
         record, _, loop = scenario.run_loop(of, partial(LoopBag, folder / name))
         out[name] = folder / name, record, loop
     return out
@@ -95,20 +102,12 @@ def test_a_bag_of_the_loop_says_which_arm_it_is(recorded, runs):
     path, _, loop = recorded["slow"]
     assert loop.bag is None
     with pytest.raises(FlexarmError, match=r"exists already"):
-        scenario.run_loop(
-            scenario.Scenario("R", scenario.parameters("paper_slow")), partial(LoopBag, path)
-        )
+        scenario.run_loop(scenario_of(), partial(LoopBag, path))
 
 
 def test_a_network_shows_in_the_bag_as_states_without_an_answer(tmp_path):
-    of = scenario.Scenario(
-        "R",
-        scenario.parameters("composite"),
-        "quintic:to=0.1,duration=0.2",
-        rate=500.0,
-        loss=0.2,
-        window=0.1,
-    )
+    motion = "quintic:to=0.1,duration=0.2"
+    of = scenario_of("composite", trajectory=motion, rate=500.0, loss=0.2, window=0.1)
     _, _, loop = scenario.run_loop(of, partial(LoopBag, tmp_path / "lossy"))
     (run,) = command.read([tmp_path / "lossy"])
     sent = run.column("joint_torque", "mode")
@@ -158,10 +157,8 @@ def test_residual_vibration_is_the_tips_about_its_mean_once_the_joints_have_sett
 
 def test_the_report_and_the_case_study_have_one_residual_and_one_peak_error(recorded, runs):
     _, record, loop = recorded["slow"]
-    got, wanted = (
-        analysis.summary(runs["slow"]),
-        metrics.case_study_metrics(record, loop.model, 1.5, 2.5),
-    )
+    got = analysis.summary(runs["slow"])
+    wanted = metrics.case_study_metrics(record, loop.model, 1.5, 2.5)
     assert 1e3 * got["residual_m"] == pytest.approx(304.8 * wanted["residual_tip_rms_ft"], rel=0.05)
     assert np.degrees(got["peak_error_rad"][0]) == pytest.approx(
         wanted["peak_joint_error_deg"], rel=1e-6
@@ -246,8 +243,7 @@ class Checker(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         self.open += [tag] if tag not in VOID else []
-        self.refers += [v for k, v in attributes if k in ("src", "href", "xlink:href", "data")]
-        self.ids += [v for k, v in attributes if k == "id"]
+        self.handle_startendtag(tag, attributes)
 
     def handle_startendtag(self, tag, attributes):
         self.refers += [v for k, v in attributes if k in ("src", "href", "xlink:href", "data")]
@@ -277,27 +273,20 @@ def checked(text):
 def compared(recorded, tmp_path_factory):
     """The page of both runs."""
     out = tmp_path_factory.mktemp("page") / "both.html"
-    paths = [str(path) for path, _, _ in recorded.values()]
-    with pytest.raises(SystemExit) as end:
-        cli.main(["report", *paths, "--out", str(out)])
-    assert end.value.code == 0
+    flexarm("report", *(path for path, _, _ in recorded.values()), "--out", out)
     return out.read_text(encoding="utf-8")
 
 
 def test_the_page_is_whole_small_and_needs_no_network(compared):
     checker = checked(compared)
     assert len(compared.encode()) < 1_000_000
-    for name in ("short", "summary", "animation", "supervisor", "tracking", "modes", "spectra"):
-        assert name in checker.ids
-    for name in ("torques", "strains", "events"):
-        assert name in checker.ids
+    sections = "short summary animation supervisor tracking modes spectra torques strains events"
+    assert set(sections.split()) <= set(checker.ids)
 
 
 def test_the_numbers_of_the_page_as_json(recorded, runs, tmp_path, capsys):
-    paths = [str(path) for path, _, _ in recorded.values()]
-    with pytest.raises(SystemExit) as end:
-        cli.main(["report", *paths, "--out", str(tmp_path / "both.html"), "--json"])
-    assert end.value.code == 0
+    paths = [path for path, _, _ in recorded.values()]
+    flexarm("report", *paths, "--out", tmp_path / "both.html", "--json")
     printed = json.loads(capsys.readouterr().out)
     assert (tmp_path / "both.html").is_file() and printed["report"] == str(tmp_path / "both.html")
     for name, numbers in printed["runs"].items():
@@ -374,14 +363,17 @@ def _made_up(path, count, arm="R", amplitude=None, change=lambda k, m: m, names=
         for space in namespaces:
             out.add(f"{space}arm_state", "flexarm_msgs/msg/ArmState")
         for k in range(count):
-            message = ArmState(session=7, sequence=k)
+            message = ArmState(
+                session=7,
+                sequence=k,
+                joint_names=["joint1"],
+                joint_position=[0.1 * np.sin(0.02 * k)],
+                joint_torque=[np.nan],
+                gauge_names=["root", "middle"],
+                strain=[1e-5 * np.cos(0.1 * k), 0.0],
+            )
             stamp = 10**9 + k * PERIOD
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            message.joint_names = ["joint1"]
-            message.joint_position = [0.1 * np.sin(0.02 * k)]
-            message.joint_torque = [np.nan]
-            message.gauge_names = ["root", "middle"]
-            message.strain = [1e-5 * np.cos(0.1 * k), 0.0]
+            set_stamp(message.header.stamp, stamp)
             if amplitude is not None:
                 message.mode_names = ["link1_y_mode1", "link1_y_mode2"]
                 message.modal_amplitude = amplitude(1e-9 * k * PERIOD)
@@ -406,18 +398,11 @@ def test_an_arm_state_alone_makes_a_report(tmp_path):
     assert "controller/state is not in the bag" in text
     run = read(path)
     assert run.amplitude_source == "strain"
-    strain_map = model_map("R")
-    wanted = strain_map.amplitudes(np.array([1e-5, 0.0]))
+    wanted = StrainMap(run.model).amplitudes(np.array([1e-5, 0.0]))
     np.testing.assert_allclose(run.deflections(slice(0, 1))[0], wanted, rtol=1e-12)
     got = analysis.summary(run)
     assert got["peak_error_rad"] is None and got["faults"] is None and got["residual_m"] is None
     assert got["peak_torque_Nm"] == [None]
-
-
-def model_map(name):
-    from flexarm_dynamics.arm.strain_map import StrainMap
-
-    return StrainMap(model.build(arm_file.load(name)))
 
 
 def test_without_strain_modes_and_arm_there_are_still_angles(tmp_path):
@@ -473,9 +458,7 @@ def test_a_session_that_begins_anew_goes_on_after_the_one_before(tmp_path):
     def again(k, message):
         if k >= 60:  # another session, whose clock began at zero
             message.session, message.sequence = 9, k - 60
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(
-                (k - 60) * PERIOD, 10**9
-            )
+            set_stamp(message.header.stamp, (k - 60) * PERIOD)
         return message
 
     run = read(_made_up(tmp_path / "again", 100, change=again))
@@ -487,11 +470,7 @@ def test_a_session_that_begins_anew_goes_on_after_the_one_before(tmp_path):
 @pytest.mark.parametrize("by", [3600.0, -0.7])
 def test_a_jump_of_the_clock_is_noted_and_left_out(tmp_path, by):
     def jump(k, message):
-        if k >= 60:
-            stamp = 10**10 + k * PERIOD + round(by * 1e9)
-        else:
-            stamp = 10**10 + k * PERIOD
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        set_stamp(message.header.stamp, 10**10 + k * PERIOD + (k >= 60) * round(by * 1e9))
         return message
 
     run = read(_made_up(tmp_path / "jump", 100, change=jump))
@@ -538,24 +517,31 @@ def test_namespaces_are_runs_of_their_own(tmp_path):
         command.read([path], namespace="middle")
 
 
-def test_an_empty_bag_and_what_is_no_bag_say_what_to_do(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("nowhere", None, "no such file"),
+        ("folder/notes.txt", b"hello", "a folder, a .mcap or a .db3"),
+        ("folder", None, "neither metadata.yaml nor a .mcap"),
+        ("junk.mcap", 100 * b"hello", "is not an MCAP file"),
+        ("broken", b"- a\n- b: [\n", "(?s)can't be read as a bag.*ros2 bag reindex"),
+    ],
+)
+def test_what_is_no_bag_says_what_to_do(tmp_path, name, content, reason):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "broken").mkdir()
+    path = tmp_path / name
+    if content is not None:
+        (path / "metadata.yaml" if path.is_dir() else path).write_bytes(content)
+    with pytest.raises(FlexarmError, match=reason) as error:
+        command.read([path])
+    assert str(path) == error.value.field
+
+
+def test_an_empty_bag_and_a_page_that_is_none_say_what_to_do(tmp_path):
     empty = _made_up(tmp_path / "empty", 0)
     with pytest.raises(FlexarmError, match=r"empty.*flexarm record"):
         command.read([empty])
-    with pytest.raises(FlexarmError, match=r"no such file"):
-        command.read([tmp_path / "nowhere"])
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(FlexarmError, match=r"neither metadata.yaml nor a .mcap"):
-        command.read([tmp_path / "folder"])
-    (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(FlexarmError, match=r"a folder, a .mcap or a .db3"):
-        command.read([tmp_path / "notes.txt"])
-    (tmp_path / "junk.mcap").write_bytes(b"hello" * 100)
-    with pytest.raises(FlexarmError, match=r"is not an MCAP file"):
-        command.read([tmp_path / "junk.mcap"])
-    (tmp_path / "folder" / "metadata.yaml").write_text("- a\n- b: [\n")
-    with pytest.raises(FlexarmError, match=r"can't be read as a bag"):
-        command.read([tmp_path / "folder"])
     with pytest.raises(FlexarmError, match=r"ends in .html"):
         command.make([empty], tmp_path / "x.pdf")
 
@@ -609,7 +595,7 @@ def test_samples_without_an_answer_change_no_number_but_their_own(tmp_path, reco
     answered = dict(enumerate(random.random(5000) > 0.2))  # 20 % of the states get no answer
     with BagWriter(tmp_path / "holes", "R") as out:
         for topic, _, raw in mcap.messages(next(path.glob("*.mcap"))):
-            stamp = message_stamp(raw)
+            stamp = raw_stamp_ns(raw)
             if topic == "/arm_state" or answered[stamp // 2_000_000 % 5000]:
                 out.write(topic[1:], stamp, raw)
     run, whole = read(tmp_path / "holes"), analysis.summary(runs["slow"])
@@ -633,19 +619,16 @@ def test_a_fault_is_shown_with_its_reason(tmp_path, recorded):
     path, _, _ = recorded["slow"]
     faulty = tmp_path / "faulty"
     with BagWriter(faulty, "R") as out:
-        for topic, kind, raw in mcap.messages(next(path.glob("*.mcap"))):
+        for topic, _, raw in mcap.messages(next(path.glob("*.mcap"))):
             name = topic.lstrip("/")
             if name == "controller/state":
-                from rclpy.serialization import deserialize_message
-
                 message = deserialize_message(raw, CompositeState)
                 if message.sequence >= 500:
                     message.supervisor_state = CompositeState.FAULT
                     message.rejected_reason = "tracking error <of joint1>"
                 message.compute_time = 1e-4 * (1 + message.sequence % 2)
                 raw = bytes(serialize_message(message))
-            out.write(name, message_stamp(raw), raw)
-            del kind
+            out.write(name, raw_stamp_ns(raw), raw)
     run = read(faulty)
     got = analysis.summary(run)
     assert got["faults"] == 1 and "tracking error <of joint1>" in got["first_fault"]
@@ -655,11 +638,6 @@ def test_a_fault_is_shown_with_its_reason(tmp_path, recorded):
     assert ("FAULT", "tracking error <of joint1>") in events
     timing = figures._Paper([run], [analysis.motions(run)], "", False).timing()
     assert "<svg" in timing.image and len(timing.times) == 1
-
-
-def message_stamp(raw):
-    sec, nanosec = struct.unpack_from("<iI", raw, 4)
-    return sec * 10**9 + nanosec
 
 
 # The parts -------------------------------------------------------------------------------------
@@ -745,8 +723,8 @@ def test_digits_are_for_reading():
 # Recording -------------------------------------------------------------------------------------
 
 
-class _Line:
-    """In the place of a `Listener`: so many states, then nothing."""
+class _Ending:
+    """In the place of a `Listener`: so many states, then Ctrl-C, then nothing more."""
 
     namespace = "left"
 
@@ -754,27 +732,17 @@ class _Line:
         self._count, self.sent = count, 0
 
     def poll(self):
-        if self.sent >= self._count:
-            raise KeyboardInterrupt if self.sent == self._count else AssertionError
         self.sent += 1
+        if self.sent == self._count + 1:
+            raise KeyboardInterrupt
+        if self.sent > self._count:
+            return {}
         message = ArmState(sequence=self.sent, joint_names=["joint1"], joint_position=[0.5])
         message.header.stamp.sec = self.sent
         return {"arm_state": [bytes(serialize_message(message))], "joint_torque": []}
 
     def ask_arm(self):
         return lambda: "R" if self.sent > 3 else ""
-
-
-class _Ending(_Line):
-    """Ctrl-C after the last state, and nothing more to come when it is asked again."""
-
-    def poll(self):
-        if self.sent < self._count:
-            return super().poll()
-        self._count, self.sent = self._count, self.sent + 1
-        if self.sent == self._count + 1:
-            raise KeyboardInterrupt
-        return {}
 
 
 def test_a_recording_ends_with_ctrl_c_and_is_a_bag_of_the_nodes_arm(tmp_path, monkeypatch, capsys):
@@ -788,30 +756,31 @@ def test_a_recording_ends_with_ctrl_c_and_is_a_bag_of_the_nodes_arm(tmp_path, mo
     assert f"flexarm report {tmp_path / 'bag'}\n" in printed
 
 
-def test_what_can_not_be_recorded_is_refused(tmp_path):
-    options = SimpleNamespace(out=str(tmp_path), duration=None, arm=None, namespace="")
-    with pytest.raises(FlexarmError, match=r"exists already"):
-        recording.record(options)
-    options = SimpleNamespace(out=str(tmp_path / "x"), duration=-1.0, arm=None, namespace="")
-    with pytest.raises(FlexarmError, match=r"--duration"):
-        recording.record(options)
-    options = SimpleNamespace(out=str(tmp_path / "x"), duration=None, arm="none", namespace="")
-    with pytest.raises(FlexarmError, match=r"none"):
-        recording.record(options)
-    assert not (tmp_path / "x").exists()
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"out": "."}, "exists already"),
+        ({"duration": -1.0}, "--duration"),
+        ({"arm": "none"}, "none"),
+    ],
+)
+def test_what_can_not_be_recorded_is_refused(tmp_path, monkeypatch, changes, reason):
+    monkeypatch.chdir(tmp_path)
+    options = {"out": "x", "duration": None, "arm": None, "namespace": "", **changes}
+    with pytest.raises(FlexarmError, match=reason):
+        recording.record(SimpleNamespace(**options))
+    assert not list(tmp_path.iterdir())
 
 
 def test_simulate_takes_a_bag_only_with_a_controller(capsys):
-    with pytest.raises(SystemExit) as end:
-        cli.main(["simulate", "R", "--bag", "x"])
-    assert end.value.code == 1 and "only with --controller" in capsys.readouterr().err
+    flexarm("simulate", "R", "--bag", "x", code=1)
+    assert "only with --controller" in capsys.readouterr().err
 
 
 def test_an_arm_that_was_read_has_no_name_in_its_bag(tmp_path):
-    of = scenario.Scenario(
-        replace(arm_file.load("R")),
-        scenario.parameters("paper_slow"),
-        "quintic:to=0.05,duration=0.1",
+    of = scenario_of(
+        arm=replace(arm_file.load("R")),
+        trajectory="quintic:to=0.05,duration=0.1",
         rate=200.0,
         window=0.0,
     )

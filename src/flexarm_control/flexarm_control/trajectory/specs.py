@@ -252,9 +252,9 @@ def _number(kind, settings, key, default):
 
 def _numbers(text, count, name, what, spread=True):
     """Read so many finite numbers, (count,); with `spread` one number stands for all."""
-    hint = f"give {count} finite {what}, separated by semicolons"
-    words = text.split(";")
-    values = [_read(float, word, name, "is not a number", hint) for word in words]
+    hint = f"give {count} finite {what}"
+    semicolons = f"{hint}, separated by semicolons"
+    values = [_read(float, word, name, "is not a number", semicolons) for word in text.split(";")]
     values = values * count if spread and len(values) == 1 else values
     if len(values) != count or not all(map(math.isfinite, values)):
         raise TrajectoryError("can't be used", field=name, value=text, hint=hint)

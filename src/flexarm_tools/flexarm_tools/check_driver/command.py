@@ -162,18 +162,18 @@ class Examination:
     Parameters
     ----------
     arm_model : ArmModel
-    line : Conversation
+    driver : Conversation
     tolerances : Tolerances
     """
 
-    def __init__(self, arm_model, line, tolerances):
+    def __init__(self, arm_model, driver, tolerances):
         self.model, self.arm = arm_model, arm_model.arm
-        self.line, self.tolerances = line, tolerances
+        self.driver, self.tolerances = driver, tolerances
         self.findings = []
 
     def listen(self, seconds):
         """Check the samples without moving; return whether they can be read at all."""
-        received = self.line.listen(seconds)
+        received = self.driver.listen(seconds)
         if len(received) < 5:
             text = f"{len(received)} states in at least {seconds:g} s: publish arm_state at a steady rate"
             self.findings.append(Finding("rate", Verdict.FAIL, text))
@@ -199,7 +199,7 @@ class Examination:
             self.findings.append(Finding("response", Verdict.FAIL, text))
             return
         # Not at the start: other publishers have to be discovered first.
-        if not self.line.alone():
+        if not self.driver.alone():
             raise not_alone()
         for joint in range(len(self.arm.joints)):
             if joint:
@@ -222,19 +222,19 @@ class Examination:
 
     def _pushed(self, joint, angle):
         """Push a joint once; return the push, its samples and the torque sent."""
-        position = np.array(self._samples(self.line.listen(0.05)).position[-1])
+        position = np.array(self._samples(self.driver.listen(0.05)).position[-1])
         push = moving.plan(self.model, position, joint, angle)
         sequences, torques = [], []
 
         def answer(at, message):
             torque = push.torque(at)
-            self.line.send(message, torque)
+            self.driver.send(message, torque)
             sequences.append(message.sequence)
             torques.append(torque)
 
-        received = self.line.listen(push.duration, answer)
+        received = self.driver.listen(push.duration, answer)
         found = self._samples(received)
-        self.line.disable(received[-1].message)
+        self.driver.disable(received[-1].message)
         return push, found, moving.sent_torque(found, sequences, torques)
 
     def _stop(self, push):
@@ -243,11 +243,11 @@ class Examination:
 
         def answer(at, message):
             torque = push.jolt(at, JOLT)
-            self.line.send(message, torque)
+            self.driver.send(message, torque)
             last[:] = message.sequence, torque
 
-        received = self.line.listen(2.0 * JOLT, answer)
-        received += self.line.listen(5.0 * self.tolerances.torque_timeout + 0.2)
+        received = self.driver.listen(2.0 * JOLT, answer)
+        received += self.driver.listen(5.0 * self.tolerances.torque_timeout + 0.2)
         self.findings.append(
             moving.check_stop(self._samples(received), *last, push.joint, self.tolerances)
         )
@@ -258,17 +258,17 @@ class Examination:
             "old sequence": lambda m: {"sequence": (m.sequence - back) % 2**32},
         }.items():
             torque = push.jolt(0.0, JOLT)
-            received = self.line.listen(
-                REFUSED, lambda _, m, c=changes, u=torque: self.line.send(m, u, **c(m))
+            received = self.driver.listen(
+                REFUSED, lambda _, m, c=changes, u=torque: self.driver.send(m, u, **c(m))
             )
             found = self._samples(received)
             self.findings.append(moving.check_refused(kind, found, torque, push.joint))
-        self.line.disable(received[-1].message)
+        self.driver.disable(received[-1].message)
 
     def _rest(self):
         """Wait under the safe action until the bending has decayed, at most 3 s."""
         for _ in range(10):
-            last = self._samples(self.line.listen(0.3))
+            last = self._samples(self.driver.listen(0.3))
             if np.ptp(last.position, axis=0).max() < 1e-4:
                 return
 
@@ -299,30 +299,30 @@ def check_driver(options):
     arm_model = model.build(arm_file.load(options.arm))
     names = Tolerances.__dataclass_fields__
     tolerances = Tolerances(**{name: getattr(options, name) for name in names})
-    line = Conversation(arm_model.arm, options.namespace)
+    driver = Conversation(arm_model.arm, options.namespace)
     try:
-        line.session.wait_for(
+        driver.session.wait_for(
             "arm_state",
-            lambda: line.received,
+            lambda: driver.received,
             options.timeout,
             "start the driver, on this ROS_DOMAIN_ID",
         )
         if options.allow_motion:
-            line.session.wait_for(
+            driver.session.wait_for(
                 "a subscriber of joint_torque",
-                line.driver_listens,
+                driver.driver_listens,
                 options.timeout,
                 "the driver has to subscribe to it",
             )
-            if not line.alone():
+            if not driver.alone():
                 raise not_alone()
-        examination = Examination(arm_model, line, tolerances)
+        examination = Examination(arm_model, driver, tolerances)
         if examination.listen(options.duration) and options.allow_motion:
             examination.move(options.angle)
     finally:
-        if options.allow_motion and line.received:
-            line.disable(line.received[-1].message)
-        line.close()
+        if options.allow_motion and driver.received:
+            driver.disable(driver.received[-1].message)
+        driver.close()
     return report(merged(examination.findings), options.json)
 
 

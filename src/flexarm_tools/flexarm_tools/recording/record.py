@@ -119,7 +119,7 @@ class Taken:
         for topic, rows in messages.items():
             for raw in rows:
                 self.bag.write(topic, now_ns, raw)
-            self.counts[topic] = self.counts.get(topic, 0) + len(rows)
+            self.counts[topic] += len(rows)
             if rows:
                 self._from, self._to = self._from or now_ns, now_ns
 
@@ -188,9 +188,8 @@ class Listener:
     def poll(self):
         """What has arrived since the last call, topic to list of bytes."""
         self._session.serve(POLL_PERIOD)
-        out = {}
-        for topic, messages in self._recorder.raw.items():
-            out[topic] = list(messages)
+        out = {topic: list(messages) for topic, messages in self._recorder.raw.items()}
+        for messages in self._recorder.raw.values():
             messages.clear()
         return out
 
@@ -203,18 +202,21 @@ class Listener:
             After so long, with the topics that there are.
         """
         if not self._session.serve(seconds, lambda: any(self._recorder.raw.values())):
-            raise FlexarmError(self._silence(seconds))
+            raise self._silence(seconds)
 
     def _silence(self, seconds):
         node = self._session.node
-        there = [n for n, kinds in node.get_topic_names_and_types() if _ours(kinds)]
-        where = f"/{self.namespace}" if self.namespace else "no namespace"
-        others = [n for n in there if node.count_publishers(n)]
-        hint = f"; there are {', '.join(sorted(others))}: give their --namespace" if others else ""
-        return (
-            f"no message of an arm in {where} for {seconds:g} s; start the driver (or simulator), in the same"
-            f" ROS_DOMAIN_ID{hint}"
+        others = sorted(
+            topic
+            for topic, kinds in node.get_topic_names_and_types()
+            if node.count_publishers(topic)
+            and any(kind.startswith("flexarm_msgs/msg/") for kind in kinds)
         )
+        where = f"/{self.namespace}" if self.namespace else "no namespace"
+        hint = "start the driver (or simulator), in the same ROS_DOMAIN_ID"
+        if others:
+            hint += f"; there are {', '.join(others)}: give their --namespace"
+        return FlexarmError(f"no message of an arm in {where} for {seconds:g} s", hint=hint)
 
     def ask_arm(self):
         """Ask the nodes for their parameter ``arm``; a function that returns it once it is known, else ''."""
@@ -239,7 +241,3 @@ class Listener:
 
     def __exit__(self, *_):
         self._session.close()
-
-
-def _ours(kinds):
-    return any(kind.startswith("flexarm_msgs/msg/") for kind in kinds)

@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
-from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_ros.messages import (
     CompositeStateWriter,
@@ -48,45 +48,42 @@ def _answer(incoming, outgoing):
     outgoing.sequence = incoming.sequence
 
 
-def observer(arm):
-    """Node in the observer's place."""
-    node = Node("relay_observer")
-    estimate, state = filled_state(arm), ObserverStateWriter(arm).message
-    state.gauge_health = bytes(len(arm.gauges))
-    estimate_pub = node.create_publisher(ArmState, "arm_state_estimate", qos.CONTROL_PATH)
-    state_pub = node.create_publisher(ObserverState, "observer/state", qos.CONTROL_PATH)
+def _relay(name, taken, answer, topic, beside, beside_topic):
+    """A node that answers each state on the topic `taken` with two ready-made messages.
 
-    def relay(msg):
-        _answer(msg, estimate)
-        estimate_pub.publish(estimate)
-        if state_pub.get_subscription_count():
-            _answer(msg, state)
-            state_pub.publish(state)
+    The message `beside` is sent only if its topic has subscribers, as the nodes do it.
+    """
+    node = Node(f"relay_{name}")
+    answers = node.create_publisher(type(answer), topic, qos.CONTROL_PATH)
+    others = node.create_publisher(type(beside), beside_topic, qos.CONTROL_PATH)
+
+    def relay(incoming):
+        _answer(incoming, answer)
+        answers.publish(answer)
+        if others.get_subscription_count():
+            _answer(incoming, beside)
+            others.publish(beside)
 
     node.control_path = ControlPath(
-        node.create_subscription(ArmState, "arm_state", relay, qos.CONTROL_PATH)
+        node.create_subscription(ArmState, taken, relay, qos.CONTROL_PATH)
     )
     return node
+
+
+def observer(arm):
+    """Node in the observer's place."""
+    state = ObserverStateWriter(arm).message
+    state.gauge_health = bytes(len(arm.gauges))
+    estimate = filled_state(arm)
+    return _relay("observer", "arm_state", estimate, "arm_state_estimate", state, "observer/state")
 
 
 def controller(arm):
     """Node in the controller's place."""
-    node = Node("relay_controller")
     torque, state = TorqueWriter(arm, 0).message, CompositeStateWriter(model.build(arm)).message
-    torque_pub = node.create_publisher(JointTorque, "joint_torque", qos.CONTROL_PATH)
-    state_pub = node.create_publisher(CompositeState, "controller/state", qos.CONTROL_PATH)
-
-    def relay(msg):
-        _answer(msg, torque)
-        torque_pub.publish(torque)
-        if state_pub.get_subscription_count():
-            _answer(msg, state)
-            state_pub.publish(state)
-
-    node.control_path = ControlPath(
-        node.create_subscription(ArmState, "arm_state_estimate", relay, qos.CONTROL_PATH)
+    return _relay(
+        "controller", "arm_state_estimate", torque, "joint_torque", state, "controller/state"
     )
-    return node
 
 
 class Source(Node):
