@@ -92,8 +92,8 @@ def excite(options):
         kept = recorder.between(min(enabled), max(enabled))
     write_bag(out, kept, options.arm)
     count = len(kept["arm_state"])
-    said = {"out": str(out), "states": count}
-    print(json.dumps(said) if options.json else f"{count} states in {out}")
+    recorded = {"out": str(out), "states": count}
+    print(json.dumps(recorded) if options.json else f"{count} states in {out}")
     if "excitation complete" not in output:
         raise FlexarmError(f"{_ending(output) or output}; what came before is in {out}")
     return out
