@@ -54,11 +54,8 @@ class Bench:
         sim, rows = self.sim, []
         self.answered, self.torques = [], []
         for k in range(count):
-            rows.append(
-                [sim.stamp_ns, sim.sequence]
-                + [a.copy() for a in (sim.position, sim.velocity, sim.torque)]
-                + [a.copy() for a in (sim.strain, sim.amplitude)]
-            )
+            values = (sim.position, sim.velocity, sim.torque, sim.strain, sim.amplitude)
+            rows.append([sim.stamp_ns, sim.sequence, *(a.copy() for a in values)])
             u = torque(k / RATE)
             if u is not None:
                 self.answered.append(sim.sequence)
@@ -66,21 +63,15 @@ class Bench:
             sim.advance(u)
         stamp, sequence, *values = (np.array(c) for c in zip(*rows, strict=True))
         stamp = stamp.astype(np.int64) + NOW
-        has = (True, True, True, values[3].shape[1] > 0, values[4].shape[1] > 0)
-        position, velocity, reported, strain, amplitude = (
-            v if h else None for v, h in zip(values, has, strict=True)
-        )
+        names = ("position", "velocity", "torque", "strain", "amplitude")
+        columns = {k: v if v.shape[1] else None for k, v in zip(names, values, strict=True)}
         return Samples(
             arrival=1e-9 * stamp,
             clock=stamp + 1_000_000,
             stamp=stamp,
             session=np.full(count, 4711),
             sequence=sequence.astype(np.int64),
-            position=position,
-            velocity=velocity,
-            torque=reported,
-            strain=strain,
-            amplitude=amplitude,
+            **columns,
         )
 
     def push_again(self, torque):
@@ -214,68 +205,70 @@ def test_a_pause_of_the_reader_makes_no_driver_fail(bench):
     assert verdicts(found)["sequence"] == "WARN" and "did not arrive" in found["sequence"].text
 
 
-# The six -----------------------------------------------------------------------------------------------
+# What goes wrong -------------------------------------------------------------------------------------
 
 
-def test_wrong_sign(bench):
-    def change(s):
-        return replace(s, position=-s.position, velocity=-s.velocity)
+def changed(*fields, by):
+    """A change of some fields of samples by a function."""
+    return lambda s: replace(s, **{field: by(getattr(s, field)) for field in fields})
 
+
+def frozen(strain):
+    return np.full_like(strain, strain[0, 0])
+
+
+def without(*fields, then):
+    """A change of samples that lack some fields."""
+    return lambda s: then(replace(s, **dict.fromkeys(fields)))
+
+
+EXCHANGED = "mode link1_y_mode1 moves as link1_y_mode2 should: they are exchanged"
+SWAPPED = changed("amplitude", by=lambda a: a[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("change", "failures"),
+    [
+        (
+            changed("position", "velocity", by=np.negative),
+            {"response": "wrong sign: reverse the sign of the position's or of the torque's scale"},
+        ),
+        (
+            changed("position", by=np.degrees),
+            {
+                "velocity": "joint1 moves 57.3 times its integrated velocity: position is in degrees",
+                "response": "moves 57.3 times as far as its model",
+            },
+        ),
+        # The velocity in degrees as well: only the model can tell.
+        (
+            changed("position", "velocity", by=np.degrees),
+            {"response": "position is in degrees, send rad"},
+        ),
+        (SWAPPED, {"mode order": EXCHANGED}),
+        (without("strain", then=SWAPPED), {"mode order": EXCHANGED}),
+        (
+            changed("stamp", by=lambda t: t - 200_000_000),
+            {
+                "stamps": "stamps are at least 0.201 s old when they arrive, allowed are 0.05 s: stamp at the"
+                " measurement and publish at once"
+            },
+        ),
+        (
+            without("amplitude", then=changed("strain", by=frozen)),
+            {"frozen strain": "strain of root, middle did not change at all while the arm moved"},
+        ),
+    ],
+    ids=(
+        *("wrong sign", "position in degrees", "both in degrees", "swapped modes"),
+        *("swapped modes without strain", "old stamps", "frozen strain"),
+    ),
+)
+def test_a_fault_fails_its_own_checks_alone_and_is_named(bench, change, failures):
     failed = bench.broken(change)
-    assert set(failed) == {"response"}
-    assert (
-        "wrong sign: reverse the sign of the position's or of the torque's scale"
-        in failed["response"]
-    )
-
-
-def test_position_in_degrees(bench):
-    failed = bench.broken(lambda s: replace(s, position=np.degrees(s.position)))
-    assert set(failed) == {"velocity", "response"}
-    assert (
-        "joint1 moves 57.3 times its integrated velocity: position is in degrees"
-        in failed["velocity"]
-    )
-    assert "moves 57.3 times as far as its model" in failed["response"]
-    # The velocity in degrees as well: only the model can tell.
-    failed = bench.broken(
-        lambda s: replace(s, position=np.degrees(s.position), velocity=np.degrees(s.velocity))
-    )
-    assert set(failed) == {"response"}
-    assert "position is in degrees, send rad" in failed["response"]
-
-
-def test_swapped_modes(bench):
-    failed = bench.broken(lambda s: replace(s, amplitude=s.amplitude[:, ::-1]))
-    assert set(failed) == {"mode order"}
-    text = "mode link1_y_mode1 moves as link1_y_mode2 should: they are exchanged"
-    assert text in failed["mode order"]
-
-
-def test_swapped_modes_of_a_driver_without_strain(bench):
-    failed = bench.broken(lambda s: replace(s, strain=None, amplitude=s.amplitude[:, ::-1]))
-    assert set(failed) == {"mode order"}
-
-
-def test_old_stamps(bench):
-    failed = bench.broken(lambda s: replace(s, stamp=s.stamp - 200_000_000))
-    assert set(failed) == {"stamps"}
-    assert failed["stamps"] == (
-        "stamps are at least 0.201 s old when they arrive, allowed are 0.05 s: stamp at the"
-        " measurement and publish at once"
-    )
-
-
-def test_frozen_strain(bench):
-    def change(s):
-        return replace(s, strain=np.full_like(s.strain, s.strain[0, 0]), amplitude=None)
-
-    failed = bench.broken(change)
-    assert set(failed) == {"frozen strain"}
-    assert (
-        "strain of root, middle did not change at all while the arm moved"
-        in failed["frozen strain"]
-    )
+    assert set(failed) == set(failures)
+    for check, text in failures.items():
+        assert text in failed[check]
 
 
 def test_one_frozen_gauge_of_several(lab):
@@ -301,45 +294,38 @@ def test_torque_ignored(bench, reports):
     assert "torque is ignored: is the drive enabled" in failed["response"]
 
 
-# More that goes wrong --------------------------------------------------------------------------------
-
-
-def changed(field, function):
-    return lambda s: replace(s, **{field: function(getattr(s, field))})
-
-
 @pytest.mark.parametrize(
     ("change", "check", "text"),
     [
-        (changed("velocity", np.degrees), "velocity", "velocity is in degrees per second"),
-        (changed("velocity", np.negative), "velocity", "one of the two has the wrong sign"),
-        (changed("strain", lambda e: 1e6 * e), "strain response", "check its scale"),
-        (changed("strain", np.negative), "strain response", "what its model does: wrong sign"),
+        (changed("velocity", by=np.degrees), "velocity", "velocity is in degrees per second"),
+        (changed("velocity", by=np.negative), "velocity", "one of the two has the wrong sign"),
+        (changed("strain", by=lambda e: 1e6 * e), "strain response", "check its scale"),
+        (changed("strain", by=np.negative), "strain response", "what its model does: wrong sign"),
         (
-            changed("strain", lambda e: e[:, ::-1]),
+            changed("strain", by=lambda e: e[:, ::-1]),
             "gauge order",
             "gauge root moves as middle should",
         ),
         (
-            changed("strain", lambda e: e + np.nan),
+            changed("strain", by=lambda e: e + np.nan),
             "finite",
             "strain of root is not finite in 200 of",
         ),
-        (changed("position", lambda q: q + 90.0), "position", "are these degrees or counts?"),
-        (changed("torque", np.negative), "torque reported", "reported with the wrong sign"),
+        (changed("position", by=lambda q: q + 90.0), "position", "are these degrees or counts?"),
+        (changed("torque", by=np.negative), "torque reported", "reported with the wrong sign"),
         (
-            changed("torque", lambda u: 0.5 * u),
+            changed("torque", by=lambda u: 0.5 * u),
             "torque reported",
             "reports 0.50 of the torque sent",
         ),
-        (changed("sequence", lambda k: 0 * k), "sequence", "stands still"),
-        (changed("sequence", lambda k: 5 * k), "sequence", "in steps of 5"),
-        (changed("session", lambda k: k + np.arange(k.size)), "session", "sessions in one run"),
-        (changed("stamp", lambda t: t + 10**8), "stamps", "in the future"),
-        (changed("stamp", lambda t: 0 * t), "stamps", "100% of the stamps do not rise"),
-        (changed("stamp", lambda t: t // 1000), "stamps", "0.001 s per second"),
+        (changed("sequence", by=lambda k: 0 * k), "sequence", "stands still"),
+        (changed("sequence", by=lambda k: 5 * k), "sequence", "in steps of 5"),
+        (changed("session", by=lambda k: k + np.arange(k.size)), "session", "sessions in one run"),
+        (changed("stamp", by=lambda t: t + 10**8), "stamps", "in the future"),
+        (changed("stamp", by=lambda t: 0 * t), "stamps", "100% of the stamps do not rise"),
+        (changed("stamp", by=lambda t: t // 1000), "stamps", "0.001 s per second"),
         (
-            changed("stamp", lambda t: t - (t - t[0]) // 5),
+            changed("stamp", by=lambda t: t - (t - t[0]) // 5),
             "rate",
             "250.0 samples per second, expected are 200",
         ),
@@ -353,34 +339,28 @@ def test_other_faults_are_named(bench, change, check, text):
 
 def test_a_scale_that_is_wrong_is_not_one_of_the_tolerated(bench):
     for factor, fails in ((0.6, False), (1.4, False), (0.4, True), (1.6, True)):
-        failed = bench.broken(
-            lambda s, f=factor: replace(s, position=f * s.position, velocity=f * s.velocity)
-        )
+        failed = bench.broken(changed("position", "velocity", by=lambda v, f=factor: f * v))
         assert ("response" in failed) == fails, factor
 
 
 def test_joints_that_are_exchanged_are_distinguished(two_link):
-    def change(s):
-        return replace(s, position=s.position[:, ::-1], velocity=s.velocity[:, ::-1])
-
-    assert "joint joint1 moves as joint2 should" in two_link.broken(change)["joint order"]
+    failed = two_link.broken(changed("position", "velocity", by=lambda v: v[:, ::-1]))
+    assert "joint joint1 moves as joint2 should" in failed["joint order"]
 
 
 def test_gauges_of_two_links_that_are_exchanged_are_distinguished(two_link):
-    def change(s):
-        return replace(s, strain=s.strain[:, [2, 1, 0, 3]], amplitude=None)
-
+    change = without("amplitude", then=changed("strain", by=lambda e: e[:, [2, 1, 0, 3]]))
     text = two_link.broken(change)["gauge order"]
     assert "gauge link1_root moves as link2_root should" in text
 
 
 def test_a_bridge_out_of_balance_is_a_warning_and_at_the_end_of_its_range_a_failure(bench):
-    found = bench.findings(changed("strain", lambda e: e + 150e-6))
+    found = bench.findings(changed("strain", by=lambda e: e + 150e-6))
     assert verdicts(found)["strain at rest"] == "WARN"
     assert "call observer/calibrate_gauges" in found["strain at rest"].text
-    failed = bench.broken(changed("strain", lambda e: np.minimum(e + 1.0, 1000e-6)))
+    failed = bench.broken(changed("strain", by=lambda e: np.minimum(e + 1.0, 1000e-6)))
     assert "at the end of its range in 100%" in failed["strain at rest"]
-    failed = bench.broken(changed("strain", lambda e: e + 1.0))
+    failed = bench.broken(changed("strain", by=lambda e: e + 1.0))
     assert "not microstrain or counts" in failed["strain at rest"]
 
 
