@@ -71,7 +71,7 @@ ENOUGH = 100
 
 
 def fuzz(kind, inputs, seed):
-    """Give one reader so many inputs.
+    """Give one reader so many inputs; a `Tally`.
 
     Parameters
     ----------
@@ -79,10 +79,6 @@ def fuzz(kind, inputs, seed):
         A `Reader`.
     inputs : int
     seed : int
-
-    Returns
-    -------
-    Tally
     """
     reader, tally = kind(), Tally(kind.name)
     started = time.perf_counter()

@@ -41,14 +41,7 @@ MAX_TRIES = 20
 
 
 class Nodes:
-    """Three nodes, and a program beside them that sends what it should not.
-
-    Parameters
-    ----------
-    bench : harness.Bench
-    seed : int
-    arm : str
-    """
+    """Three nodes, and a program beside them that sends what it should not."""
 
     def __init__(self, bench, seed, arm="R"):
         self.bench, self.random = bench, Random(f"{seed} nodes")
@@ -264,7 +257,7 @@ def _sendable(value):
 
 
 def fuzz(count, seed, say, patience=180.0):
-    """Give running nodes so many messages.
+    """Give running nodes so many messages; a `Tally` of each kind.
 
     Parameters
     ----------
@@ -274,10 +267,6 @@ def fuzz(count, seed, say, patience=180.0):
         Called with each `Tally` when it is complete.
     patience : float
         Longest wait for any one thing [s].
-
-    Returns
-    -------
-    list of Tally
     """
     tallies = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, harness.Bench(folder) as bench:

@@ -97,16 +97,12 @@ CASE_STUDY = {
 
 
 def one_arm(values):
-    """The nodes of one arm.
+    """The nodes of one arm, a list of `Start`.
 
     Parameters
     ----------
     values : mapping
         Of the arguments `ONE_ARM`, as strings.
-
-    Returns
-    -------
-    list of Start
 
     Raises
     ------
@@ -196,10 +192,6 @@ def description(arguments, starts):
     arguments : mapping of str to Argument
     starts : callable
         Takes the values by name, returns a list of `Start`.
-
-    Returns
-    -------
-    launch.LaunchDescription
     """
     from launch import LaunchDescription
     from launch.actions import DeclareLaunchArgument, OpaqueFunction

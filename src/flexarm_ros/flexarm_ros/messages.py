@@ -77,13 +77,7 @@ class _Columns:
 
 
 class StateReader:
-    """Reads `ArmState` messages into an `ArmSample`.
-
-    Parameters
-    ----------
-    arm : Arm
-        Whose names and order count.
-    """
+    """Reads `ArmState` messages into an `ArmSample`, in the order of an `arm`'s names."""
 
     def __init__(self, arm):
         self._joints = _Columns("joint_names", arm.joint_names)
@@ -140,14 +134,7 @@ def _floats(msg, field, size):
 
 
 class StateWriter:
-    """An `ArmState` message whose arrays are written in place.
-
-    Parameters
-    ----------
-    arm : Arm
-    frame_id : str
-        Base frame of the arm.
-    """
+    """An `ArmState` message whose arrays are written in place; `frame_id` is the `arm`'s base frame."""
 
     def __init__(self, arm, frame_id="base_link"):
         self.message = msg = ArmState()
@@ -202,12 +189,7 @@ class TorqueWriter:
 
 
 class TorqueReader:
-    """Reads `JointTorque` messages.
-
-    Parameters
-    ----------
-    arm : Arm
-    """
+    """Reads `JointTorque` messages for an `arm`."""
 
     #: A torque beyond this is no torque [N m].
     HUGE = 1e9

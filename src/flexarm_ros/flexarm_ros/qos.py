@@ -110,13 +110,7 @@ class _Mismatch:
 
 
 class Mismatches:
-    """Publishers and subscriptions of other nodes that are incompatible with this node's.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Of whose topics.
-    """
+    """Publishers and subscriptions of other nodes that are incompatible with those of a `node`."""
 
     def __init__(self, node):
         self._node = node

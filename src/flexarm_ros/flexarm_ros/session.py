@@ -314,11 +314,9 @@ class Session:
     # Services --------------------------------------------------------------------------------
 
     def ask(self, kind, service, /, then=None, **request):
-        """Send a request of a `kind` to a `service` without waiting; ``then(answer)`` is called while serving.
+        """Send a request of a `kind` to a `service` without waiting; its `Question`.
 
-        Returns
-        -------
-        Question
+        While serving, ``then(answer)`` is called.
         """
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)

@@ -56,11 +56,7 @@ class Controllers:
 
 
 class TorqueLimit:
-    """Clips torques to the joints' limits.
-
-    Parameters
-    ----------
-    arm : Arm
+    """Clips torques to the limits of an `arm`'s joints.
 
     Attributes
     ----------

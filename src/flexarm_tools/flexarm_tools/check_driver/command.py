@@ -67,13 +67,7 @@ def _positive(text):
 
 
 class Conversation:
-    """Receives a driver's states and answers them.
-
-    Parameters
-    ----------
-    arm : Arm
-    namespace : str
-    """
+    """Receives a driver's states and answers them."""
 
     #: Id of this program; those of controllers are random.
     CONTROLLER_ID = 0xC4EC
@@ -157,14 +151,7 @@ def not_alone():
 
 
 class Examination:
-    """All checks: listen, push each joint, stop.
-
-    Parameters
-    ----------
-    arm_model : ArmModel
-    driver : Conversation
-    tolerances : Tolerances
-    """
+    """All checks of a driver, through a `Conversation` with it: listen, push each joint, stop."""
 
     def __init__(self, arm_model, driver, tolerances):
         self.model, self.arm = arm_model, arm_model.arm

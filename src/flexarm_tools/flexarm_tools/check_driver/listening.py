@@ -64,12 +64,9 @@ class Tolerances:
 
 
 def check_layout(arm, messages):
-    """Compare names with the arm file's, and lengths with the names, for each shape that occurred.
+    """Compare the messages' names with the arm file's, and lengths with the names, for each shape that occurred.
 
-    Parameters
-    ----------
-    arm : Arm
-    messages : sequence of flexarm_msgs/ArmState
+    `messages` are `flexarm_msgs/ArmState`.
 
     Returns
     -------
@@ -378,13 +375,9 @@ def check_frozen_strain(arm, samples, span=None):
 
 
 def check_listening(model, samples, tolerances):
-    """All checks of `samples` that need no motion, with the `tolerances` of the command line.
+    """Findings of all checks of `samples` that need no motion, with the `tolerances` of the command line.
 
     `check_layout` must have passed.
-
-    Returns
-    -------
-    list of Finding
     """
     arm = model.arm
     return [

@@ -84,10 +84,6 @@ def plan(model, position, joint, angle=0.05):
         Where the arm is [rad].
     joint : int
     angle : float
-
-    Returns
-    -------
-    Push
     """
     terms = model.terms(np.asarray(position, float), np.zeros(model.n_joints))
     a, B = slow_subsystem(terms)
@@ -359,7 +355,7 @@ def unseen(push, samples):
 
 
 def check_push(model, push, samples, sent, tolerances):
-    """All checks of one push.
+    """Findings of all checks of one push.
 
     Parameters
     ----------
@@ -370,10 +366,6 @@ def check_push(model, push, samples, sent, tolerances):
     sent : ndarray, shape (N, n)
         See `sent_torque`.
     tolerances : Tolerances
-
-    Returns
-    -------
-    list of Finding
     """
     arm = model.arm
     if samples.size < 10 or samples.period <= 0.0:

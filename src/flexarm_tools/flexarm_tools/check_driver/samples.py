@@ -97,17 +97,7 @@ class Received(NamedTuple):
 
 
 def samples(arm, received):
-    """`Samples` of messages whose names and lengths are right (see `check_layout`).
-
-    Parameters
-    ----------
-    arm : Arm
-    received : sequence of Received
-
-    Returns
-    -------
-    Samples
-    """
+    """`Samples` of a list of `Received` whose names and lengths are right (see `check_layout`)."""
     messages = [h.message for h in received]
 
     def columns(field, names, wanted):

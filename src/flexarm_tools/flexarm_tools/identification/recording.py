@@ -26,7 +26,7 @@ def of_contents(contents, arm):
 
 
 def read(path, arm, namespace=""):
-    """Read a bag or a CSV file, by what `path` is.
+    """A `Recording` of a bag or a CSV file, by what `path` is.
 
     Parameters
     ----------
@@ -34,10 +34,6 @@ def read(path, arm, namespace=""):
     arm : Arm
     namespace : str
         Of the topics in a bag.
-
-    Returns
-    -------
-    Recording
 
     Raises
     ------

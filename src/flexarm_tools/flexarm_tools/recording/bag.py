@@ -193,17 +193,13 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
 
 
 def from_messages(raw, arm):
-    """The same of serialised messages in memory.
+    """The `Contents` of serialised messages in memory.
 
     Parameters
     ----------
     raw : dict
         Topic to list of bytes.
     arm : Arm
-
-    Returns
-    -------
-    Contents
     """
     reader = _Reader(arm)
     for topic, messages in raw.items():

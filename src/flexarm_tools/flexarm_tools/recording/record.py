@@ -169,12 +169,7 @@ class Taken:
 
 
 class Listener:
-    """A session that collects an arm's topics and asks its nodes for the arm; a context.
-
-    Parameters
-    ----------
-    namespace : str
-    """
+    """A session that collects an arm's topics and asks its nodes for the arm; a context."""
 
     def __init__(self, namespace=""):
         from flexarm_ros.session import Session

@@ -79,7 +79,7 @@ class Recorder:
         return raw_stamp_ns(newest) if newest else 0
 
     def between(self, begin_ns, end_ns):
-        """One message per stamp, from the first to the last stamp; of one that was sent again, the last.
+        """One message per stamp from `begin_ns` to `end_ns`; of one that was sent again, the last.
 
         Returns
         -------
@@ -93,7 +93,7 @@ class Recorder:
         return kept
 
     def samples(self, begin_ns, end_ns):
-        """As `between`, of all topics the same samples.
+        """As `between`, from `begin_ns` to `end_ns`, of all topics the same samples.
 
         Raises
         ------

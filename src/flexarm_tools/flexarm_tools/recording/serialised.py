@@ -181,22 +181,13 @@ def layout_of(raw, kind):
 
 
 class Decoder:
-    """Turns serialised messages of one type into columns, remembering their layouts.
-
-    Parameters
-    ----------
-    kind : str
-    """
+    """Turns serialised messages of one type, `kind`, into columns, remembering their layouts."""
 
     def __init__(self, kind):
         self.kind, self._layouts, self.broken = kind, {}, 0
 
     def groups(self, messages):
-        """Yield (rows, layout, block) for messages that are alike; what can't be read is counted in `broken`.
-
-        Parameters
-        ----------
-        messages : list of bytes
+        """Yield (rows, layout, block) for `messages`, bytes, that are alike; `broken` counts what can't be read.
 
         Yields
         ------

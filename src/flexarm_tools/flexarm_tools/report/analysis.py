@@ -65,12 +65,7 @@ def motions(run):
 
 
 def summary(run, moves=None):
-    """All numbers of the summary table.
-
-    Parameters
-    ----------
-    run : Run
-    moves : list of Motion, optional
+    """All numbers of the summary table of a `run`; `moves` are its motions, if they are known.
 
     Returns
     -------
@@ -293,13 +288,7 @@ class Spectrum:
 
 
 def spectrum(run, mask):
-    """Welch's estimate over the stretches without gaps in some samples; None where none is long enough.
-
-    Parameters
-    ----------
-    run : Run
-    mask : ndarray of bool, shape (k,)
-    """
+    """Welch's estimate over the stretches without gaps in samples, `mask` (k,); None where none is long enough."""
     from scipy.signal import welch
 
     if not run.amplitude_source or not run.period > 0.0:

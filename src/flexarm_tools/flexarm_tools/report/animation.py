@@ -26,12 +26,7 @@ SHOWN = 0.12
 
 
 class Shape:
-    """The shape of an arm, from joint angles and modal amplitudes.
-
-    Parameters
-    ----------
-    arm : Arm
-    """
+    """The shape of an `arm`, from joint angles and modal amplitudes."""
 
     def __init__(self, arm):
         self.chain = chain = Chain(replace(arm, model="chain"))

@@ -61,7 +61,7 @@ def report(options):
 
 
 def make(bags, out, arm=None, namespace=None, progress=None, names=None, opening=""):
-    """Write the report of some bags.
+    """Write the report of some bags; the page's path.
 
     Parameters
     ----------
@@ -75,10 +75,6 @@ def make(bags, out, arm=None, namespace=None, progress=None, names=None, opening
         What the runs are called on the page; by their folders if not given.
     opening : str
         Sentences before the numbers: what one sees on the page.
-
-    Returns
-    -------
-    Path
 
     Raises
     ------

@@ -71,7 +71,7 @@ def colour(i):
 
 
 def draw(runs, moves, spectra, label, png=False):
-    """All figures for which the runs have data.
+    """A list of `Figure`: all for which the runs have data.
 
     Parameters
     ----------
@@ -82,10 +82,6 @@ def draw(runs, moves, spectra, label, png=False):
         What time zero is, in words.
     png : bool
         Draw all figures as PNG.
-
-    Returns
-    -------
-    list of Figure
     """
     paper = _Paper(runs, moves, label, png)
     with plt.rc_context(STYLE):

@@ -65,10 +65,6 @@ def write(runs, opening=""):
     opening : str
         Sentences before the numbers: what one sees on the page.
 
-    Returns
-    -------
-    str
-
     Raises
     ------
     FlexarmError

@@ -149,10 +149,6 @@ def measure(arm, log_directory, count=3000, recorder=None):
         Round trips.
     recorder : callable, optional
         ``recorder(processes)``, a context manager with `poll`: what else listens, as in the run compared.
-
-    Returns
-    -------
-    float
     """
     with own_domain() as domain, Processes(domain, log_directory) as processes:
         for role in ("observer", "controller"):

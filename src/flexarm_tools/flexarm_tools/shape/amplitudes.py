@@ -7,12 +7,7 @@ from flexarm_ros.messages import StateReader
 
 
 class Amplitudes:
-    """All modal amplitudes of an arm from states that hold the observed ones.
-
-    Parameters
-    ----------
-    arm : Arm
-    """
+    """All modal amplitudes of an `arm`, from states that hold the observed ones."""
 
     def __init__(self, arm):
         self.reader = StateReader(arm)
@@ -21,12 +16,7 @@ class Amplitudes:
         self.values = np.zeros(len(names))
 
     def read(self, msg, sample):
-        """Fill a sample; return the amplitudes (m,) [m, rad], zero where the state has none.
-
-        Raises
-        ------
-        MessageError
-        """
+        """Fill a `sample`; return the amplitudes (m,) [m, rad], zero where the state has none."""
         self.reader.read(msg, sample)
         self.values[:] = 0.0
         if sample.amplitude is not None:

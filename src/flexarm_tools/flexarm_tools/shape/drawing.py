@@ -61,7 +61,7 @@ class Drawer:
         self._rest = np.zeros(len(self.arm.modes))
 
     def picture(self, q, delta=None, slow=None, fast=None, exaggeration=1.0):
-        """The arm as it is now.
+        """The arm as it is now, a `Picture`.
 
         Parameters
         ----------
@@ -73,10 +73,6 @@ class Drawer:
             Torques [N m].
         exaggeration : float
             The deflections are drawn so many times as large; other than 1, at first order.
-
-        Returns
-        -------
-        Picture
 
         Raises
         ------

@@ -90,12 +90,7 @@ def view(options):
 
 
 def check(options):
-    """Refuse options that don't go together, and find the files of those that do.
-
-    Raises
-    ------
-    FlexarmError
-    """
+    """Refuse options that don't go together, and find the files of those that do."""
     if not 0.1 <= options.rate <= MAX_RATE:
         raise ParameterError(
             "is out of range",
@@ -118,10 +113,6 @@ def check(options):
 
 def files(controller, arm):
     """Controller file and arm of the nodes to start, where one or both are not given.
-
-    Returns
-    -------
-    Path, str
 
     Raises
     ------
@@ -154,14 +145,7 @@ def start(options, stack):
 
 
 class View:
-    """Shows what the nodes publish and carries out what is done on the page, in one thread.
-
-    Parameters
-    ----------
-    link : Link
-    options : Namespace
-    stack : ExitStack
-    """
+    """Shows what the nodes publish and carries out what is done on the page, in one thread."""
 
     def __init__(self, link, options, stack):
         self.link, self.options, self.stack = link, options, stack

@@ -89,17 +89,7 @@ def range_of(constraints):
 
 
 def changed(values, changes):
-    """Whole values of parameters after numbers of them were changed.
-
-    Parameters
-    ----------
-    values : mapping of str to float or list
-    changes : mapping of (name, index) to float
-
-    Returns
-    -------
-    dict of str to float or list
-    """
+    """Whole values of parameters after `changes` of numbers in them, a mapping of (name, index) to float."""
     out = {}
     for (name, index), number in changes.items():
         if index is None:

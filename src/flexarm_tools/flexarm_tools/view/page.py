@@ -28,12 +28,7 @@ EXAGGERATION = 20.0
 
 
 class History:
-    """The last seconds of some numbers.
-
-    Parameters
-    ----------
-    columns : int
-    """
+    """The last seconds of some numbers, in so many `columns`."""
 
     def __init__(self, columns):
         self._rows = deque()
