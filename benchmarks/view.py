@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.latency import command as latency
+from benchmarks.latency import measure as latency
 
 ROUNDS = 12
 TWO_LINK = latency.Case("two_link", "two_link", 1000.0, (0.0, 0.0), (1.0, 1.0), 1.5, pace=0.25)
@@ -56,15 +56,11 @@ def main(case, rounds=ROUNDS):
         viewed.processes.stop()
         client = viewed.processes.log("client").strip()
     print(f"{case.name}; the client: {client}")
-    found = {
-        key: [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in each]
-        for key, each in windows.items()
-    }
+    found = {key: latency.percentiles(each) for key, each in windows.items()}
     for key, each in found.items():
         p50, p95, p99 = 1e3 * np.median(each, axis=0)
         print(f"{key:8} p50 {p50:.3f} ms, p95 {p95:.3f} ms, p99 {p99:.3f} ms")
-    ratios = np.array(found["viewed"]) / np.array(found["alone"])
-    p50, p95, p99 = np.median(ratios, axis=0)
+    p50, p95, p99 = np.median(found["viewed"] / found["alone"], axis=0)
     print(f"viewed / alone, median of {rounds} turns: p50 {p50:.3f}, p95 {p95:.3f}, p99 {p99:.3f}")
     print(
         f"load of the machine in the last minute: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"

@@ -96,16 +96,6 @@ def test_options_choose_the_cases():
         latency.chosen(options("--arms", "two_link"))
 
 
-def test_the_table_goes_between_the_markers_alone(tmp_path):
-    file = tmp_path / "page.md"
-    file.write_text(f"above\n{latency.BEGIN}\nold\n{latency.END}\nbelow\n")
-    latency.write(file, "new")
-    assert file.read_text() == f"above\n{latency.BEGIN}\nnew\n{latency.END}\nbelow\n"
-    file.write_text("none")
-    with pytest.raises(FlexarmError, match="no lines"):
-        latency.write(file, "new")
-
-
 def row(chain, median, missed):
     return {"chain": chain, "latency_ms": {"p50": median}, "missed": missed}
 

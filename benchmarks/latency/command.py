@@ -18,19 +18,6 @@ BEGIN, END = "<!-- latency: begin -->", "<!-- latency: end -->"
 MAX_LOAD, MAX_RELAY_MS, MAX_RELAY_LATE = 0.5, 1.5, 0.1
 
 
-def write(file, text):
-    """Put the tables between the markers of a Markdown file.
-
-    `text` is the tables in Markdown.
-
-    Raises
-    ------
-    FlexarmError
-        When the file has no markers.
-    """
-    write_between(file, BEGIN, END, text)
-
-
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
@@ -157,4 +144,4 @@ def latency(options):
     if options.write and busy and not options.force:
         raise FlexarmError(f"{options.write} is not written: the machine was too busy; see --force")
     if options.write:
-        write(options.write, "\n\n".join(tables))
+        write_between(options.write, BEGIN, END, "\n\n".join(tables))

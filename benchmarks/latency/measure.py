@@ -20,8 +20,11 @@ import numpy as np
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies import markdown
 from flexarm_studies.loop import parameter_files
 
+#: Percentiles of the latency.
+NAMES = ("p50", "p95", "p99")
 #: What takes turns: the processes beside the simulator, and whether they are the loop's.
 CHAINS = {
     "relay": ("observer", "controller"),
@@ -249,6 +252,16 @@ def measure(
     return out
 
 
+def percentiles(windows):
+    """Latencies of each of the windows: `NAMES`, shape (windows, 3) [s]."""
+    return np.array([np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows])
+
+
+def medians(values):
+    """Medians over the windows, of `values` as `percentiles` gives them, by `NAMES`."""
+    return dict(zip(NAMES, np.median(values, axis=0).tolist(), strict=True))
+
+
 def summary(case, found):
     """Rows of the table of one case, and what they are made of.
 
@@ -259,10 +272,6 @@ def summary(case, found):
     list of dict
         One for each chain; times in milliseconds.
     """
-
-    def percentiles(windows):
-        return [np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows]
-
     for name, chain in found.items():
         for window in chain["windows"]:
             if not window["latencies"]:
@@ -272,7 +281,6 @@ def summary(case, found):
     for name, chain in found.items():
         windows = chain["windows"]
         each = percentiles(windows)
-        ratios = [a / b for a, b in zip(each, bare, strict=True)]
         answered = sum(len(w["latencies"]) for w in windows)
         sent = answered + sum(w["missed"] for w in windows)
         row = {
@@ -282,17 +290,13 @@ def summary(case, found):
             "chain": name,
             "rounds": len(windows),
             "samples": answered,
-            "latency_ms": dict(
-                zip(("p50", "p95", "p99"), (1e3 * np.median(each, axis=0)).tolist(), strict=True)
-            ),
-            "ratio": dict(
-                zip(("p50", "p95", "p99"), np.median(ratios, axis=0).tolist(), strict=True)
-            ),
+            "latency_ms": medians(1e3 * each),
+            "ratio": medians(each / bare),
             "missed": sum(w["missed"] for w in windows) / max(sent, 1),
             "lost": sum(w["lost"] for w in windows) / max(sent, 1),
             "enabled": sum(w["enabled"] for w in windows) / answered,
         }
-        base = float(np.median([b[0] for b in bare]))
+        base = float(np.median(bare[:, 0]))
         for part, seconds in chain.get("mathematics", {}).items():
             row[f"{part}_ms"] = 1e3 * seconds
             row[f"{part}_share"] = seconds / base
@@ -302,14 +306,12 @@ def summary(case, found):
 
 def table(rows):
     """Markdown table of `summary` rows."""
-    lines = [
-        "| arm, rate | | p50 [ms] | p95 | p99 | ratio of p50 | of p95 | late or missed | controller's step [ms] |"
-        " of relay's p50 | the law in it [ms] | of relay's p50 |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = ("arm, rate", "", "p50 [ms]", "p95", "p99", "ratio of p50", "of p95", "late or missed")
+    head += ("controller's step [ms]", "of relay's p50", "the law in it [ms]", "of relay's p50")
+    lines = []
     for row in rows:
         t, r = row["latency_ms"], row["ratio"]
-        cells = [row["case"], row["chain"], *(f"{t[p]:.2f}" for p in ("p50", "p95", "p99"))]
+        cells = [row["case"], row["chain"], *(f"{t[p]:.2f}" for p in NAMES)]
         if row["chain"] == "relay":
             cells += ["1", "1"]
         else:
@@ -319,5 +321,5 @@ def table(rows):
             took = row.get(f"{part}_ms")
             share = "" if took is None else f"{100 * row[f'{part}_share']:.0f} %"
             cells += ["" if took is None else f"{took:.3f}", share]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return "\n".join(markdown.table(head, lines))

@@ -15,7 +15,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from .measure import Chain
+from flexarm_studies import markdown
+
+from .measure import Chain, medians, percentiles
 
 #: From one set to the next [s].
 EVERY = 1.0
@@ -163,19 +165,13 @@ def summary(case, found):
     -------
     list of dict
     """
-    each = {
-        kind: 1e3 * np.array([np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows])
-        for kind, windows in found.items()
-    }
-    names = ("p50", "p95", "p99")
+    each = {kind: 1e3 * percentiles(windows) for kind, windows in found.items()}
     return [
         {
             "case": case.name,
             "meanwhile": kind,
-            "latency_ms": dict(zip(names, np.median(mine, axis=0).tolist(), strict=True)),
-            "ratio": dict(
-                zip(names, np.median(mine / each[NOTHING], axis=0).tolist(), strict=True)
-            ),
+            "latency_ms": medians(mine),
+            "ratio": medians(mine / each[NOTHING]),
         }
         for kind, mine in each.items()
     ]
@@ -183,13 +179,7 @@ def summary(case, found):
 
 def table(rows):
     """Markdown table of `summary` rows."""
-    lines = [
-        "| arm, rate | meanwhile | p50 [ms] | p95 | p99 | ratio of p50 | of p95 | of p99 |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        cells = [row["case"], row["meanwhile"]]
-        cells += [f"{value:.2f}" for value in row["latency_ms"].values()]
-        cells += [f"{value:.2f}" for value in row["ratio"].values()]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    head = ("arm, rate", "meanwhile", "p50 [ms]", "p95", "p99", "ratio of p50", "of p95", "of p99")
+    numbers = lambda row: (*row["latency_ms"].values(), *row["ratio"].values())  # noqa: E731
+    lines = [(r["case"], r["meanwhile"], *(f"{v:.2f}" for v in numbers(r))) for r in rows]
+    return "\n".join(markdown.table(head, lines))

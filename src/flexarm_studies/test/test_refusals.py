@@ -33,7 +33,7 @@ REFUSED = {
         "--rate nan": "--rate: nan is out of range",
         "--duration -1": "--duration: -1.0 is out of range",
         "--duration 1e9": "makes 100000000000 rows (10000000 rows)",
-        "--modes 0": "0 modes; from 1 to 20",
+        "--modes 0": "modes of two_link: 0 is out of range (1 to 20)",
     },
     "simulate two_link --out o.csv --torque": {
         "none.csv": "none.csv",
@@ -67,7 +67,7 @@ REFUSED = {
         "paper_composite --foreshortening": "--foreshortening: is not possible with --controller",
         "paper_composite --set slow.kp=[6]": "slow.kp: [6] is a list of integers",
         "paper_composite --set slow.kp=6.0 x=1": "x: no such parameter",
-        "paper_composite --payload-scale -1": "R: payload times -1.0",
+        "paper_composite --payload-scale -1": "payload of R: -1.0 is out of range",
         "paper_composite --plant-modes 99": "plant_modes: 99 is above",
     },
     "analyze R paper_composite --quick": {
@@ -80,7 +80,7 @@ REFUSED = {
         "rigid": "modes to observe: of rigid are none",
         "R --count 1": "--count: 1 gauges can't observe the 2 modes of link1 in y",
         "R --count 22": "--count: 22 gauges are more than there are positions (21)",
-        "R --modes 0": "0 modes",
+        "R --modes 0": "modes of R: 0 is out of range (1 to 20)",
         "nothing": "neither a file nor a shipped arm",
         "R --plot gauges.txt": "--plot: 'gauges.txt' has the wrong suffix (.png, .svg, .pdf)",
     },

@@ -144,8 +144,8 @@ def test_the_summary_is_what_the_record_gives(recorded, runs, name):
 def test_residual_vibration_is_the_tips_about_its_mean_once_the_joints_have_settled(recorded, runs):
     _, record, loop = recorded["slow"]
     rest = (record.state == HOLDING) & (record.time >= 0.5 + metrics.SETTLE - 1e-9)
-    tip = metrics._path(loop.model, record.position, record.amplitude)[rest]
-    rigid = metrics._path(loop.model, record.position, 0.0 * record.amplitude)[rest]
+    tip = metrics.tip_path(loop.model, record.position, record.amplitude)[rest]
+    rigid = metrics.tip_path(loop.model, record.position, 0.0 * record.amplitude)[rest]
     away = tip - rigid
     wanted = np.sqrt(np.mean(np.linalg.norm(away - away.mean(0), axis=1) ** 2))
     got = analysis.summary(runs["slow"])

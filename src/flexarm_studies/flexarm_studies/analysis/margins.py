@@ -15,6 +15,7 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import FlexarmError
 
 from ..loop import scenario as scenarios
+from ..loop.metrics import tip_path
 from . import case as cases
 from . import trial
 
@@ -185,12 +186,7 @@ def noise(case):
     if metrics["lost"]:
         return {"reason": metrics["reason"], "tip_rms_mm": None}
     plant, late = loop.simulator.plant_model, record.time > SETTLING
-    tip = np.array(
-        [
-            plant.tip_position(q, d)
-            for q, d in zip(record.plant_position[late], record.plant_amplitude[late], strict=True)
-        ]
-    )
+    tip = tip_path(plant, record.plant_position[late], record.plant_amplitude[late])
     return {
         "reason": "",
         "tip_rms_mm": 1e3 * float(np.sqrt(tip.var(0).sum())),

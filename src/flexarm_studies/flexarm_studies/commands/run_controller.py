@@ -13,25 +13,14 @@ from flexarm_dynamics.errors import FlexarmError
 
 from .. import tables
 from ..loop import scenario as scenarios
+from ..loop.metrics import tip_path
 from .options import angles
 
-#: Options of the closed loop, and the field of `Scenario` that each one fills.
-FIELDS = {
-    "trajectory": "trajectory",
-    "payload_scale": "payload_scale",
-    "stiffness_scale": "stiffness_scale",
-    "damping_scale": "damping_scale",
-    "plant_arm": "plant_arm",
-    "plant_modes": "plant_modes",
-    "noise": "noise",
-    "seed": "seed",
-    "delay": "delay",
-    "window": "window",
-    "settle_within": "tolerance",
-    "repeat": "repeat",
-    "duration": "duration",
-    "rate": "rate",
-}
+#: Options of the closed loop: fields of `Scenario`.
+FIELDS = (
+    "trajectory", "payload_scale", "stiffness_scale", "damping_scale", "plant_arm", "plant_modes", "noise", "seed",
+    "delay", "window", "tolerance", "repeat", "duration", "rate",
+)  # fmt: skip
 #: Options of `flexarm simulate` that belong to the arm without a controller, or to both.
 OPEN_LOOP = ("torque", "prescribed", "step", "modes", "foreshortening", "finite_slope")
 SHARED = ("duration", "rate")
@@ -86,22 +75,19 @@ def add_arguments(parser):
         metavar="FOLDER",
         help="record the run as the nodes' topics: a rosbag2 bag for `flexarm report`, PlotJuggler, Foxglove",
     )
-    add("--settle-within", type=float, help="tolerance of the tip for settling [mm] (1)")
+    add(
+        "--settle-within",
+        dest="tolerance",
+        type=float,
+        help="tolerance of the tip for settling [mm] (1)",
+    )
 
 
 def check_arguments(options):
-    """Refuse options that do not fit the mode, with or without a controller.
-
-    Raises
-    ------
-    FlexarmError
-    """
+    """Refuse options that do not fit the mode, with or without a controller."""
     if options.controller is None:
-        wrong = [
-            k
-            for k in (*FIELDS, "set", "bag")
-            if k not in SHARED and getattr(options, k) is not None
-        ]
+        others = [k for k in (*FIELDS, "set", "bag") if k not in SHARED]
+        wrong = [k for k in others if getattr(options, k) is not None]
         why = "is possible only with --controller"
     else:
         wrong = [k for k in OPEN_LOOP if getattr(options, k)]
@@ -110,7 +96,8 @@ def check_arguments(options):
             hint = "give a file, or a motion such as paper"
             raise FlexarmError("is missing", field="--trajectory", hint=hint)
     if wrong:
-        raise FlexarmError(why, field=f"--{wrong[0].replace('_', '-')}")
+        name = "settle-within" if wrong[0] == "tolerance" else wrong[0].replace("_", "-")
+        raise FlexarmError(why, field=f"--{name}")
 
 
 def scenario_of(options):
@@ -123,10 +110,9 @@ def scenario_of(options):
     if options.method is not None:
         parameters["integrator"] = options.method
     given = {k: getattr(options, k) for k in FIELDS if getattr(options, k) is not None}
-    if "settle_within" in given:
-        given["settle_within"] *= 1e-3
-    fields = {FIELDS[k]: v for k, v in given.items()}
-    return scenarios.Scenario(options.arm, parameters, **fields)
+    if "tolerance" in given:
+        given["tolerance"] *= 1e-3  # [mm]
+    return scenarios.Scenario(options.arm, parameters, **given)
 
 
 def run_controller(options, recorder=None):
@@ -137,8 +123,7 @@ def run_controller(options, recorder=None):
     for warning in warnings(scenario, loop):
         print(f"flexarm simulate: {warning}", file=sys.stderr)
     if options.out:
-        rows = table(record, loop.model, plant)
-        tables.write(column_names(loop.model, plant), rows, options.out)
+        tables.write(*table(record, loop.model, plant), options.out)
     if options.json:
         result = {"scenario": scenario.as_dict(), "metrics": metrics}
         if options.out:
@@ -178,12 +163,11 @@ def report(scenario, arm_model, metrics):
         f"{'joint':16}{'peak error':>12}{'rms error':>12}{'peak torque':>13}{'rms torque':>12}",
         f"{'':16}{'[deg]':>12}{'[deg]':>12}{'[N m]':>13}{'[N m]':>12}",
     ]
-    columns = ("peak_joint_error_rad", "rms_joint_error_rad", "peak_torque_Nm", "rms_torque_Nm")
-    for i, name in enumerate(arm_model.joint_names):
-        peak, rms, torque, effort = (m[c][i] for c in columns)
-        lines.append(
-            f"{name:16}{math.degrees(peak):12.4g}{math.degrees(rms):12.4g}{torque:13.4g}{effort:12.4g}"
-        )
+    errors = np.degrees([m["peak_joint_error_rad"], m["rms_joint_error_rad"]])
+    for name, *row in zip(
+        arm_model.joint_names, *errors, m["peak_torque_Nm"], m["rms_torque_Nm"], strict=True
+    ):
+        lines.append("{:16}{:12.4g}{:12.4g}{:13.4g}{:12.4g}".format(name, *row))
     lines += ["", *(f"{text:44}{value}" for text, value in _of_the_tip(scenario, m))]
     for i, each in enumerate(m.get("passes", ())):
         peak = max(each["peak_joint_error_rad"])
@@ -222,44 +206,26 @@ def _pair(m, name):
 # The table -------------------------------------------------------------------------------------
 
 
-def column_names(arm_model, plant_model):
-    """Columns of the table: time, per joint, per mode, the tip."""
-    n = arm_model.n_joints
-    prefixes = ("q_ref", "qd_ref", "q", "q_measured", "qd_estimate", "tau_slow", "tau_fast", "tau")
-    names = ["t", *(f"{p}{i + 1}" for p in prefixes for i in range(n))]
-    names += list(plant_model.mode_names)
-    for what in ("estimate", "rate_estimate", "quasi_steady"):
-        names += [f"{name}_{what}" for name in arm_model.mode_names]
-    names += [f"tip_{axis}" for axis in "xyz"] + [f"tip_ref_{axis}" for axis in "xyz"]
-    return [*names, "saturated"]
-
-
 def table(record, arm_model, plant_model):
-    """Rows of the table; joint angles and amplitudes without suffix are the simulated arm's own."""
+    """Columns and rows of the table; joint angles and amplitudes without suffix are the simulated arm's own.
+
+    `arm_model` is the arm as the controller knows it.
+    """
     r = record
-    straight = np.zeros(arm_model.n_modes)
-    tip = [
-        plant_model.tip_position(q, d)
-        for q, d in zip(r.plant_position, r.plant_amplitude, strict=True)
-    ]
-    wanted = [arm_model.tip_position(q, straight) for q in r.reference]
-    return np.column_stack(
-        [
-            r.time,
-            r.reference,
-            r.reference_velocity,
-            r.plant_position,
-            r.position,
-            r.velocity,
-            r.slow_torque,
-            r.fast_torque,
-            r.torque,
-            r.plant_amplitude,
-            r.amplitude,
-            r.rate,
-            r.quasi_steady,
-            tip,
-            wanted,
-            r.saturated,
-        ]
-    )
+    per_joint = {
+        "q_ref": r.reference, "qd_ref": r.reference_velocity, "q": r.plant_position,
+        "q_measured": r.position, "qd_estimate": r.velocity,
+        "tau_slow": r.slow_torque, "tau_fast": r.fast_torque, "tau": r.torque,
+    }  # fmt: skip
+    per_mode = {"estimate": r.amplitude, "rate_estimate": r.rate, "quasi_steady": r.quasi_steady}
+    straight = np.zeros((r.time.size, arm_model.n_modes))
+    tips = {
+        "tip": tip_path(plant_model, r.plant_position, r.plant_amplitude),
+        "tip_ref": tip_path(arm_model, r.reference, straight),
+    }
+    names = ["t", *(f"{what}{i + 1}" for what in per_joint for i in range(arm_model.n_joints))]
+    names += plant_model.mode_names
+    names += [f"{mode}_{what}" for what in per_mode for mode in arm_model.mode_names]
+    names += [f"{what}_{axis}" for what in tips for axis in "xyz"] + ["saturated"]
+    columns = [r.time, *per_joint.values(), r.plant_amplitude, *per_mode.values()]
+    return names, np.column_stack([*columns, *tips.values(), r.saturated])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of a comparison, for the terminal and for docs/comparison.md."""
 
-from ..markdown import write_between
+from .. import markdown
 from .controllers import OWN, PID, SHIPPED
 
 BEGIN, END = "<!-- comparison: begin -->", "<!-- comparison: end -->"
@@ -18,9 +18,9 @@ HEAD = (
 def cells(row, window):
     """The table's cells of a row, one per name in `HEAD`."""
     if "refused" in row:
-        return ["refused", *[""] * (len(HEAD) - 1)]
+        return ["refused"] + [""] * (len(HEAD) - 1)
     if "lost" in row:
-        return ["arm lost", *[""] * (len(HEAD) - 1)]
+        return ["arm lost"] + [""] * (len(HEAD) - 1)
     return [
         f"{1e3 * row['peak_joint_error_rad']:.3g}",
         f"{row['peak_tip_mm']:.4g}",
@@ -131,18 +131,9 @@ def _against_pid(own, pid, window):
 
 
 def _table(head, rows):
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return "\n".join(markdown.table(head, rows))
 
 
 def write(found, file):
-    """Put the tables between the markers of a Markdown file.
-
-    `found` is the comparison as in its JSON.
-
-    Raises
-    ------
-    FlexarmError
-        When the file has no markers.
-    """
-    write_between(file, BEGIN, END, f"\n{text(found)}\n")
+    """Put the tables of a comparison, as in its JSON, between the markers of a Markdown `file`."""
+    markdown.write_between(file, BEGIN, END, f"\n{text(found)}\n")

@@ -14,7 +14,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from flexarm_dynamics.arm.units import FOOT, POUND_FORCE_FOOT
+from flexarm_dynamics import singular_perturbation as sp
+from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 
 
 @dataclass(frozen=True)
@@ -246,8 +247,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
     if record.time[-1] >= 0.0:  # else the arm was lost before the motion began
         record = _from(record, 0.0)
     error = joint_error(record.reference, record.plant_position)
-    tip = _path(plant_model, record.plant_position, record.plant_amplitude)
-    wanted = _path(model, record.reference, np.zeros((record.time.size, model.n_modes)))
+    tip = tip_path(plant_model, record.plant_position, record.plant_amplitude)
+    wanted = tip_path(model, record.reference, np.zeros((record.time.size, model.n_modes)))
     found = {
         "peak_joint_error_rad": error.max(0).tolist(),
         "rms_joint_error_rad": _rms(error, 0).tolist(),
@@ -293,8 +294,11 @@ def _tip_errors(unit, distance):
     }
 
 
-def _path(model, position, amplitude):
-    """The tip along a record, shape (k, 3) [m]. Rows that repeat the one before are not computed again."""
+def tip_path(model, position, amplitude):
+    """The tip for joint `position` (k, n) and modal `amplitude` (k, m), shape (k, 3) [m].
+
+    Rows that repeat the one before are not computed again.
+    """
     rows, out = np.hstack([position, amplitude]), np.empty((len(position), 3))
     new = np.append(True, (rows[1:] != rows[:-1]).any(1))
     for k in np.flatnonzero(new):
@@ -314,7 +318,7 @@ def _sagging_path(model, record):
         amplitude.append(bent)
     amplitude = np.array(amplitude).reshape(len(knots), model.n_modes)
     columns = [np.interp(time, time[knots], column) for column in amplitude.T]
-    return _path(model, reference, np.array(columns).reshape(model.n_modes, len(time)).T)
+    return tip_path(model, reference, np.array(columns).reshape(model.n_modes, len(time)).T)
 
 
 def _residual(record, model, tip, end, span):
@@ -328,7 +332,7 @@ def _residual(record, model, tip, end, span):
     middle = position.mean(0)
     bent = model.tip_position(middle, model.static_deflection(middle))
     static = bent - model.tip_position(middle, straight[0])
-    return 1e3 * residual_vibration(tip[late] - _path(model, position, straight), static)
+    return 1e3 * residual_vibration(tip[late] - tip_path(model, position, straight), static)
 
 
 def _settling_time(time, distance, end, tolerance):
@@ -355,9 +359,6 @@ def linear_metrics(model, law, q):
     dict
         Keys as in ``summary.json``; k_f in the paper's units and with its sign, u_f = -k_f z_f.
     """
-    from flexarm_dynamics import singular_perturbation as sp
-    from flexarm_dynamics.arm.units import POUND_FORCE
-
     terms = model.terms(q, np.zeros(model.n_joints))
     A2, B2 = sp.fast_subsystem(terms)
     open_loop, _ = sp.frequencies_and_damping(np.linalg.eigvals(A2))
