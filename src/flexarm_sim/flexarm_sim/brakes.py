@@ -82,6 +82,8 @@ class Brakes:
         Friction of all joints without brakes, as `ArmModel.friction_table`.
     implicit : bool
         Use the implicit method, for modes too fast for an explicit one.
+    refinement : int
+        Factor of the substeps that the modes need.
 
     Attributes
     ----------
@@ -92,20 +94,17 @@ class Brakes:
     #: `side` of a joint without brake.
     FREE = 2
 
-    def __init__(self, model, period, torque, friction, implicit=False):
+    def __init__(self, model, period, torque, friction, implicit=False, refinement=1):
         self.model, self.torque, self.friction = model, np.asarray(torque, float), friction
         self.period = period
-        self.substeps = 1 if implicit else integrators.substeps(model, period, "dop853")
+        needed = 1 if implicit else integrators.substeps(model, period, "dop853")
+        self.substeps = refinement * needed
         self._step = model.lockable_stepper(None if implicit else METHODS["rk4"])
         n, size = model.n_joints, 2 * (model.n_joints + model.n_modes)
         self._rates = slice(size // 2, size // 2 + n)
         self._has = self.torque > 0.0
         self.side = np.where(self._has, 0, self.FREE)
         self._known, self._at = None, np.zeros(n)
-
-    def refine(self, factor):
-        """Multiply the substeps by `factor`."""
-        self.substeps *= factor
 
     def advance(self, state, fraction=1.0):
         """Advance `state`, (2 (n + m),), in place by a fraction of a period.

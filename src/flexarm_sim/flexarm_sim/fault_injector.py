@@ -8,6 +8,7 @@ needs no ROS.
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -28,6 +29,15 @@ FIELDS = {
     "modal_amplitude": "mode_names",
 }
 WINDOW = ("from", "for")
+#: What the number of a key may be.
+RANGES = {
+    "from": (0.0, 1e9),
+    "at": (0.0, 1e9),
+    "for": (1e-9, 1e9),
+    "by": (-1e9, 1e9),
+    "share": (0.0, 1.0),
+    "seed": (0, 2**31 - 1),
+}
 #: Kinds for one or all entries of a field: their keys, and those that are required.
 VALUE_KINDS = {
     "nan": ((), ()),
@@ -153,16 +163,14 @@ def parse(text, arm):
             refuse(word, f"no key of {words[1]}", ", ".join(f"{k}=…" for k in allowed))
         if key in keys:
             refuse(word, f"{key} is given twice")
-        keys[key] = _number(
-            key, value, signal, words[1], lambda *why, word=word: refuse(word, *why)
-        )
+        keys[key] = _number(key, value, words[1], partial(refuse, word))
     for key in needed:
         if key not in keys:
             refuse(words[1], f"needs {key}=…")
     return Fault(signal, words[1], entry, tuple(keys.items()))
 
 
-def _number(key, text, signal, kind, refuse):
+def _number(key, text, kind, refuse):
     """The value of a key, checked."""
     try:
         value = int(text) if key == "seed" else float(text)
@@ -170,17 +178,7 @@ def _number(key, text, signal, kind, refuse):
         refuse("a seed is an integer" if key == "seed" else "not a number")
     if not math.isfinite(value):
         refuse("not finite")
-    low, high = -1e9, 1e9
-    if key in ("from", "at"):
-        low = 0.0
-    elif key == "for":
-        low = 1e-9
-    elif key == "share":
-        low, high = 0.0, 1.0
-    elif key == "seed":
-        low, high = 0, 2**31 - 1
-    elif kind == "delay":
-        low, high = 1e-9, MAX_DELAY
+    low, high = (1e-9, MAX_DELAY) if (key, kind) == ("by", "delay") else RANGES[key]
     if not low <= value <= high:
         refuse("out of range", f"from {low:g} to {high:g}")
     return value
@@ -344,8 +342,6 @@ def _whole_fault(fault, out):
     elif fault.signal == "names":
         for key, names in out.names.items():
             names.reverse()
-            for name in [
-                f for f, of in (*FIELDS.items(), ("modal_rate", "mode_names")) if of == key
-            ]:
-                if out.values.get(name) is not None:
+            for name, of in (*FIELDS.items(), ("modal_rate", "mode_names")):
+                if of == key and out.values.get(name) is not None:
                     out.values[name] = out.values[name][::-1].copy()

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from flexarm_dynamics.errors import ModelError, ShapeError
+from flexarm_dynamics.errors import ModelError, check_shape
 
 from . import integrators
 from .brakes import Brakes
@@ -52,17 +52,13 @@ class Plant:
         self._brakes = None
         if brake.any():
             implicit = integrators.METHODS[integrator] is None
-            self._brakes = Brakes(model, period, brake, self._safe, implicit)
-            self._brakes.refine(refinement)
+            self._brakes = Brakes(model, period, brake, self._safe, implicit, refinement)
 
     def reset(self, position=None, delta=None):
         """Put the arm at rest at `position` [rad], bent by `delta`; by default as its weight bends it, joints held."""
         n = self.model.n_joints
         position = np.zeros(n) if position is None else np.asarray(position, float)
-        if position.shape != (n,):
-            raise ShapeError(
-                "is the wrong shape", field="initial position", value=position.shape, limit=(n,)
-            )
+        check_shape(position, (n,), "initial position")
         self.state[:] = 0.0
         self.q[:] = position
         self.delta[:] = self.model.static_deflection(position) if delta is None else delta

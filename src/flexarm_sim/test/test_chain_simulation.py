@@ -34,17 +34,16 @@ def split(chain, states):
 # --- against two multibody codes ---------------------------------------------------------------
 
 
-def data():
-    """``tests/data`` of the repository, looked for upwards from here."""
-    for parent in Path(__file__).resolve().parents:
-        if (parent / "tests" / "data" / "parameters.json").is_file():
-            return parent / "tests" / "data"
-    raise FileNotFoundError(f"no tests/data above {__file__}")
+DATA = next(
+    folder / "tests" / "data"
+    for folder in Path(__file__).resolve().parents
+    if (folder / "tests" / "data" / "parameters.json").is_file()
+)
 
 
 @pytest.fixture(scope="module")
 def parameters():
-    return json.loads((data() / "parameters.json").read_text())
+    return json.loads((DATA / "parameters.json").read_text())
 
 
 def one_link(parameters, modes):
@@ -109,7 +108,7 @@ def within(found, limits):
 @pytest.mark.slow
 def test_one_link_follows_two_multibody_codes(parameters, level, modes, limits):
     """A torque pulse there and back."""
-    table = np.genfromtxt(data() / "one_link_pulse.csv", delimiter=",", names=True)
+    table = np.genfromtxt(DATA / "one_link_pulse.csv", delimiter=",", names=True)
     chain = Chain(at_level(one_link(parameters, modes), level))
     T, t = parameters["one_link_pulse"]["T"], table["t"][:-1]
     torque = np.where(t < 0.5 - 1e-9, T, np.where(t < 1.0 - 1e-9, -T, 0.0))[:, None]
@@ -138,7 +137,7 @@ def test_one_link_follows_two_multibody_codes(parameters, level, modes, limits):
 def test_two_links_follow_two_multibody_codes(parameters, case, level, modes, limits):
     """Sinusoidal torques, and a tenth of them; what each level can not know is in the limits."""
     name = "two_link_torque" + ("_x0p1" if case else "")
-    table = np.genfromtxt(data() / f"{name}.csv", delimiter=",", names=True)
+    table = np.genfromtxt(DATA / f"{name}.csv", delimiter=",", names=True)
     chain = Chain(at_level(two_links(parameters, modes), level))
     t = np.linspace(0.0, 4.0, 4001)
     size = 0.1 if case else 1.0

@@ -133,22 +133,8 @@ def test_a_fault_is_what_its_line_says(fault):
     assert parse(str(fault), ARM) == fault
 
 
-WORDS = st.sampled_from(
-    [
-        "strain",
-        "state",
-        "clock",
-        "nan",
-        "drop",
-        "jump",
-        "by=1",
-        "from=",
-        "for=1e999",
-        "at=ö",
-        "=",
-        ".",
-    ]
-)
+PARTS = ["strain", "state", "clock", "nan", "drop", "jump", "by=1", "from=", "for=1e999", "at=ö"]
+WORDS = st.sampled_from([*PARTS, "=", "."])
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -248,36 +234,15 @@ def test_a_share_is_lost_by_seed_the_same_ones_each_time():
 
 def test_late_messages_keep_order_number_and_stamp():
     out = sent(["state delay by=0.003 from=0.004 for=0.004"], 14)
-    assert numbers(out) == [
-        [0],
-        [1],
-        [2],
-        [3],
-        [],
-        [],
-        [],
-        [4],
-        [5],
-        [6],
-        [7, 8, 9, 10],
-        [11],
-        [12],
-        [13],
-    ]
+    late = [[], [], [], [4], [5], [6], [7, 8, 9, 10]]
+    assert numbers(out) == [[0], [1], [2], [3], *late, [11], [12], [13]]
     assert all(s.stamp_ns == START + s.sequence * PERIOD for messages in out for s in messages)
 
 
 def test_messages_come_twice_or_out_of_order():
     assert numbers(sent(["state duplicate for=0.002"], 4)) == [[0, 0], [1, 1], [2], [3]]
-    assert numbers(sent(["state swap from=0.001 for=0.004"], 7)) == [
-        [0],
-        [],
-        [2, 1],
-        [],
-        [4, 3],
-        [5],
-        [6],
-    ]
+    swapped = sent(["state swap from=0.001 for=0.004"], 7)
+    assert numbers(swapped) == [[0], [], [2, 1], [], [4, 3], [5], [6]]
     assert numbers(sent(["state swap for=0.001"], 3)) == [[], [1, 0], [2]]
 
 

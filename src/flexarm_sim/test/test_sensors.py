@@ -11,10 +11,11 @@ from flexarm_dynamics.models import model
 from flexarm_sim.sensors import Sensors
 
 
-def sensors(arm, noise=False, seed=0, counts=0, sigma=0.0, **gauge):
+def sensors(arm, noise=False, seed=0, counts=0, sigma=0.0, period=0.0, **gauge):
     joint = replace(arm.arm.joints[0], encoder_counts=counts)
     gauges = tuple(replace(g, noise=sigma, **gauge) for g in arm.arm.gauges)
-    return Sensors(model.build(replace(arm.arm, joints=(joint,), gauges=gauges)), noise, seed)
+    changed = model.build(replace(arm.arm, joints=(joint,), gauges=gauges))
+    return Sensors(changed, noise, seed, period)
 
 
 def strains(s, delta=(0.0, 0.0), count=1):
@@ -77,8 +78,7 @@ def test_gauge_noise_is_the_same_for_the_same_seed_and_after_a_reset(arm_r):
 
 @pytest.mark.parametrize(("noise", "sigma"), [(False, 1e-6), (True, 0.0)])
 def test_there_is_no_noise_unless_it_is_asked_for_and_stated(arm_r, noise, sigma):
-    s = sensors(arm_r, noise, sigma=sigma)
-    assert_array_equal(strains(s, count=3), np.zeros((3, 2)))
+    assert_array_equal(strains(sensors(arm_r, noise, sigma=sigma), count=3), np.zeros((3, 2)))
 
 
 def test_a_quiet_gauge_beside_a_noisy_one_stays_quiet(arm_r):
@@ -127,14 +127,10 @@ def test_a_range_that_is_not_stated_is_a_thousand_microstrain(arm_r):
     assert strains(sensors(arm_r), [-1.0, 0.0])[0, 0] == 1e-3
 
 
-def drifting(arm, drift, period=1e-3, seed=0, noise=True):
-    gauges = tuple(replace(g, drift=drift) for g in arm.arm.gauges)
-    return Sensors(model.build(replace(arm.arm, gauges=gauges)), noise, seed, period)
-
-
 def test_the_bias_walks_by_drift_times_the_root_of_time(arm_r):
     """From 300 walks of 100 samples: the variance grows in proportion, steps are independent."""
-    walks = np.array([strains(drifting(arm_r, 2e-6, 1e-2, k), count=101) for k in range(300)])
+    walking = [sensors(arm_r, True, k, period=1e-2, drift=2e-6) for k in range(300)]
+    walks = np.array([strains(s, count=101) for s in walking])
     assert_array_equal(walks[:, 0], 0.0)
     for k, rms in ((1, 2e-7), (25, 1e-6), (100, 2e-6)):
         assert_allclose(walks[:, k].std(), rms, rtol=0.12)
@@ -143,15 +139,13 @@ def test_the_bias_walks_by_drift_times_the_root_of_time(arm_r):
 
 
 def test_drift_starts_again_with_a_reset_and_leaves_the_noise_as_it_was(arm_r):
-    s = drifting(arm_r, 1e-6)
-    first = strains(s, count=20)
+    def drifting(noise=True, **more):
+        return sensors(arm_r, noise, 4, period=1e-3, **{"drift": 1e-6, **more})
+
+    s = drifting()
+    walk = strains(s, count=20)
     s.reset()
-    assert_array_equal(strains(s, count=20), first)
-    assert_array_equal(strains(drifting(arm_r, 1e-6, noise=False), count=3), np.zeros((3, 2)))
-    gauges = [tuple(replace(g, drift=d, noise=1e-6) for g in arm_r.arm.gauges) for d in (0.0, 1e-6)]
-    still, walking = (
-        strains(Sensors(model.build(replace(arm_r.arm, gauges=g)), True, 4, 1e-3), count=20)
-        for g in gauges
-    )
-    walk = strains(drifting(arm_r, 1e-6, seed=4), count=20)
+    assert_array_equal(strains(s, count=20), walk)
+    assert_array_equal(strains(drifting(noise=False), count=3), np.zeros((3, 2)))
+    still, walking = (strains(drifting(sigma=1e-6, drift=d), count=20) for d in (0.0, 1e-6))
     assert_allclose(walking - still, walk, atol=1e-20)

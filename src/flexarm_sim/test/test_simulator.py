@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated arm sample by sample: time, session, spill-over, another plant, reset."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics.arm.arm_file import find
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, ModelError, ParameterError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.simulator import PARAMETERS, Simulator
@@ -14,8 +15,16 @@ from flexarm_sim.simulator import PARAMETERS, Simulator
 FIELDS = ("position", "velocity", "torque", "strain", "amplitude", "rate")
 
 
-def simulator(arm="R", **settings):
-    return Simulator(check_all(PARAMETERS, {"arm": str(arm), **settings}, {"joints": 1}))
+#: The arm, and one with other data.
+R = arm_file.load("R")
+OTHER = replace(R, name="other")
+JOINT, GAUGES = R.joints[0], R.gauges
+
+
+def simulator(arm="R", plant_arm="", **settings):
+    """Arms are given by name, or as they are."""
+    checked = check_all(PARAMETERS, settings, {"joints": 1})
+    return Simulator(checked | {"arm": arm, "plant_arm": plant_arm})
 
 
 def samples(sim, count=50):
@@ -25,17 +34,6 @@ def samples(sim, count=50):
         out.append([sim.sequence, sim.stamp_ns, *np.concatenate([getattr(sim, f) for f in FIELDS])])
         sim.advance(np.array([3.0 * np.sin(0.2 * k)]) if k % 7 else None)
     return np.array(out)
-
-
-def changed_arm(tmp_path, name="R", change=None, stem="other"):
-    """A copy of a shipped arm file, its YAML changed."""
-    data = yaml.safe_load(find(name).read_text())
-    data["name"] = stem
-    if change:
-        change(data)
-    path = tmp_path / f"{stem}.yaml"
-    path.write_text(yaml.safe_dump(data))
-    return str(path)
 
 
 # --------------------------------------------------------------------------- samples
@@ -81,11 +79,9 @@ def test_with_the_modes_of_the_file_the_gauges_give_the_true_amplitudes():
         assert_array_equal(sim.velocity, sim.plant.qd)
 
 
-def test_joint_angles_are_quantised_and_velocities_are_not(tmp_path):
-    def change(data):
-        data["joints"][0]["encoder_counts"] = 1000
-
-    sim = simulator(changed_arm(tmp_path, change=change), initial_position=[0.01])
+def test_joint_angles_are_quantised_and_velocities_are_not():
+    arm = replace(R, joints=(replace(JOINT, encoder_counts=1000),))
+    sim = simulator(arm, initial_position=[0.01])
     assert_allclose(sim.position, [2.0 * np.pi / 1000 * 2.0], rtol=1e-12)
     sim.advance(np.array([1.0]))
     assert_array_equal(sim.velocity, sim.plant.qd)
@@ -127,19 +123,12 @@ def test_spill_over_is_that_of_the_gauge_rows_all_along_a_motion():
     assert seen > 1e-5  # [m]
 
 
-def test_with_fewer_modes_than_observed_there_is_no_plant():
-    with pytest.raises(ModelError, match=r"link1_y_mode2.*raise plant_modes"):
-        simulator(plant_modes=1)
-
-
 # --------------------------------------------------------------------------- another plant
 
 
-def test_the_plant_may_be_another_arm_than_the_controllers(tmp_path):
-    def heavier(data):
-        data["payload"]["mass"] *= 2.0
-
-    sim = simulator(plant_arm=changed_arm(tmp_path, change=heavier))
+def test_the_plant_may_be_another_arm_than_the_controllers():
+    heavier = replace(R.payload, mass=2.0 * R.payload.mass)
+    sim = simulator(plant_arm=replace(OTHER, payload=heavier))
     assert (sim.arm.name, sim.plant_model.arm.name) == ("R", "other")
     ratio = sim.plant_model.coefficients.rigid / sim.nominal.coefficients.rigid
     assert_allclose(ratio, (1.1586 + 3.1e-3 * 16) / 1.1586, rtol=1e-9)
@@ -150,11 +139,8 @@ def test_the_plant_may_be_another_arm_than_the_controllers(tmp_path):
     assert_allclose(sim.position / same.position, 1.0 / ratio, rtol=0.02)
 
 
-def test_gauges_of_the_plant_are_read_in_the_order_of_the_arm(tmp_path):
-    def change(data):
-        data["gauges"].reverse()
-
-    swapped, same = simulator(plant_arm=changed_arm(tmp_path, change=change)), simulator()
+def test_gauges_of_the_plant_are_read_in_the_order_of_the_arm():
+    swapped, same = simulator(plant_arm=replace(OTHER, gauges=GAUGES[::-1])), simulator()
     for sim in (swapped, same):
         for _ in range(20):
             sim.advance(np.array([2.0]))
@@ -162,11 +148,9 @@ def test_gauges_of_the_plant_are_read_in_the_order_of_the_arm(tmp_path):
     assert_array_equal(swapped.amplitude, same.amplitude)
 
 
-def test_a_gauge_that_is_off_in_the_plant_alone_deceives_the_amplitudes(tmp_path):
-    def change(data):
-        data["gauges"][0]["bias"] = 1e-5
-
-    sim = simulator(plant_arm=changed_arm(tmp_path, change=change))
+def test_a_gauge_that_is_off_in_the_plant_alone_deceives_the_amplitudes():
+    off = replace(GAUGES[0], bias=1e-5)
+    sim = simulator(plant_arm=replace(OTHER, gauges=(off, *GAUGES[1:])))
     assert_array_equal(sim.strain, [1e-5, 0.0])
     assert np.abs(sim.amplitude).max() > 1e-4  # [m]
 
@@ -175,22 +159,18 @@ def test_a_gauge_that_is_off_in_the_plant_alone_deceives_the_amplitudes(tmp_path
     ("key", "mine", "its"),
     [("joints", ["joint1"], ["elbow"]), ("gauges", ["root", "middle"], ["elbow", "middle"])],
 )
-def test_a_plant_with_other_names_is_refused(tmp_path, key, mine, its):
-    def change(data):
-        data[key][0]["name"] = "elbow"
-
+def test_a_plant_with_other_names_is_refused(key, mine, its):
+    first, *rest = getattr(R, key)
     with pytest.raises(ModelError) as error:
-        simulator(plant_arm=changed_arm(tmp_path, change=change))
+        simulator(plant_arm=replace(OTHER, **{key: (replace(first, name="elbow"), *rest)}))
     assert error.value.field == "plant_arm other"
     assert (error.value.value, error.value.limit) == (its, mine)
 
 
-def test_a_plant_without_the_observed_modes_is_refused(tmp_path):
-    def change(data):
-        data["links"][0]["flexible"]["y"]["modes"] = 1
-
-    with pytest.raises(ModelError, match="lacks the modes link1_y_mode2"):
-        simulator(plant_arm=changed_arm(tmp_path, change=change))
+@pytest.mark.parametrize("settings", [{"plant_modes": 1}, {"plant_arm": OTHER.with_modes(1)}])
+def test_a_plant_without_the_observed_modes_is_refused(settings):
+    with pytest.raises(ModelError, match=r"lacks the modes link1_y_mode2.*raise plant_modes"):
+        simulator(**settings)
 
 
 def test_settings_that_can_not_be_are_refused():
@@ -209,23 +189,17 @@ def test_settings_that_can_not_be_are_refused():
 # --------------------------------------------------------------------------- determinism
 
 
-def noisy(tmp_path):
-    def change(data):
-        for gauge in data["gauges"]:
-            gauge["noise"] = 1e-6
-
-    return changed_arm(tmp_path, change=change)
+NOISY = replace(R, gauges=tuple(replace(gauge, noise=1e-6) for gauge in GAUGES))
 
 
-def test_two_simulators_with_the_same_seed_give_the_same_samples_to_the_last_bit(tmp_path):
-    arm = noisy(tmp_path)
-    first = samples(simulator(arm, noise=True, seed=5))
-    assert_array_equal(samples(simulator(arm, noise=True, seed=5)), first)
-    assert not np.array_equal(samples(simulator(arm, noise=True, seed=6)), first)
+def test_two_simulators_with_the_same_seed_give_the_same_samples_to_the_last_bit():
+    first = samples(simulator(NOISY, noise=True, seed=5))
+    assert_array_equal(samples(simulator(NOISY, noise=True, seed=5)), first)
+    assert not np.array_equal(samples(simulator(NOISY, noise=True, seed=6)), first)
 
 
-def test_after_a_reset_the_samples_are_the_same_to_the_last_bit(tmp_path):
-    sim = simulator(noisy(tmp_path), noise=True, seed=5, plant_modes=3, initial_position=[0.2])
+def test_after_a_reset_the_samples_are_the_same_to_the_last_bit():
+    sim = simulator(NOISY, noise=True, seed=5, plant_modes=3, initial_position=[0.2])
     first = samples(sim)
     sim.reset()
     assert_array_equal(samples(sim), first)
