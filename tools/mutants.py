@@ -256,13 +256,12 @@ LAWS = [
     *of(
         "flexarm_control",
         "fast",
-        TESTS + "test_more_fast_laws.py",
+        TESTS + "test_fast_laws.py",
         (
             "lqr",
             "(20): alpha missing",
             "_solve(A2 + alpha * np.eye(A2.shape[0]), B2, q, parameters)",
             "_solve(A2, B2, q, parameters)",
-            TESTS + "test_fast_laws.py",
         ),
         (
             "pole_placement",
