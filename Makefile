@@ -49,16 +49,18 @@ demo: build
 # Two at a time, but those in real time one by one and after the others: two real-time loops are too much for two
 # cores. pytest's 5 means that PYTEST_ARGS selects nothing there.
 TESTS := $(wildcard src/*/test) tests
+# Two processes with several threads each hold each other up: small matrices then take several times as long.
+ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 test: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; \
-	python -m pytest -q -n 2 --dist loadgroup -m "not real_time" $(PYTEST_ARGS) $(TESTS); others=$$?; \
+	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not real_time" $(PYTEST_ARGS) $(TESTS); others=$$?; \
 	python -m pytest -q -m real_time $(PYTEST_ARGS) $(TESTS); real_time=$$?; \
 	case $$others$$real_time in 00|05|50) ;; *) exit 1 ;; esac
 
 # The inner loop: style, imports, and the unit tests that are over quickly.
 check: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; ruff check && ruff format --check -q && \
-	python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
+	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
 
 # Wrong signs, factors and limits, put in one at a time: a test must fail for each.
