@@ -47,15 +47,7 @@ class ControlResponse(_Numpy):
     name = "python-control, input_output_response"
 
     def __init__(
-        self,
-        case,
-        parameters,
-        *,
-        input_step=1e-2,
-        rtol=1e-3,
-        atol=1e-6,
-        method="RK45",
-        **settings,
+        self, case, parameters, *, input_step=1e-2, rtol=1e-3, atol=1e-6, method="RK45", **settings
     ):
         super().__init__(case, parameters, **settings)
         self.every = round(1.0 / (RATE * input_step))
@@ -70,18 +62,15 @@ class ControlResponse(_Numpy):
         t = times(duration)
         state = np.zeros(2 * self.arm.size)
         states = np.empty((t.size, state.size))
-        ends = [edge for edge in self.torque.edges if edge < duration] + [duration]
-        first = 0
-        for end in ends:
-            last = round(end * RATE)
-            if self.torque.edges:
-                # Constant in this piece; python-control would interpolate across the jump.
-                points = t[first : last + 1]
-                level = self.torque(0.5 * (points[0] + points[-1]))
-                inputs = np.repeat(level[:, None], points.size, axis=1)
-            else:
+        for start, end, held in self.pieces(duration):
+            first, last = round(start * RATE), round(end * RATE)
+            if held is None:
                 points = np.arange((last - first) * self.every + 1) / (RATE * self.every)
                 inputs = self.torque.sample(points).T
+            else:
+                # python-control would interpolate across the jump.
+                points = t[first : last + 1]
+                inputs = np.repeat(held[:, None], points.size, axis=1)
             response = control.input_output_response(
                 self.system,
                 points,
@@ -91,5 +80,5 @@ class ControlResponse(_Numpy):
                 solve_ivp_kwargs=self.options,
             )
             states[first : last + 1] = response.states.T
-            state, first = response.states[:, -1], last
+            state = response.states[:, -1]
         return states

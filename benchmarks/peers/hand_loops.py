@@ -48,14 +48,9 @@ def one_link_constants(link):
     mass, gram = np.diag(link.mass), link.gram
     lever = link.coupling / mass
     values = [
-        link.inertia - link.coupling @ lever,
-        *gram[0],
-        gram[1, 1],
-        *(1.0 / mass),
-        *(np.diag(link.stiffness) / mass),
-        *link.coupling,
-        *lever,
-    ]
+        link.inertia - link.coupling @ lever, *gram[0], gram[1, 1],
+        *(1.0 / mass), *(np.diag(link.stiffness) / mass), *link.coupling, *lever,
+    ]  # fmt: skip
     return tuple(float(v) for v in values)
 
 
@@ -69,31 +64,14 @@ def two_links_constants(inner, outer):
     by_coupling = np.linalg.solve(inner.mass, inner.coupling)
     by_tip = np.linalg.solve(inner.mass, inner.tip)
     values = [
-        inner.length,
-        *inner.tip,
-        *inner.coupling,
-        gram1[0, 0],
-        gram1[0, 1],
-        gram1[1, 1],
-        *by_stiffness.ravel(),
-        *by_slope,
-        *by_coupling,
-        *by_tip,
-        inner.inertia - inner.coupling @ by_coupling,
-        inner.tip @ by_coupling,
-        inner.tip @ by_tip,
-        outer.first_x,
-        *outer.first_y,
-        gram2[0, 0],
-        gram2[0, 1],
-        gram2[1, 1],
-        *(1.0 / mass2),
-        *(np.diag(outer.stiffness) / mass2),
-        *outer.coupling,
+        inner.length, *inner.tip, *inner.coupling, *gram1[0], gram1[1, 1],
+        *by_stiffness.ravel(), *by_slope, *by_coupling, *by_tip,
+        inner.inertia - inner.coupling @ by_coupling, inner.tip @ by_coupling, inner.tip @ by_tip,
+        outer.first_x, *outer.first_y, *gram2[0], gram2[1, 1],
+        *(1.0 / mass2), *(np.diag(outer.stiffness) / mass2), *outer.coupling,
         outer.inertia - outer.coupling @ (outer.coupling / mass2),
-        outer.first_y @ (outer.first_y / mass2),
-        outer.first_y @ (outer.coupling / mass2),
-    ]
+        outer.first_y @ (outer.first_y / mass2), outer.first_y @ (outer.coupling / mass2),
+    ]  # fmt: skip
     return tuple(float(v) for v in values)
 
 
@@ -114,43 +92,9 @@ def one_link(k, x1, x2, r, v1, v2, torque):
 def two_links(k, q, x1, x2, al, y1, y2, r, v1, v2, s, u1, u2, torque1, torque2):
     """Accelerations of (q1, delta1, alpha2, delta2) at (q, x, al, y) and rates (r, v, s, u)."""
     (
-        length,
-        e1,
-        e2,
-        m1,
-        m2,
-        g11,
-        g12,
-        g22,
-        w11,
-        w12,
-        w21,
-        w22,
-        sl1,
-        sl2,
-        c1,
-        c2,
-        t1,
-        t2,
-        j1,
-        em,
-        ee,
-        fx,
-        h1,
-        h2,
-        p11,
-        p12,
-        p22,
-        b1,
-        b2,
-        o1,
-        o2,
-        n1,
-        n2,
-        j2,
-        hh,
-        hm,
-    ) = k
+        length, e1, e2, m1, m2, g11, g12, g22, w11, w12, w21, w22, sl1, sl2, c1, c2, t1, t2, j1, em, ee,
+        fx, h1, h2, p11, p12, p22, b1, b2, o1, o2, n1, n2, j2, hh, hm,
+    ) = k  # fmt: skip
     bend = al - q
     c, z = cos(bend), sin(bend)
     tip = e1 * x1 + e2 * x2
@@ -238,23 +182,13 @@ def run_one(k, h, every, torque, out):
             xm, ym = x + half * v, y + half * w
             a2, b2, c2 = one_link(k, xm, ym, r + half * a1, v + half * b1, w + half * c1, middle)
             a3, b3, c3 = one_link(
-                k,
-                xm + quarter * b1,
-                ym + quarter * c1,
-                r + half * a2,
-                v + half * b2,
-                w + half * c2,
-                middle,
-            )
+                k, xm + quarter * b1, ym + quarter * c1,
+                r + half * a2, v + half * b2, w + half * c2, middle,
+            )  # fmt: skip
             a4, b4, c4 = one_link(
-                k,
-                x + h * v + half2 * b2,
-                y + h * w + half2 * c2,
-                r + h * a3,
-                v + h * b3,
-                w + h * c3,
-                end,
-            )
+                k, x + h * v + half2 * b2, y + h * w + half2 * c2,
+                r + h * a3, v + h * b3, w + h * c3, end,
+            )  # fmt: skip
             q += h * r + sixth2 * (a1 + a2 + a3)
             x += h * v + sixth2 * (b1 + b2 + b3)
             y += h * w + sixth2 * (c1 + c2 + c3)
@@ -282,56 +216,22 @@ def run_two(k, h, every, torque, out):
             ya, yb, yc = xa + half * va, xb + half * vb, xc + half * vc
             yd, ye, yf = xd + half * vd, xe + half * ve, xf + half * vf
             a2, b2, c2, d2, e2, f2 = two_links(
-                k,
-                ya,
-                yb,
-                yc,
-                yd,
-                ye,
-                yf,
-                va + half * a1,
-                vb + half * b1,
-                vc + half * c1,
-                vd + half * d1,
-                ve + half * e1,
-                vf + half * f1,
-                step[1, 0],
-                step[1, 1],
-            )
+                k, ya, yb, yc, yd, ye, yf,
+                va + half * a1, vb + half * b1, vc + half * c1, vd + half * d1, ve + half * e1, vf + half * f1,
+                step[1, 0], step[1, 1],
+            )  # fmt: skip
             a3, b3, c3, d3, e3, f3 = two_links(
-                k,
-                ya + quarter * a1,
-                yb + quarter * b1,
-                yc + quarter * c1,
-                yd + quarter * d1,
-                ye + quarter * e1,
-                yf + quarter * f1,
-                va + half * a2,
-                vb + half * b2,
-                vc + half * c2,
-                vd + half * d2,
-                ve + half * e2,
-                vf + half * f2,
-                step[1, 0],
-                step[1, 1],
-            )
+                k, ya + quarter * a1, yb + quarter * b1, yc + quarter * c1,
+                yd + quarter * d1, ye + quarter * e1, yf + quarter * f1,
+                va + half * a2, vb + half * b2, vc + half * c2, vd + half * d2, ve + half * e2, vf + half * f2,
+                step[1, 0], step[1, 1],
+            )  # fmt: skip
             a4, b4, c4, d4, e4, f4 = two_links(
-                k,
-                xa + h * va + half2 * a2,
-                xb + h * vb + half2 * b2,
-                xc + h * vc + half2 * c2,
-                xd + h * vd + half2 * d2,
-                xe + h * ve + half2 * e2,
-                xf + h * vf + half2 * f2,
-                va + h * a3,
-                vb + h * b3,
-                vc + h * c3,
-                vd + h * d3,
-                ve + h * e3,
-                vf + h * f3,
-                step[2, 0],
-                step[2, 1],
-            )
+                k, xa + h * va + half2 * a2, xb + h * vb + half2 * b2, xc + h * vc + half2 * c2,
+                xd + h * vd + half2 * d2, xe + h * ve + half2 * e2, xf + h * vf + half2 * f2,
+                va + h * a3, vb + h * b3, vc + h * c3, vd + h * d3, ve + h * e3, vf + h * f3,
+                step[2, 0], step[2, 1],
+            )  # fmt: skip
             xa += h * va + sixth2 * (a1 + a2 + a3)
             xb += h * vb + sixth2 * (b1 + b2 + b3)
             xc += h * vc + sixth2 * (c1 + c2 + c3)

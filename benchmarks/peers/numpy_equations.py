@@ -11,6 +11,8 @@ State of one link: :math:`(q, \delta, \dot q, \dot\delta)`, of two :math:`(q_1, 
 \delta_2, \dot q_1, \dots)`, the amplitudes link by link, two modes each.
 """
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -278,6 +280,14 @@ class _Numpy(Peer):
         super().__init__(case, parameters, **settings)
         self.arm = equations(parameters, tip_mass, tip_inertia)
 
+    def pieces(self, duration):
+        """Start and end of each smooth piece of the torque [s], and its torque there; None for a sine."""
+        for start, end in pairwise(
+            (0.0, *(e for e in self.torque.edges if e < duration), duration)
+        ):
+            # Held: the last stage of a piece must not see the next level.
+            yield start, end, self.torque(0.5 * (start + end)) if self.torque.edges else None
+
     def derivative(self, state, torque):
         """Time derivative of the state."""
         n = self.arm.size
@@ -306,15 +316,10 @@ class NumpyDop853(_Numpy):
         t = times(duration)
         state = np.zeros(2 * self.arm.size)
         states = np.empty((t.size, state.size))
-        ends = [edge for edge in self.torque.edges if edge < duration] + [duration]
-        start = 0.0
-        for end in ends:
-            # Inside a piece the torque is smooth: its last stage must not see the next level.
-            if self.torque.edges:
-                held = self.torque(0.5 * (start + end))
-                right = lambda t, x, held=held: self.derivative(x, held)  # noqa: E731
-            else:
-                right = lambda t, x: self.derivative(x, self.torque(t))  # noqa: E731
+        for start, end, held in self.pieces(duration):
+            right = lambda t, x, held=held: self.derivative(  # noqa: E731
+                x, self.torque(t) if held is None else held
+            )
             here = (t >= start - 1e-9) & (t <= end + 1e-9)
             piece = solve_ivp(
                 right,
@@ -326,7 +331,7 @@ class NumpyDop853(_Numpy):
                 atol=self.atol,
             )
             states[here] = piece.y.T
-            state, start = piece.y[:, -1], end
+            state = piece.y[:, -1]
         return states
 
 

@@ -207,9 +207,10 @@ def _pair(m, name):
 
 
 def table(record, arm_model, plant_model):
-    """Columns and rows of the table; joint angles and amplitudes without suffix are the simulated arm's own.
+    """Columns and rows of the table of a `record`.
 
-    `arm_model` is the arm as the controller knows it.
+    `arm_model` is the arm as the controller knows it, `plant_model` the simulated one; joint angles and amplitudes
+    without suffix are the latter's own.
     """
     r = record
     per_joint = {
