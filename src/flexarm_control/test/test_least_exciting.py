@@ -9,7 +9,6 @@ from scipy.optimize import minimize
 
 from flexarm_control.motions import excitation, profiles
 from flexarm_control.motions.least_exciting import _Problem, least_exciting, least_squares
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS
@@ -54,11 +53,7 @@ def test_the_full_model_is_left_as_quiet_as_the_linear_theory_says(arm_r, motion
     """Nonlinear equations of motion under the slow torque alone, against the linear energy."""
 
     def energy_left(profile):
-        times = np.linspace(0.0, 2.0, 401)
-        states = zip(
-            *(f(times) for f in (profile.position, profile.velocity, profile.acceleration)),
-            strict=True,
-        )
+        states = zip(*profile.states(np.linspace(0.0, 2.0, 401)), strict=True)
         torque = np.array([excitation.reduced(arm_r, *state)[0] for state in states])
         rows = np.zeros((401, 6))
         arm_r.stepper(METHODS["dop853"]).trajectory(rows, torque[:-1], torque[1:], 0.005)
@@ -73,12 +68,10 @@ def test_the_full_model_is_left_as_quiet_as_the_linear_theory_says(arm_r, motion
     assert energy_left(motion.profile) < 1e-4 * left
 
 
-def test_no_feasible_neighbour_is_better(arm_r, motion):
+def test_no_feasible_neighbour_is_better(arm_r):
     """Convexity: along any way that keeps the limits the objective of the last programme does not fall."""
-    infinite = np.array([np.inf])
-    problem = _Problem(
-        arm_r, profiles.quintic([0.0], [QUARTER], 2.0), np.array([3.5]), infinite, None
-    )
+    base = profiles.quintic([0.0], [QUARTER], 2.0)
+    problem = _Problem(arm_r, base, np.array([3.5]), np.array([np.inf]), None)
     x, _ = problem.solve()
     r, A = problem.linearised(x, 2.0)
     E, f = problem._objective(r[:, 1:], A[:, 1:])
@@ -131,11 +124,8 @@ def test_the_least_torque_it_names_is_near_the_double_integrators_and_does(arm_r
     assert found.excitation.peak_torque[0] <= 2.0 * (1.0 + 1e-5)
 
 
-def test_two_joints_move_together_within_both_torques_and_both_speeds():
-    arm = model.build(arm_file.load("two_link"))
-    found = least_exciting(
-        arm, [0.0, 0.2], [0.8, 0.6], 3.0, torque_limit=[0.45, 1.0], velocity_limit=[0.45, 1.0]
-    )
+def test_two_joints_move_together_within_both_torques_and_both_speeds(two_link):
+    found = least_exciting(two_link, [0.0, 0.2], [0.8, 0.6], 3.0, [0.45, 1.0], [0.45, 1.0])
     t = np.linspace(0.0, 3.0, 301)
     way = (found.profile.position(t) - [0.0, 0.2]) / [0.8, 0.4]
     np.testing.assert_allclose(way[:, 0], way[:, 1], atol=1e-12)
@@ -144,14 +134,12 @@ def test_two_joints_move_together_within_both_torques_and_both_speeds():
     assert found.excitation.residual < 0.01 * found.quintic.residual
 
 
-def test_a_rigid_arm_gets_the_smoothest_motion_and_gravity_that_cant_be_held_is_named():
-    arm = model.build(arm_file.load("rigid"))
-    found = least_exciting(arm, [0.0, 0.2], [0.5, 0.5], 2.0)
+def test_a_rigid_arm_gets_the_smoothest_motion_and_gravity_that_cant_be_held_is_named(rigid):
+    found = least_exciting(rigid, [0.0, 0.2], [0.5, 0.5], 2.0)
     assert found.excitation.residual == 0.0 and found.rounds <= 3
-    with pytest.raises(
-        TrajectoryError, match=r"holding the arm on the way takes 1\.\d+ times the torque limits"
-    ):
-        least_exciting(arm, [0.0, 0.2], [0.5, 0.5], 2.0, torque_limit=[6.0, 10.0])
+    message = r"holding the arm on the way takes 1\.\d+ times the torque limits"
+    with pytest.raises(TrajectoryError, match=message):
+        least_exciting(rigid, [0.0, 0.2], [0.5, 0.5], 2.0, torque_limit=[6.0, 10.0])
 
 
 @pytest.mark.parametrize(

@@ -7,21 +7,10 @@ from scipy.optimize import brentq
 
 from flexarm_control.motions import profiles, shapers, tip_paths
 from flexarm_control.trajectory import specs
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
-from flexarm_dynamics.models import model
 
 START = np.array([0.2, -0.3, 0.9, 0.2])
-
-
-@pytest.fixture(scope="module")
-def long_reach():
-    return model.build(arm_file.load("long_reach"))
-
-
-@pytest.fixture(scope="module")
-def two_link():
-    return model.build(arm_file.load("two_link"))
+PLANAR = np.array([0.2, 1.2])
 
 
 def resting_tip(arm, q):
@@ -68,10 +57,9 @@ def test_velocities_and_accelerations_are_the_derivatives(lifted, shaped):
 
 
 def test_an_arc_keeps_its_distance_from_its_centre(two_link):
-    start, via = np.array([0.2, 1.2]), np.array([0.35, 0.75, 0.0])
-    begin = resting_tip(two_link, start)
-    end = np.array([-0.05, 0.6, 0.0])
-    path = tip_paths.arc(two_link, start, via, end, profiles.quintic(0.0, 1.0, 2.0))
+    begin = resting_tip(two_link, PLANAR)
+    via, end = np.array([0.35, 0.75, 0.0]), np.array([-0.05, 0.6, 0.0])
+    path = tip_paths.arc(two_link, PLANAR, via, end, profiles.quintic(0.0, 1.0, 2.0))
     tips = np.array([resting_tip(two_link, path.position(t)) for t in np.linspace(0.0, 2.0, 33)])
     np.testing.assert_allclose(tips[[0, -1]], [begin, end], atol=1e-8)
     # The centre by perpendicular bisectors: 2 (p_i - p_0) c = |p_i|^2 - |p_0|^2.
@@ -93,18 +81,16 @@ def test_an_arc_keeps_its_distance_from_its_centre(two_link):
 
 
 def test_a_circle_turns_through_via_even_when_that_is_the_long_way():
-    curve = tip_paths.circle(np.array([1.0, 0, 0]), np.array([-1.0, 0, 0]), np.array([0.0, -1, 0]))
-    np.testing.assert_allclose(
-        curve(np.array([0.0, 2 / 3, 1.0])), [[1, 0, 0], [-1, 0, 0], [0, -1, 0]], atol=1e-12
-    )
-    np.testing.assert_allclose(curve(1 / 3), [0.0, 1.0, 0.0], atol=1e-12)
+    begin, via, end = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0.0, -1, 0]])
+    curve = tip_paths.circle(begin, via, end)
+    at = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+    np.testing.assert_allclose(curve(at), [begin, [0, 1, 0], via, end], atol=1e-12)
 
 
 def test_a_line_is_written_as_a_spec_and_its_shaper_leaves_the_tip_on_it(two_link):
-    start = np.array([0.2, 1.2])
-    begin, end = resting_tip(two_link, start), np.array([0.3, 0.5, 0.0])
+    begin, end = resting_tip(two_link, PLANAR), np.array([0.3, 0.5, 0.0])
     text = "line:tip=0.3;0.5;0,duration=2,shaper=zv,shape-modes=1,points=21"
-    spec = specs.from_spec(text, two_link, start)
+    spec = specs.from_spec(text, two_link, PLANAR)
     assert spec.times[-1] > 2.1
     tips = np.array([resting_tip(two_link, q) for q in spec.positions])
     off = np.cross(tips - begin, (end - begin) / np.linalg.norm(end - begin))
@@ -117,7 +103,7 @@ def test_a_line_is_written_as_a_spec_and_its_shaper_leaves_the_tip_on_it(two_lin
     [
         (
             "line:tip=1.5;0;0",
-            r"beyond \d+ %: .* out of reach from there; the nearest found is .* m away",
+            r"beyond \d+ %: .* out of reach from there; the nearest found is .* m",
         ),
         ("line:tip=0.3;0.5;0.1", r"out of reach"),
         ("line:tip=nan;0;0", r"tip: 'nan;0;0' can't be used; give 3 finite coordinates"),
@@ -127,24 +113,18 @@ def test_a_line_is_written_as_a_spec_and_its_shaper_leaves_the_tip_on_it(two_lin
 )
 def test_what_the_tip_cant_follow_is_refused(two_link, text, message):
     with pytest.raises(FlexarmError, match=message):
-        specs.from_spec(text, two_link, [0.2, 1.2])
+        specs.from_spec(text, two_link, PLANAR)
 
 
-def test_a_path_past_the_base_is_refused_as_nearly_singular(two_link):
-    """Within 0.1 mm of the base the elbow has to fold and the shoulder to swing round at once."""
-    start = np.array([0.2, 1.2])
-    end = -resting_tip(two_link, start) + [2e-4, 0.0, 0.0]
+def test_a_line_past_the_base_or_of_no_length_and_an_arc_on_a_line_are_refused(two_link):
+    begin, law = resting_tip(two_link, PLANAR), profiles.quintic(0.0, 1.0, 1.0)
+    # Within 0.1 mm of the base the elbow has to fold and the shoulder to swing round at once.
     with pytest.raises(TrajectoryError, match=r"% of it, near q = .* nearly singular there"):
-        tip_paths.line(two_link, start, end, profiles.quintic(0.0, 1.0, 1.0))
-
-
-def test_points_on_a_line_make_no_circle_and_a_tip_that_is_there_no_path(two_link):
-    start = np.array([0.2, 1.2])
-    begin, law = resting_tip(two_link, start), profiles.quintic(0.0, 1.0, 1.0)
-    with pytest.raises(TrajectoryError, match="are on a line"):
-        tip_paths.arc(two_link, start, 1.1 * begin, 1.2 * begin, law)
+        tip_paths.line(two_link, PLANAR, -begin + [2e-4, 0.0, 0.0], law)
     with pytest.raises(TrajectoryError, match="is where the tip is already"):
-        tip_paths.line(two_link, start, begin, law)
+        tip_paths.line(two_link, PLANAR, begin, law)
+    with pytest.raises(TrajectoryError, match="are on a line"):
+        tip_paths.arc(two_link, PLANAR, 1.1 * begin, 1.2 * begin, law)
 
 
 def test_a_start_beyond_the_joints_limits_is_refused(long_reach):

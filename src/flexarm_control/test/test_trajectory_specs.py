@@ -6,14 +6,7 @@ import pytest
 
 from flexarm_control.motions import profiles, shapers
 from flexarm_control.trajectory import files, specs
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import NOT_GIVEN, FlexarmError
-from flexarm_dynamics.models import model
-
-
-@pytest.fixture(scope="module")
-def two_link():
-    return model.build(arm_file.load("two_link"))
 
 
 def agrees(trajectory, profile):
@@ -25,14 +18,10 @@ def agrees(trajectory, profile):
 
 def test_a_spec_is_the_familys_motion(arm_r, two_link):
     agrees(specs.from_spec("paper", arm_r), profiles.paper_profile())
-    agrees(
-        specs.from_spec("quintic:to=1.57,duration=2.5", arm_r, [0.2]),
-        profiles.quintic(0.2, 1.57, 2.5),
-    )
-    agrees(
-        specs.from_spec("smooth: to=0.5;-0.3, from=0.1;0, duration=3, smoothness=4", two_link),
-        profiles.smooth([0.1, 0.0], [0.5, -0.3], 3.0, 4),
-    )
+    spec = specs.from_spec("quintic:to=1.57,duration=2.5", arm_r, [0.2])
+    agrees(spec, profiles.quintic(0.2, 1.57, 2.5))
+    text = "smooth: to=0.5;-0.3, from=0.1;0, duration=3, smoothness=4"
+    agrees(specs.from_spec(text, two_link), profiles.smooth([0.1, 0.0], [0.5, -0.3], 3.0, 4))
     spec = specs.from_spec("quintic:to=0.4,shaper=zvd,shape_modes=1,points=51", two_link)
     shaper = shapers.for_arm(two_link, [0.4, 0.4], "zvd", 1)
     agrees(spec, shaper.apply(profiles.quintic([0, 0], [0.4, 0.4], 2.0)))
@@ -76,7 +65,6 @@ def test_what_cant_be_read_is_refused_naming_it(arm_r, text, field, value):
     ("text", "field"),
     [("quintic:to=4", "positions"), ("quintic:to=3,duration=0.2", "velocities")],
 )
-def test_a_motion_beyond_the_arms_limits_is_refused(text, field):
-    arm = model.build(arm_file.load("one_link"))
+def test_a_motion_beyond_the_arms_limits_is_refused(one_link, text, field):
     with pytest.raises(FlexarmError, match=rf"points\[\d+\]\.{field} of joint joint1: .* limit"):
-        specs.from_spec(text, arm)
+        specs.from_spec(text, one_link)
