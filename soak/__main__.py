@@ -8,11 +8,11 @@ import time
 
 from flexarm_dynamics.errors import FlexarmError
 
-#: Growth of a process's memory that is none: the allocator's own coming and going [MiB].
+#: A process's memory may grow by this much: so much the allocator takes and gives back by itself [MiB].
 FLAT = 8.0
-#: Longest wait for any one thing, on a machine that has other things to do [s].
+#: Timeout of each wait, on a busy machine [s].
 PATIENCE = 180.0
-#: Between two lines of progress [s].
+#: Time between two lines of progress [s].
 REPORT = 10.0
 
 
@@ -32,7 +32,7 @@ def parser():
 
 
 def soak(options, say):
-    """Run it; the `Soak`, and why it ended early (empty if it did not)."""
+    """Run the rounds; the `Soak`, and why it ended early (empty if it did not)."""
     from . import run
 
     with tempfile.TemporaryDirectory(prefix="soak-") as folder, run.harness.Bench(folder) as bench:
@@ -55,7 +55,7 @@ def soak(options, say):
 
 
 def progress(life, wall):
-    """A line of how it goes."""
+    """A line of progress after `wall` seconds."""
     memory = ", ".join(f"{name} {mib:.0f} MiB" for name, mib in life.memory[-1].items())
     counts = life.invariants.counts
     return (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold of every sample on the topics, whatever happens to the nodes."""
+"""What must hold for every sample on the topics, whatever happens to the nodes."""
 
 from collections import Counter
 
@@ -8,7 +8,7 @@ import numpy as np
 from flexarm_msgs.msg import CompositeState, JointTorque
 from flexarm_ros.messages import stamp_ns
 
-#: So many estimates wait for the torque that answers them.
+#: Number of estimates that are kept for the torques that answer them.
 KEPT = 4000
 #: States in which the controller sends torque.
 RUNNING = (
@@ -20,7 +20,7 @@ RUNNING = (
 
 
 class Invariants:
-    """Takes messages in the order they come, and keeps what it needs of the last ones alone.
+    """Checks messages in their order of arrival; of earlier ones it keeps only what the checks need.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The soak itself: rounds of trouble, each followed by a healthy motion that must come to its end."""
+"""The soak itself: rounds of faults and changes, each followed by a healthy motion that must reach its end."""
 
 import random
 import sys
@@ -79,16 +79,16 @@ def resident(pid):
 
 
 class Soak:
-    """Three nodes in lockstep, and what is done to them.
+    """Three nodes in lockstep, with faults, changed parameters and motions.
 
     Parameters
     ----------
     bench : harness.Bench
     seed : int
-        Of the plan: motions, parameters and faults in their order.
+        Of the motions, parameters and faults, and their order.
     arm : str
     faults : bool
-        Whether faults are put into the simulator's states.
+        Whether the simulator injects faults into its states.
     """
 
     def __init__(self, bench, seed, arm="R", faults=True):
@@ -125,7 +125,7 @@ class Soak:
     # Messages ----------------------------------------------------------------------------------
 
     def drain(self):
-        """Judge what has come, and forget it but for the last of each."""
+        """Check the messages that have arrived, and keep only the last one of each topic."""
         arm, judge = self.arm, self.invariants
         for tap, take in (
             (arm.estimated, judge.estimate),
@@ -142,7 +142,7 @@ class Soak:
         return True
 
     def wait(self, what, condition, patience=None):
-        """Judge messages until a condition holds."""
+        """Check messages until a condition holds."""
         return self.bench.wait_for(what, lambda: self.drain() and condition(), patience)
 
     def running(self):
@@ -152,7 +152,7 @@ class Soak:
     # Rounds --------------------------------------------------------------------------------------
 
     def begin(self, **parameters):
-        """A new session of the arm, and torque; whatever was before."""
+        """Start a new session of the arm, whatever its state, and wait for torque."""
         self.put([])
         for name, value in parameters.items():
             self.bench.set("controller", **{name: value})
@@ -180,20 +180,20 @@ class Soak:
         """Set the simulator's faults."""
         if not self.faults:
             return
-        # Typed: an empty list says nothing of what it might hold.
+        # With its type, which an empty list does not show.
         value = RosParameter("faults", RosParameter.Type.STRING_ARRAY, lines).to_parameter_msg()
         answer = self.bench.call(SetParameters, "simulator/set_parameters", parameters=[value])
         result = answer.results[0]
         assert result.successful, f"faults {lines} refused: {result.reason}"
 
     def move(self, to, duration):
-        """Publish a motion; it need not be taken."""
+        """Publish a motion, which the controller may refuse."""
         n = len(self.description.joints)
         point = (duration, [to] * n, [0.0] * n, [0.0] * n)
         self.arm.publish_trajectory(harness.trajectory(self.description.joint_names, point))
 
     def trouble(self):
-        """One round: motions, parameters, faults, all at random."""
+        """One round: a random motion with random parameters and faults."""
         rng, names = self.random, self.description.gauge_names
         self.begin()
         lines = [
@@ -214,7 +214,7 @@ class Soak:
         self.rounds += 1
 
     def run_for(self, seconds):
-        """Let the loop go on for a while of simulated time, counted in samples."""
+        """Let the loop run for some seconds of simulated time, counted in samples."""
         first, session = self.arm.state.sequence, self.arm.state.session
         samples = round(1000 * seconds)
 
@@ -226,7 +226,7 @@ class Soak:
         self.seconds += seconds
 
     def prove(self):
-        """A healthy motion comes to its end."""
+        """A healthy motion reaches its end."""
         self.begin(**HEALTHY)
         to, before = self.random.uniform(0.2, 0.4), self.arm.state.accepted_trajectory_id
         again = [0.0]
@@ -249,7 +249,7 @@ class Soak:
     # Resources -------------------------------------------------------------------------------------
 
     def look(self):
-        """Note memory, and files in shared memory."""
+        """Record the memory of each process, and the number of files in shared memory."""
         self.memory.append({name: resident(pid) for name, pid in self.pids.items()})
         self.shared.append(len(set().union(*(harness.segments(p) for p in self.pids.values()))))
 

@@ -54,7 +54,7 @@ def test_every_command_is_listed_with_a_line_of_its_own(capsys):
     "words, key",
     [
         (["urdf", "R", "--pieces", "2"], "joints"),
-        (["publish", "quintic", "--to", "0.5", "--dry-run"], "vibration_energy_J"),
+        (["publish", "quintic", "--duration", "0.2", "--dry-run"], "vibration_energy_J"),
         (["publish", "paper", "--out", "{tmp}/paper.csv"], "points"),
         (["parameters"], "controller"),
         (["show", "R"], "modes"),
@@ -68,7 +68,7 @@ def test_json_is_all_that_standard_output_gets(words, key, tmp_path, capsys):
 
 
 def test_a_dry_run_says_the_same_in_both_ways(capsys):
-    words = ["publish", "quintic", "--to", "1.5", "--dry-run"]
+    words = ["publish", "quintic", "--to", "0.1", "--duration", "0.2", "--dry-run"]
     people, machines = text_of(words, capsys), json.loads(text_of([*words, "--json"], capsys))
     (joint,) = machines["joints"]
     assert f"slow torque {joint['peak_slow_torque_Nm']:.4g} N m" in people

@@ -106,3 +106,12 @@ def check_file(path, option="--plot"):
         raise FlexarmError("has the wrong suffix", field=option, value=str(path), limit=limit)
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def new_path(path, option):
+    """Return the path of what a command writes, or refuse one that exists."""
+    path = Path(path)
+    if path.exists():
+        hint = "name another one or remove it"
+        raise FlexarmError("exists already", field=option, value=str(path), hint=hint)
+    return path

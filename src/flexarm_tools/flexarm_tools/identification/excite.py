@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import tempfile
-from pathlib import Path
 
 from flexarm_control.motions import excitation_run
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.commands.options import new_path
 from flexarm_studies.progress import Progress
 
 from .live import PATIENCE, START_DRIVER
@@ -70,9 +70,7 @@ def excite(options):
 
     if not options.allow_motion:
         raise FlexarmError("this moves the arm", hint="stand clear, and give --allow-motion")
-    out = Path(options.out)
-    if out.exists():
-        raise FlexarmError("exists already", field="--out", value=str(out))
+    out = new_path(options.out, "--out")
     out.parent.mkdir(parents=True, exist_ok=True)
     arm_file.load(options.arm)  # refused here, and not in another process's log
     with Session(RECORDER, namespace=options.namespace) as session:

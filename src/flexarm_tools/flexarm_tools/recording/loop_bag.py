@@ -5,17 +5,16 @@ Nothing is sent: no middleware is started. Stamps are the simulator's, and so ar
 """
 
 import math
-from pathlib import Path
 
 from rclpy.serialization import serialize_message
 
-from flexarm_dynamics.errors import FlexarmError
 from flexarm_ros.messages import (
     CompositeStateWriter,
     ObserverStateWriter,
     StateWriter,
     TorqueWriter,
 )
+from flexarm_studies.commands.options import new_path
 
 from .recorder import BagWriter
 
@@ -32,22 +31,10 @@ class LoopBag:
         Shipped name or path of the arm file, which goes into the bag.
     observer : str
         Name of the observer, as the node publishes it.
-
-    Raises
-    ------
-    FlexarmError
-        When the folder exists.
     """
 
     def __init__(self, folder, loop, arm, observer=""):
-        self.folder, self._loop, self._observer = Path(folder), loop, observer
-        if self.folder.exists():
-            raise FlexarmError(
-                "exists already",
-                field="--bag",
-                value=str(folder),
-                hint="name another one or remove it",
-            )
+        self.folder, self._loop, self._observer = new_path(folder, "--bag"), loop, observer
         arm_ = loop.model.arm
         self._measured, self._estimate = StateWriter(arm_), StateWriter(arm_)
         self._torque, self._state = TorqueWriter(arm_, 1), CompositeStateWriter(loop.model)

@@ -9,10 +9,10 @@ import datetime
 import json
 import sys
 import time
-from pathlib import Path
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.commands.options import new_path
 
 #: Timeout for the first message [s].
 PATIENCE = 10.0
@@ -56,11 +56,7 @@ def record(options):
             "is out of range", field="--duration", value=duration, limit="greater than 0"
         )
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    out = Path(options.out or f"results/bag-{stamp}")
-    if out.exists():
-        raise FlexarmError(
-            "exists already", field="--out", value=str(out), hint="name another one or remove it"
-        )
+    out = new_path(options.out or f"results/bag-{stamp}", "--out")
     if options.arm:
         arm_file.load(options.arm)  # refuse a wrong one before the recording
     with Listener(options.namespace) as listener:

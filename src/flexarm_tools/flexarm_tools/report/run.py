@@ -116,13 +116,13 @@ class Run:
     # Columns -----------------------------------------------------------------------------------
 
     def column(self, topic, field, j=None, part=ALL):
-        """A field's value in each sample, shape (k,), NaN where the topic has none; None without the field.
+        """A field's values in each sample, NaN where the topic has none; None without the field.
 
         Parameters
         ----------
         topic, field : str
         j : int, optional
-            Which joint, gauge or mode.
+            Which joint, gauge or mode: shape (k,); not given: all of them, shape (k, width).
         part : slice, optional
             Samples to take; all by default.
         """
@@ -131,7 +131,7 @@ class Run:
         values = self.contents.tables[topic].columns[field]
         values = values if j is None else values[:, j]
         rows = self._rows_of(topic)[part]
-        out = np.full(rows.size, np.nan)
+        out = np.full((rows.size, *values.shape[1:]), np.nan)
         out[rows >= 0] = values[rows[rows >= 0]]
         return out
 
@@ -233,9 +233,8 @@ class Run:
 
     def _mapped(self, part):
         """Amplitudes mapped from the strains, shape (part, modes)."""
-        strain_map, count = self._strain_map, len(self.gauge_names)
-        strain = [self.column(self.base, "strain", g, part) for g in range(count)]
-        mapped = (np.column_stack(strain) - strain_map.bias) @ strain_map.inverse.T
+        strain_map, strain = self._strain_map, self.column(self.base, "strain", part=part)
+        mapped = (strain - strain_map.bias) @ strain_map.inverse.T
         out = np.full((len(mapped), len(self.mode_names)), np.nan)
         for i, name in enumerate(strain_map.mode_names):
             out[:, self.mode_names.index(name)] = mapped[:, i]
@@ -266,13 +265,13 @@ class Run:
     def bent_known(self):
         """Samples whose deflections are known, shape (k,) bool."""
         known = np.ones(self.time.size, bool)
-        for j in np.flatnonzero(self._known_modes):
+        for j in np.flatnonzero(self._known_modes):  # no table of all samples in memory
             known &= np.isfinite(bridged(self.amplitude(j), BRIDGED))
         return known
 
     def positions(self, part=ALL):
         """Joint angles, shape (part, n) [rad]."""
-        return np.column_stack([self.position(j, part) for j in range(len(self.joint_names))])
+        return self.column(self.base, "joint_position", part=part)
 
     def references(self, part=ALL):
         """Reference angles, shape (part, n) [rad]; None without."""
