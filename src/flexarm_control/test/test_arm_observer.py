@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.loop.samples import ArmSample
-from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_control.observers.arm_observer import observe
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import MessageError, ModelError
@@ -31,7 +31,7 @@ def sample(k=0, session=1, **fields):
 
 
 def observed(arm, name="filtered_derivative", **options):
-    return ArmObserver(arm, design_observer(name, arm, {}), **options)
+    return observe(arm, name, options)
 
 
 def state(core):

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers import gauge_health
-from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_control.observers.arm_observer import observe
 from flexarm_control.observers.gauge_health import (
     GOOD,
     MISSING,
@@ -369,7 +369,7 @@ def test_a_calibration_is_described_in_microstrain_and_as_lines_of_the_arm_file(
 
 
 def observed(arm, **options):
-    return ArmObserver(arm, design_observer("filtered_derivative", arm, {}), **options)
+    return observe(arm, "filtered_derivative", options)
 
 
 def sample(arm, k, strain, amplitude=None):

@@ -8,7 +8,7 @@ import pytest
 
 from flexarm_control.composite.design import FAST, SLOW, design_law
 from flexarm_control.loop.samples import ArmSample
-from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_control.observers.arm_observer import observe
 from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, MessageError, UnknownComponentError
@@ -16,7 +16,7 @@ from flexarm_dynamics.models import model
 
 
 def test_strain_in_microstrain_is_refused_by_name(arm_r):
-    observer = ArmObserver(arm_r, design_observer("filtered_derivative", arm_r, {}))
+    observer = observe(arm_r, "filtered_derivative", {})
     sample = ArmSample(1, 2, 2)
     sample.amplitude, sample.strain = None, np.array([0.0, 250.0])
     with pytest.raises(MessageError, match="strain of middle: 250"):

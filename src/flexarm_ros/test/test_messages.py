@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from flexarm_control.composite.design import design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
-from flexarm_control.observers.arm_observer import ArmObserver, design_observer
+from flexarm_control.observers.arm_observer import observe
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
@@ -214,7 +214,7 @@ states = st.fixed_dictionaries(
 @pytest.mark.slow
 def test_any_stream_of_states_is_a_finite_estimate_or_a_message_error(stream):
     reader = StateReader(REAL)
-    observer = ArmObserver(MODEL, design_observer("filtered_derivative", MODEL, {}))
+    observer = observe(MODEL, "filtered_derivative", {})
     sample = ArmSample(1, 2, 2)
     for fields, stamp in stream:
         message = ArmState(**fields)

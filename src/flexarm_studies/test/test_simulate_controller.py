@@ -544,7 +544,7 @@ def test_closed_loop_takes_the_observers_common_parameters():
     observer = {"type": "filtered_derivative", "joint_velocity_bandwidth": 123.0}
     slow = {"type": "linear_model_following"}
     loop = ClosedLoop("R", slow, {"type": "none"}, observer)
-    assert loop.observer.bandwidth == 123.0
+    assert loop.observer.settings["joint_velocity_bandwidth"] == 123.0
     with pytest.raises(
         ParameterError, match=r"observer\.joint_velocity_bandwidth: 0\.1 rad/s is below"
     ):

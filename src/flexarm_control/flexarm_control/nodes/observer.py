@@ -54,10 +54,8 @@ class ObserverNode(ArmNode):
 
     def _changed(self, names):
         """Replace the observer by a new one, which continues from the old one's estimate."""
-        common = self.parameters.group("observer.", arm_observer.PARAMETERS)
-        self.core.bandwidth, self.core.delay = common["joint_velocity_bandwidth"], common["delay"]
-        self.core.smooth_position = common["smooth_position"]
-        if names - {"observer." + name for name in common}:
+        self.core.settings = self.parameters.group("observer.", arm_observer.PARAMETERS)
+        if names - {"observer." + name for name in self.core.settings}:
             observer = self._new_core().observer
             observer.resume(self.core.observer)
             self.core.observer = observer
@@ -117,16 +115,9 @@ class ObserverNode(ArmNode):
 
     def _forward_unknown(self, msg):
         """Pass a bad sample on without modal states, so that the controller disables at once."""
-        out = ArmState(
-            header=msg.header,
-            session=msg.session,
-            sequence=msg.sequence,
-            joint_names=msg.joint_names,
-            joint_position=msg.joint_position,
-            joint_velocity=msg.joint_velocity,
-            joint_torque=msg.joint_torque,
-        )
-        self._estimate_pub.publish(out)
+        for field in ("gauge_names", "strain", "mode_names", "modal_amplitude", "modal_rate"):
+            setattr(msg, field, [])
+        self._estimate_pub.publish(msg)
 
     def diagnose(self):
         return self._statistics.diagnose(self.core, self.parameters["observer.type"], self.active)

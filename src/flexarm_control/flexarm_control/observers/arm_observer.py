@@ -43,9 +43,9 @@ def observe(model, name, values):
     UnknownComponentError, ParameterError, DesignError, ModelError
     """
     common = {p.name for p in PARAMETERS}
-    options = {k: v for k, v in values.items() if k in common}
+    settings = {k: v for k, v in values.items() if k in common}
     law = design_observer(name, model, {k: v for k, v in values.items() if k not in common})
-    return ArmObserver(model, law, **check_all(PARAMETERS, options, prefix="observer."))
+    return ArmObserver(model, law, check_all(PARAMETERS, settings, prefix="observer."))
 
 
 class ArmObserver:
@@ -62,19 +62,14 @@ class ArmObserver:
     model : ArmModel
         Model of the arm file's arm.
     observer : Observer
-    joint_velocity_bandwidth : float
-        [rad/s]
-    delay : float
-        [s]
-    smooth_position : bool
-        Whether `position` is the observer's estimate, if it makes one.
-    calibration_samples, stuck_samples : int
-        See `gauge_health.PARAMETERS`.
+    settings : mapping
+        Checked values of `PARAMETERS`.
 
     Attributes
     ----------
     observer : Observer
-        May be replaced between two samples.
+    settings : mapping
+        Both may be replaced between two samples.
     gauges : GaugeHealth or None
         Health of each gauge; None for an arm without gauges.
     calibration : BiasCalibration or None
@@ -88,24 +83,14 @@ class ArmObserver:
         The observer's estimate, predicted ahead by the delay.
     """
 
-    def __init__(
-        self,
-        model,
-        observer,
-        joint_velocity_bandwidth=500.0,
-        delay=0.0,
-        smooth_position=True,
-        calibration_samples=200,
-        stuck_samples=50,
-    ):
-        self.model, self.observer = model, observer
+    def __init__(self, model, observer, settings):
+        self.model, self.observer, self.settings = model, observer, settings
         self.strain_map = self.gauges = self.calibration = None
         if model.arm.gauges:
-            self.strain_map = StrainMap(model)
-            self.gauges = gauge_health.GaugeHealth(model, self.strain_map, stuck_samples)
-            self.calibration = gauge_health.BiasCalibration(
-                model, self.strain_map, calibration_samples
-            )
+            self.strain_map = map_ = StrainMap(model)
+            self.gauges = gauge_health.GaugeHealth(model, map_, settings["stuck_samples"])
+            samples = settings["calibration_samples"]
+            self.calibration = gauge_health.BiasCalibration(model, map_, samples)
         self.calibrated = False
         observed = model.arm.observed_modes
         if tuple(observed) != tuple(model.mode_names):
@@ -115,17 +100,13 @@ class ArmObserver:
                 field="observed_modes",
                 hint="lower `modes` in links[].flexible",
             )
-        self.bandwidth, self.delay = joint_velocity_bandwidth, delay
-        self.smooth_position = smooth_position
         n, m = model.n_joints, model.n_modes
         self.position, self.velocity = np.zeros(n), np.zeros(n)
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self._measured, self._derivative = np.zeros(n), np.zeros(n)
-        self._mapped, self._used = np.zeros(m), np.zeros(m)
-        self._nothing = np.zeros(0)
+        self._mapped, self._nothing = np.zeros(m), np.zeros(0)
         self._motion = Motion(model)
         self._order = SampleOrder()
-        self.reason = ""
 
     def step(self, sample):
         """Take one sample, on the control path.
@@ -164,7 +145,7 @@ class ArmObserver:
         if restart:
             self.observer.reset()
         dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
-        if self.delay and not restart:
+        if self.settings["delay"] and not restart:
             need_torque(sample.torque, "observer.delay", "set observer.delay to 0.0")
         if not sample.velocity_known:
             sample.velocity[:] = self._joint_velocity(sample, dt)
@@ -173,7 +154,6 @@ class ArmObserver:
         # Only now, so that a refused sample leaves nothing behind, not even its time step.
         self._order.take(sample)
         self._derivative[:], self._measured[:] = sample.velocity, sample.position
-        self._used[:] = sample.amplitude
         if sample.strain is not None and self.calibration is not None:
             self.calibration.push(sample)
         return self.observer.converged
@@ -221,15 +201,13 @@ class ArmObserver:
         old, new = self.strain_map.bias, self.calibration.bias()
         self.strain_map.bias = new
         self.calibrated = True
-        now = self.strain_map.amplitudes(self.calibration.last)
-        self.observer.rest_at(now)
-        self._used[:] = now
+        self.observer.rest_at(self.strain_map.amplitudes(self.calibration.last))
         return old, new
 
     def _pass_on(self, sample):
         """Set the output: the observer's estimate or the sample's values, predicted ahead by the delay."""
         observer = self.observer
-        smooth = self.smooth_position and observer.joint_position is not None
+        smooth = self.settings["smooth_position"] and observer.joint_position is not None
         estimated = not sample.velocity_known and observer.joint_velocity is not None
         x = np.concatenate(
             [
@@ -239,8 +217,8 @@ class ArmObserver:
                 observer.rate,
             ]
         )
-        if self.delay and observer.converged:
-            x = self._predicted(x, sample.torque)
+        if self.settings["delay"] and observer.converged:
+            x = self._predicted(x, sample.torque, self.settings["delay"])
         if not np.isfinite(x).all():
             # It would stay so for ever.
             observer.reset()
@@ -252,10 +230,10 @@ class ArmObserver:
             group[:] = x[start : start + group.size]
             start += group.size
 
-    def _predicted(self, x, torque):
-        """Return the state after the delay."""
-        count = int(np.ceil(self.delay / MAX_PREDICTION))
-        part = self.delay / count
+    def _predicted(self, x, torque, delay):
+        """The state after the delay."""
+        count = int(np.ceil(delay / MAX_PREDICTION))
+        part = delay / count
         for _ in range(count):
             x = self._motion.advance(x, torque, part, self._motion.step_for(part, x[: torque.size]))
         return x
@@ -294,7 +272,8 @@ class ArmObserver:
         if dt == 0.0:
             return np.zeros_like(self._derivative)
         difference = (sample.position - self._measured) / dt
-        return difference + (self._derivative - difference) * np.exp(-self.bandwidth * dt)
+        bandwidth = self.settings["joint_velocity_bandwidth"]
+        return difference + (self._derivative - difference) * np.exp(-bandwidth * dt)
 
 
 #: After a longer silence an observer starts afresh [ns].
