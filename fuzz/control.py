@@ -251,7 +251,9 @@ class Controllers(_Path):
         if not enabled:
             demand(not core.torque.any(), "disabled with a torque")
             demand(core.reason, "disabled for no reason")
-            demand(len(core.reason) <= self.LONGEST, f"a reason of {len(core.reason)} characters")
+            demand(
+                len(core.reason) <= self.MAX_LENGTH, f"a reason of {len(core.reason)} characters"
+            )
             return 1
         demand(np.isfinite(core.torque).all(), f"a torque of {core.torque}")
         demand(

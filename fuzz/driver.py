@@ -15,12 +15,12 @@ from flexarm_driver_template import protocol
 from flexarm_driver_template.device import MeasurementTime
 
 JOINTS, GAUGES = 2, 4
-#: More counts no electronics has, and a double holds each of them.
-MOST = 2**53
+#: No electronics counts further; a double holds every integer up to here.
+MAX_COUNT = 2**53
 
 
 class Lines(Reader):
-    """`protocol`: a frame is one, whole and of numbers that a message holds; else it is none."""
+    """`protocol`: a line is either a whole frame, of numbers that a message can hold, or none."""
 
     name, weight, error, batch = "serial line", 5.0, (), 5
 
@@ -50,7 +50,7 @@ class Lines(Reader):
                 *frame.bridge,
                 *frame.drive,
             )
-            demand(all(abs(n) <= MOST for n in numbers), "a count that no double holds")
+            demand(all(abs(n) <= MAX_COUNT for n in numbers), "a count that no double holds")
             demand(frame.number >= 0 and frame.microseconds >= 0, "a clock before its start")
             host += 1_000_000
             stamp = clock.stamp(1000 * frame.microseconds, host)

@@ -354,4 +354,4 @@ class Driver(Reader):
     def check(self, given, result):
         for finding in result:
             demand(isinstance(finding.verdict, Verdict), "verdict")
-            demand(0 < len(finding.text) <= self.LONGEST, f"{len(finding.text)} characters")
+            demand(0 < len(finding.text) <= self.MAX_LENGTH, f"{len(finding.text)} characters")

@@ -213,7 +213,7 @@ class Gate(Reader):
             history.append((now, sequence, SimpleNamespace(**_fields(msg))))
             reason = gate.offer(msg, now)
             demand(isinstance(reason, str), "a verdict that is no text")
-            demand(len(reason) <= self.LONGEST, f"a reason of {len(reason)} characters")
+            demand(len(reason) <= self.MAX_LENGTH, f"a reason of {len(reason)} characters")
             refused += bool(reason)
             if not reason:
                 demand(msg.session == 7 and msg.mode == JointTorque.ENABLED, "let through")

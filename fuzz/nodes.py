@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running nodes: malformed messages and parameters over DDS, in lockstep; afterwards they must hold an arm."""
+"""Running nodes: malformed messages and parameters over DDS, in lockstep; afterwards they must still hold an arm."""
 
 import sys
 import tempfile
@@ -27,16 +27,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import harness
 
 NODES = ("simulator", "observer", "controller")
-#: Of all messages: states to the observer, states to the controller, torques, trajectories, parameters.
-SHARES = {
+#: Fractions of the messages that go to each topic; the rest are parameters.
+FRACTIONS = {
     "arm_state": 0.35,
     "arm_state_estimate": 0.2,
     "joint_torque": 0.2,
     "joint_trajectory": 0.15,
 }
-#: A node is asked for an answer after so many messages that have none.
+#: After so many messages that get no answer, a service call checks that the node is alive.
 AT_ONCE = 5
-#: A state that is not answered is sent again so often.
+#: Number of times that a state without an answer is sent again.
 MAX_TRIES = 20
 
 
@@ -83,7 +83,7 @@ class Nodes:
             set_stamp(msg.header.stamp, 10**9 + 10**6 * k)
             if self.random.random() < 0.7:
                 spoil_state(self.random, msg)
-            # The answer tells that it was read; by this number it is known.
+            # The answer shows that it was read; this number identifies it.
             msg.session, msg.sequence = self.session, k
             if self.random.random() < 0.02:
                 msg.session += 1 + k  # the source begins anew
@@ -93,7 +93,7 @@ class Nodes:
             def answered(key=key, tries=tries, msg=msg):
                 if harness.answers(self.arm.torques, *key) or len(tries) > MAX_TRIES:
                     return True
-                if time.monotonic() > tries[-1] + 0.5:  # overtaken: the line keeps the newest alone
+                if time.monotonic() > tries[-1] + 0.5:  # overtaken: only the newest one is kept
                     tries.append(time.monotonic())
                     publisher.publish(msg)
                 return False
@@ -146,7 +146,7 @@ class Nodes:
                     continue
                 if len(fields) != 4:
                     continue
-                # rclpy does not look; what converts the message does, and can't be caught there.
+                # rclpy does not check; the conversion to C does, and its error can't be caught.
                 sec = (sec + 2**31) % 2**32 - 2**31
                 out.time_from_start.sec, out.time_from_start.nanosec = sec, nanosec
                 out.positions, out.velocities, out.accelerations, out.effort = fields
@@ -246,7 +246,7 @@ class Nodes:
 
 
 def _sendable(value):
-    """Whether a message holds it; what rclpy lets through there breaks in C, past any handler."""
+    """Whether a message can hold a value; what rclpy does not check fails in C, where no handler catches it."""
     if isinstance(value, list):
         return all(
             type(v) is type(value[0]) and not isinstance(v, list) and _sendable(v) for v in value
@@ -286,17 +286,17 @@ def fuzz(count, seed, say, patience=180.0):
             tally.seconds = time.perf_counter() - started
             say(tally)
 
-        part("trajectories", SHARES["joint_trajectory"], nodes.trajectories)
-        part("parameters", 1.0 - sum(SHARES.values()), nodes.parameters)
+        part("trajectories", FRACTIONS["joint_trajectory"], nodes.trajectories)
+        part("parameters", 1.0 - sum(FRACTIONS.values()), nodes.parameters)
         # Stop the nodes that would answer beside this program.
         bench.change("controller", "deactivate")
-        part("torques", SHARES["joint_torque"], nodes.torques)
+        part("torques", FRACTIONS["joint_torque"], nodes.torques)
         bench.change("controller", "activate")
         bench.change("simulator", "deactivate")
-        part("states", SHARES["arm_state"], lambda n, t: nodes.states("arm_state", n, t))
+        part("states", FRACTIONS["arm_state"], lambda n, t: nodes.states("arm_state", n, t))
         part(
             "estimates",
-            SHARES["arm_state_estimate"],
+            FRACTIONS["arm_state_estimate"],
             lambda n, t: nodes.states("arm_state_estimate", n, t),
         )
         bench.change("simulator", "activate")

@@ -4,7 +4,7 @@
 import math
 from array import array
 
-#: What has broken readers before: ends of ranges, what is no number, and what is one only in name.
+#: Values that have broken readers before: ends of ranges, NaN and infinities, negative zero, subnormal numbers.
 FLOATS = (
     math.nan,
     math.inf,
@@ -29,7 +29,7 @@ FLOATS = (
     -1.7976931348623157e308,
 )
 INTS = (0, 1, -1, 2, 7, 255, 2**15, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**53 + 1, 2**63 - 1)
-#: Integers that no field of a message holds, but a file does.
+#: Integers that a file can hold, but no field of a message.
 HUGE_INTS = (2**63, -(2**63) - 1, 2**64, 10**30, 10**400, 16**5000, -(16**5000))
 TEXTS = (
     "",

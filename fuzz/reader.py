@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is fuzzed: readers, each with its inputs and with what must hold of every one."""
+"""Base class of what is fuzzed: readers, each with its inputs and with what must hold for every input."""
 
 import reprlib
 from random import Random
@@ -12,7 +12,7 @@ class Violation(Exception):
 
 
 def demand(holds, what):
-    """Raise unless a property holds."""
+    """Raise `Violation` unless a property holds."""
     if not holds:
         raise Violation(what)
 
@@ -24,11 +24,11 @@ class Reader:
     ----------
     name : str
     weight : float
-        Part of all inputs that it gets, before the weights are normalised [-].
+        Fraction of all inputs that it gets, before the weights are normalised [-].
     error : type
-        What it may raise, and nothing else.
+        The only errors that it may raise.
     words : tuple of str
-        A refusal names one of them: fields, or what else tells where to look.
+        A refusal names at least one of them: fields, or other words that show where to look.
     batch : int
         Inputs in one run of `run`.
     """
@@ -36,8 +36,8 @@ class Reader:
     name, weight, batch = "", 1.0, 1
     error = FlexarmError
     words = ()
-    #: A longer message is not one for a log.
-    LONGEST = 1500
+    #: A log line must not be longer [characters].
+    MAX_LENGTH = 1500
 
     def make(self, rng):
         """An input."""
@@ -51,7 +51,7 @@ class Reader:
         """Raise `Violation` unless what was read is valid."""
 
     def state(self):
-        """What a refused input must leave alone, as something that compares."""
+        """What a refused input must not change, as something that compares."""
         return None
 
     def run(self, rng):
@@ -76,12 +76,12 @@ class Reader:
         """A refusal says what is wrong, and where."""
         text = str(error)
         demand(text.strip(), f"a {type(error).__name__} without a word")
-        demand(len(text) <= self.LONGEST, f"a message of {len(text)} characters: {text[:120]}…")
+        demand(len(text) <= self.MAX_LENGTH, f"a message of {len(text)} characters: {text[:120]}…")
         named = not self.words or any(word in text for word in self.words)
         demand(named, f"the refusal names no field: {text}")
 
     def renew(self):
-        """Begin anew after a failure."""
+        """Start again after a failure."""
 
 
 _SHORT = reprlib.Repr()

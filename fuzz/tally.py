@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the inputs of one reader or node."""
+"""Counts of what happened to the inputs of one reader or node."""
 
 
 class Tally:
-    """What came of one reader's inputs."""
+    """Counts for one reader: inputs, how many were refused, and failures."""
 
     def __init__(self, name):
         self.name, self.inputs, self.refused, self.failures = name, 0, 0, 0

@@ -93,7 +93,8 @@ def excite(options):
     recorded = {"out": str(out), "states": count}
     print(json.dumps(recorded) if options.json else f"{count} states in {out}")
     if "excitation complete" not in output:
-        raise FlexarmError(f"{_ending(output) or output}; what came before is in {out}")
+        hint = f"what came before is in {out}"
+        raise FlexarmError(_ending(output) or output, field="excite", hint=hint)
     return out
 
 
@@ -135,7 +136,8 @@ def _run(options, session):
             while not ended():
                 seen = len(states)
                 if not session.serve(SILENCE, lambda seen=seen: len(states) > seen or ended()):
-                    raise FlexarmError(f"no arm_state for {SILENCE:g} s\n{output()}")
+                    problem = f"none came for {SILENCE:g} s\n{output()}"
+                    raise FlexarmError(problem, field="arm_state")
             session.poll()
         finally:
             process.send_signal(signal.SIGINT)

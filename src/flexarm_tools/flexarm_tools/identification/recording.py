@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.shown import listed, show
+from flexarm_dynamics.shown import listed
 from flexarm_studies.identification.recording import from_tables, read_csv
 
 
@@ -18,9 +18,8 @@ def of_contents(contents, arm):
     """
     unknown = contents.unknown.get("gauge_names")
     if unknown:
-        raise FlexarmError(
-            f"{show(unknown)} are not this arm's: {listed(arm.gauge_names)}", field="gauge_names"
-        )
+        limit = listed(arm.gauge_names)
+        raise FlexarmError("are not this arm's", field="gauge_names", value=unknown, limit=limit)
     tables = contents.tables
     return from_tables(tables.get("arm_state"), tables.get("joint_torque"), arm)
 

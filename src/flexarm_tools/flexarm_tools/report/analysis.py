@@ -105,9 +105,8 @@ def _supervision(run):
     reasons = run.contents.reasons
     first = None
     if entered.size:
-        first = (
-            f"{run.time[entered[0]]:.3f} s: {reasons[run.reason[entered[0]]] or 'no reason given'}"
-        )
+        reason = reasons[run.reason[entered[0]]] or "no reason given"
+        first = f"{run.time[entered[0]]:.3f} s: {reason}"
     took = run.column("controller/state", "compute_time")
     took = None if took is None else took[took > 0.0]  # 0: an answer repeated without a new sample
     times = None
@@ -145,12 +144,8 @@ def _tracking(run):
 
 
 def _vibration(run, moves):
-    found = {
-        "residual_m": None,
-        "residual_windows": 0,
-        "residual_window_s": None,
-        "peak_deflection_m": None,
-    }
+    found = {"residual_m": None, "residual_windows": 0, "residual_window_s": None}
+    found["peak_deflection_m"] = None
     if not run.amplitude_source or run.model is None:
         return found
     rows, names = tip_rows(run.model)
@@ -165,10 +160,8 @@ def _vibration(run, moves):
     if known:
         squares = sum(len(bending) * residual_vibration(bending) ** 2 for bending in known)
         found["residual_m"] = float(np.sqrt(squares / sum(map(len, known))))
-        found["residual_windows"], found["residual_window_s"] = (
-            len(known),
-            [round(s, 6) for s in span],
-        )
+        found["residual_windows"] = len(known)
+        found["residual_window_s"] = [round(s, 6) for s in span]
     return found
 
 
@@ -304,8 +297,7 @@ def spectrum(run, mask):
         rows, names = np.eye(len(run.mode_names)), list(run.mode_names)
     if not names:
         return None
-    longest = max(b - a for a, b in pieces)
-    length = int(min(longest, round(SEGMENT * rate)))
+    length = int(min(max(b - a for a, b in pieces), round(SEGMENT * rate)))
     power, weight, q = 0.0, 0, 0.0
     for a, b in pieces:
         if b - a < length / 2 or b - a < 8:
@@ -393,12 +385,9 @@ def refusals(run):
     reasons = run.contents.reasons
     change = np.flatnonzero(np.diff(run.reason) != 0) + 1
     rows = [int(i) for i in np.concatenate([[0], change]) if run.reason[i] >= 0]
+    names = (*STATES, "?")  # -1: unknown
     return [
-        (
-            float(run.time[i]),
-            STATES[run.state[i]] if run.state[i] >= 0 else "?",
-            reasons[run.reason[i]],
-        )
+        (float(run.time[i]), names[run.state[i]], reasons[run.reason[i]])
         for i in rows
         if reasons[run.reason[i]]
     ]

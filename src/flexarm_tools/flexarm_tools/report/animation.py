@@ -150,12 +150,17 @@ def _held(values):
     return np.nan_to_num(np.take_along_axis(values, last, axis=0))
 
 
+def possible(run):
+    """Whether a run can be shown: its arm is known, and it has more than one sample."""
+    return run.arm is not None and run.time.size > 1
+
+
 def data(runs):
     """The animation of all `runs` for the page's script, ready for JSON; None where no arm is known.
 
     Numbers are integer multiples of a `unit`, two bytes each, little endian, in base 64; -32768 stands for none.
     """
-    runs = [run for run in runs if run.arm is not None and run.time.size > 1]
+    runs = [run for run in runs if possible(run)]
     if not runs:
         return None
     start, end = window(runs)
@@ -173,15 +178,13 @@ def data(runs):
     out["still"] = float(times[int(np.argmax(bending))])
     for run, f in zip(runs, films, strict=True):
         bent = max(float(np.abs(f.bent).max()), 1e-12)
-        straight, reference = _packed(f.straight, reach), None
-        if f.reference is not None:
-            reference = _packed(f.reference, reach)
+        reference = None if f.reference is None else _packed(f.reference, reach)
         out["runs"].append(
             {
                 "label": run.label,
                 "links": f.straight.shape[1],
                 "unit": reach / 32000.0,
-                "straight": straight,
+                "straight": _packed(f.straight, reach),
                 "reference": reference,
                 "bentUnit": bent / 32000.0,
                 "bent": _packed(f.bent, bent),
@@ -195,10 +198,8 @@ def _round(value):
     """The largest of 1, 2, 5, 10, … that is not above the value; at least 1."""
     if value <= 1.0:
         return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(
-        max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-9))
-    )
+    steps = np.array([1.0, 2.0, 5.0]) * 10.0 ** np.floor(np.log10(value))
+    return float(steps[steps <= value * (1 + 1e-9)].max())
 
 
 def _packed(values, largest):

@@ -71,12 +71,8 @@ def write(runs, opening=""):
         For more than `MAX_RUNS` runs, or a page that can't be made small enough.
     """
     if len(runs) > MAX_RUNS:
-        raise FlexarmError(
-            "are too many to distinguish on a page",
-            field="runs",
-            value=len(runs),
-            limit=f"at most {MAX_RUNS}",
-        )
+        problem, limit = "are too many to distinguish on a page", f"at most {MAX_RUNS}"
+        raise FlexarmError(problem, field="runs", value=len(runs), limit=limit)
     moves = [analysis.motions(run) for run in runs]
     label = _align(runs, moves)
     numbers = [analysis.summary(run, m) for run, m in zip(runs, moves, strict=True)]
@@ -124,9 +120,7 @@ def _page(runs, numbers, spectra, drawn, film, label, opening):
         }
         for i, run in enumerate(runs)
     ]
-    filmed = [
-        s for s, run in zip(shown, runs, strict=True) if run.arm is not None and run.time.size > 1
-    ]
+    filmed = [s for s, run in zip(shown, runs, strict=True) if animation.possible(run)]
     if film is not None:
         film |= {
             "colours": [s["colour"] for s in filmed],
@@ -193,9 +187,8 @@ def short(runs, numbers):
             text += f" The tip vibrated by {digits(1e3 * m['residual_m'])} mm rms, {_window(m)}."
         text += _torque_words(run, m)
         if m["faults"]:
-            text += (
-                f" {_several(m['faults'], 'fault').capitalize()}, the first at {m['first_fault']}."
-            )
+            count = _several(m["faults"], "fault").capitalize()
+            text += f" {count}, the first at {m['first_fault']}."
         elif m["faults"] == 0:
             text += " No faults."
         lines.append(text)
@@ -209,12 +202,9 @@ def _window(m):
 
 
 def _torque_words(run, m):
+    peaks = zip(m["peak_torque_Nm"], m["torque_limit_Nm"], strict=True)
     fractions = [
-        (peak / limit, j)
-        for j, (peak, limit) in enumerate(
-            zip(m["peak_torque_Nm"], m["torque_limit_Nm"], strict=True)
-        )
-        if peak is not None and limit
+        (peak / limit, j) for j, (peak, limit) in enumerate(peaks) if peak is not None and limit
     ]
     if not fractions:
         return ""
@@ -237,18 +227,16 @@ def _differences(runs, numbers):
             continue
         if window is not None:
             windows = sorted({window(numbers[i]) for _, i in known})
-            name += (
-                f", {windows[0]}"
-                if len(windows) == 1
-                else ", over windows that differ (see the table)"
-            )
+            differ = "over windows that differ (see the table)"
+            name += f", {windows[0] if len(windows) == 1 else differ}"
         (low, best), (high, worst) = min(known), max(known)
         if high / low >= 1.05:
-            lines.append(
-                f"{name}: {runs[best].label} has {digits(high / low)} times less than {runs[worst].label}."
+            text = (
+                f"{runs[best].label} has {digits(high / low)} times less than {runs[worst].label}"
             )
         else:
-            lines.append(f"{name}: the same within 5 % in all runs.")
+            text = "the same within 5 % in all runs"
+        lines.append(f"{name}: {text}.")
     return lines
 
 
@@ -316,10 +304,9 @@ def _lost(run, m):
     if not m["lost"]:
         return _cell("0")
     fraction = f"({digits(100.0 * m['lost'] / (m['lost'] + m['samples']))} %"
-    missed = (
-        f", {m['lost_by_recorder']} missed by the recorder alone" if m["lost_by_recorder"] else ""
-    )
-    return _cell(str(m["lost"]), f"{fraction}{missed})", bad=m["lost"] > m["lost_by_recorder"])
+    by_recorder = m["lost_by_recorder"]
+    missed = f", {by_recorder} missed by the recorder alone" if by_recorder else ""
+    return _cell(str(m["lost"]), f"{fraction}{missed})", bad=m["lost"] > by_recorder)
 
 
 def _unanswered(run, m):
@@ -386,19 +373,16 @@ def _frequencies(runs, spectra):
             continue
         known = analysis.predicted(run, s.configuration)
         top = analysis.highest(run, known)
-        cells = [
-            [f for f in known.get(f"joints {case}", ()) if f < top][: analysis.MAX_FREQUENCIES]
-            for case in ("locked", "free")
-        ]
-        measured = [digits(f, 4) for f in analysis.peaks(s, top)] or ["none stands out"]
-        out.append(
-            [
-                run.label,
-                ", ".join(measured),
-                *(", ".join(digits(f, 4) for f in c) or "–" for c in cells),
-            ]
-        )
+        cells = [_hertz(analysis.peaks(s, top)) or "none stands out"]
+        for case in ("joints locked", "joints free"):
+            shown = [f for f in known.get(case, ()) if f < top][: analysis.MAX_FREQUENCIES]
+            cells.append(_hertz(shown) or "–")
+        out.append([run.label, *cells])
     return out
+
+
+def _hertz(frequencies):
+    return ", ".join(digits(f, 4) for f in frequencies)
 
 
 def _events(runs):

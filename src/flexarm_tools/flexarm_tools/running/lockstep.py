@@ -113,13 +113,14 @@ class LockstepRun(Session):
             self.wait_for("the trajectory to be accepted", lambda: self.accepted() > before)
         except WaitError as error:
             reason = self.controller_state().rejected_reason
-            raise ProcessError(f"the trajectory was not accepted: {reason}\n{error}") from None
+            field = "the trajectory was not accepted"
+            raise ProcessError(f"{reason}\n{error}", field=field) from None
 
     def pause(self, paused):
         """Call the simulator's `~/pause`."""
         answer = self.call(SetBool, "simulator/pause", data=paused)
         if not answer.success:
-            raise ProcessError(f"simulator/pause: {answer.message}")
+            raise ProcessError(answer.message, field="simulator/pause")
 
     def run(self, message, duration, progress=lambda fraction: None):
         """Offer a trajectory at `TRAJECTORY_START_NS`, run `duration` seconds beyond its start, and record.
@@ -165,4 +166,4 @@ class LockstepRun(Session):
     def _check_fault(self):
         state = self.controller_state()
         if state.supervisor_state == CompositeState.FAULT:
-            raise ProcessError(f"the controller is in fault: {state.rejected_reason}")
+            raise ProcessError(state.rejected_reason, field="the controller is in fault")

@@ -69,7 +69,8 @@ def own_domain():
                 continue
             yield number
             return
-    raise ProcessError("all of 100 DDS domains are taken by other flexarm runs")
+    problem = "all are taken by other flexarm runs"
+    raise ProcessError(problem, field="ROS_DOMAIN_ID", limit="1 to 100")
 
 
 def environment(domain):

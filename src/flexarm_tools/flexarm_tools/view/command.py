@@ -177,9 +177,8 @@ class View:
 
             self.page = page = Page(arm_model.arm, self.drawer.reach, self.options.port)
         except ModuleNotFoundError as error:
-            raise FlexarmError(
-                f"{error.name} is missing: pip install viser, or make build"
-            ) from None
+            hint = "pip install viser, or make build"
+            raise FlexarmError("is missing", field=error.name, hint=hint) from None
         self.stack.callback(page.close)
         self.link.say, self.link.on_values = page.say, page.take_values
         self.link.find_gains(page.offer_gains)
