@@ -21,6 +21,7 @@ choose the interpolation as in a message. Every file that is read is checked by 
 import csv
 import math
 import re
+from itertools import chain
 from pathlib import Path
 
 import yaml
@@ -167,10 +168,7 @@ def _wanted(joint_names):
 def _csv_columns(header, joint_names, line):
     """Where t and each field's columns are; fields that are not there have none."""
     count = range(1, len(joint_names) + 1)
-    fields = {
-        field: [f"{prefix}{i}" for i in count if f"{prefix}{i}" in header]
-        for field, prefix in _PREFIXES.items()
-    }
+    fields = {field: [f"{prefix}{i}" for i in count] for field, prefix in _PREFIXES.items()}
     known = {"t"}.union(*fields.values())
     where, hint = f":{line}", f"give {_wanted(joint_names)} for {listed(joint_names)}"
     for word in header:
@@ -180,18 +178,14 @@ def _csv_columns(header, joint_names, line):
             raise TrajectoryError(
                 f"is the name of {header.count(word)} columns", field=where, value=word
             )
-    missing = [
-        f"{_PREFIXES[field]}{i}"
-        for field, names in fields.items()
-        for i in count
-        if (names or field == "positions") and f"{_PREFIXES[field]}{i}" not in header
-    ]
-    missing += [] if "t" in header else ["t"]
-    if missing:
-        raise TrajectoryError("is no column here", field=where, value=missing[0], hint=hint)
-    return {"t": header.index("t")} | {
-        field: [header.index(name) for name in names] for field, names in fields.items()
-    }
+    for field in ("velocities", "accelerations"):
+        if not set(header).intersection(fields[field]):
+            fields[field] = []
+    for name in (*chain(*fields.values()), "t"):
+        if name not in header:
+            raise TrajectoryError("is no column here", field=where, value=name, hint=hint)
+    columns = {field: [header.index(name) for name in names] for field, names in fields.items()}
+    return columns | {"t": header.index("t")}
 
 
 def _csv_number(word, column, line):

@@ -20,6 +20,7 @@ from .values import (
     SPEED_ROUNDING,
     UNITS,
     joint_limit,
+    refuse_joint,
     seconds,
 )
 
@@ -267,8 +268,8 @@ def _field(name, column, arm_joint_names, order):
         return None
     values = _numbers(name, column, n).reshape(len(column), n)[:, order]
     wild = ~(np.abs(values) <= MAX_MAGNITUDE)  # so written, it finds nan too
-    limit = np.full(n, MAX_MAGNITUDE)
-    _refuse(name, wild, values, arm_joint_names, f"{UNITS[name]} is not finite or too large", limit)
+    problem = f"{UNITS[name]} is not finite or too large"
+    refuse_joint(name, wild, values, arm_joint_names, problem, MAX_MAGNITUDE)
     values.flags.writeable = False
     return values
 
@@ -317,9 +318,9 @@ def _refuse_end_velocity(trajectory):
         return
     end = trajectory.velocities[-1:]
     moving = np.abs(end) > END_VELOCITY_TOLERANCE
-    problem, first = "rad/s is not zero at the last point", trajectory.times_ns.size - 1
-    zero, hint = np.zeros(end.shape[1]), "the arm holds there"
-    _refuse("velocities", moving, end, trajectory.joint_names, problem, zero, hint, first)
+    problem, hint = "rad/s is not zero at the last point", "the arm holds there"
+    names, last = trajectory.joint_names, trajectory.times_ns.size - 1
+    refuse_joint("velocities", moving, end, names, problem, 0.0, hint, last)
 
 
 def _check_limits(trajectory, position_low, position_high, velocity_max):
@@ -327,32 +328,20 @@ def _check_limits(trajectory, position_low, position_high, velocity_max):
     names, positions = trajectory.joint_names, trajectory.positions
     if position_low is not None:
         low = joint_limit("position_low", position_low, names)
-        _refuse("positions", positions < low, positions, names, "rad is below the limit", low)
+        refuse_joint("positions", positions < low, positions, names, "rad is below the limit", low)
     if position_high is not None:
         high = joint_limit("position_high", position_high, names)
-        _refuse("positions", positions > high, positions, names, "rad is above the limit", high)
+        refuse_joint(
+            "positions", positions > high, positions, names, "rad is above the limit", high
+        )
     if velocity_max is None:
         return
     limit = joint_limit("velocity_max", velocity_max, names)
     if trajectory.velocities is not None:
         speeds = np.abs(trajectory.velocities)
         problem = "rad/s is beyond the speed limit"
-        _refuse("velocities", speeds > limit, trajectory.velocities, names, problem, limit)
+        refuse_joint("velocities", speeds > limit, trajectory.velocities, names, problem, limit)
     mean = np.diff(positions, axis=0) / (np.diff(trajectory.times_ns) / SECOND)[:, None]
     fast = np.abs(mean) > limit * (1.0 + SPEED_ROUNDING)
     problem = "rad/s on average from the point before is beyond the speed limit"
-    _refuse("positions", fast, mean, names, problem, limit, "give it more time", 1)
-
-
-def _refuse(field, bad, values, names, problem, limit, hint="", first=0):
-    """Refuse the first bad one of the values (k, n) of points from `first` on; `limit` is (n,)."""
-    found = np.argwhere(bad)
-    if found.size:
-        index, joint = (int(i) for i in found[0])
-        raise TrajectoryError(
-            problem,
-            field=f"points[{first + index}].{field} of joint {names[joint]}",
-            value=float(values[index, joint]),
-            limit=float(limit[joint]),
-            hint=hint,
-        )
+    refuse_joint("positions", fast, mean, names, problem, limit, "give it more time", 1)

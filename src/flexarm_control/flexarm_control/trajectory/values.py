@@ -43,15 +43,17 @@ def per_joint(name, values, joint_names):
     return array
 
 
-def refuse_joint(name, bad, values, joint_names, problem, limit=None, hint=""):
-    """Refuse the first of the values (n,) that is bad, by its joint; `limit` may be (n,)."""
-    if np.any(bad):
-        joint = int(np.argmax(bad))
+def refuse_joint(name, bad, values, joint_names, problem, limit=None, hint="", first=0):
+    """Refuse the first bad one of the values (n,), or (k, n) of points from `first` on; `limit` may be (n,)."""
+    found = np.argwhere(bad)
+    if found.size:
+        *point, joint = found[0]
         limit = float(limit[joint]) if isinstance(limit, np.ndarray) else limit
+        where = f"points[{first + point[0]}].{name}" if point else name
         raise TrajectoryError(
             problem,
-            field=f"{name} of joint {joint_names[joint]}",
-            value=float(values[joint]),
+            field=f"{where} of joint {joint_names[joint]}",
+            value=float(values[tuple(found[0])]),
             limit=limit,
             hint=hint,
         )
