@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.loop.samples import ArmSample
-from flexarm_control.observers.arm_observer import observe
+from flexarm_control.observers.arm_observer import OBSERVERS, observe
+from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import MessageError, ModelError
@@ -36,7 +37,10 @@ def observed(arm, name="filtered_derivative", **options):
 
 def state(core):
     o = core.observer
-    return np.concatenate([core.velocity, o.amplitude, o.rate, o.innovation, [o.converged]])
+    joints = core.position, core.velocity
+    return np.concatenate(
+        [*joints, o.amplitude, o.rate, o.innovation, o.covariance_diagonal, [o.converged]]
+    )
 
 
 # --------------------------------------------------------------------------- strains
@@ -74,7 +78,7 @@ def test_an_arm_with_a_mode_that_it_does_not_observe_is_refused():
 # --------------------------------------------------------------------------- order of samples
 
 
-@pytest.mark.parametrize("name", ["filtered_derivative", "luenberger", "true_rates"])
+@pytest.mark.parametrize("name", registry.names(OBSERVERS))
 def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
     core = observed(arm_r, name)
     for k in range(20):
@@ -82,7 +86,8 @@ def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
         once, known = state(core), core.observer.converged
         for _ in range(3):
             # what it carries does not matter: it is known
-            assert core.step(sample(k, rate=[9.0, 9.0], amplitude=[0.5, 0.5])) is known
+            again = sample(k, rate=[9.0, 9.0], amplitude=[0.5, 0.5], position=[9.0])
+            assert core.step(again) is known
         assert_array_equal(state(core), once)
     fresh = observed(arm_r, name)
     for k in range(20):
@@ -180,14 +185,15 @@ def test_a_bad_joint_velocity_does_not_matter_where_none_was_given(arm_r):
     assert_array_equal(core.velocity, [0.0])
 
 
-def test_a_sample_that_the_observer_refuses_leaves_nothing_behind(arm_r):
+@pytest.mark.parametrize("name", ["luenberger", "kalman", "extended_kalman"])
+def test_a_sample_that_the_observer_refuses_leaves_nothing_behind(arm_r, name):
     """Its time step neither: the next estimate is the one of a stream that never had it."""
-    core, clean = observed(arm_r, "luenberger"), observed(arm_r, "luenberger")
+    core, clean = observed(arm_r, name), observed(arm_r, name)
     for k in range(30):
         args = {"velocity_known": False, "position": [0.01 * k**2]}
         if k == 12:
             for _ in range(2):  # sent again, it is refused again
-                with pytest.raises(MessageError, match="joint_torque: is unknown"):
+                with pytest.raises(MessageError, match=f"joint_torque: is unknown.*{name}"):
                     core.step(sample(k, torque=[np.nan], **args))
                 assert_array_equal(state(core), state(clean))
             continue

@@ -257,51 +257,6 @@ def test_without_noise_the_estimate_is_exact_whatever_the_steps_and_gaps(linear)
         assert_allclose(observer.state, x, atol=1e-6 * max(np.abs(x).max(), 1.0))
 
 
-@pytest.mark.parametrize("name", ["kalman", "extended_kalman"])
-def test_a_repeated_sample_changes_nothing(arm_r, name):
-    core = observe(arm_r, name, {})
-    for k in range(6):
-        known = core.step(numbered(k))
-        arrays = core.observer.state, core.observer.covariance, core.position
-        before = [array.copy() for array in arrays]
-        again = numbered(k)
-        again.position += 0.1
-        assert core.step(again) is known
-        for array, wanted in zip(arrays, before, strict=True):
-            assert_array_equal(array, wanted)
-
-
-@pytest.mark.parametrize("name", ["kalman", "extended_kalman"])
-def test_after_a_reset_a_filter_is_as_new(arm_r, name):
-    def run(observer):
-        out = []
-        for k in range(60):
-            observer.update(numbered(k), H if k else 0.0)
-            p = list(observer.parameters_estimated.values())
-            out.append([*observer.state, *observer.covariance_diagonal, *p, observer.converged])
-        return np.array(out)
-
-    observer = design_observer(name, arm_r, {})
-    first = run(observer)
-    assert observer.converged
-    observer.reset()
-    assert not observer.converged
-    assert_array_equal(run(observer), first)
-
-
-@pytest.mark.parametrize("name", ["kalman", "extended_kalman"])
-def test_an_unknown_torque_is_refused_and_leaves_nothing_behind(arm_r, name):
-    observer = design_observer(name, arm_r, {})
-    observer.update(numbered(0), 0.0)
-    observer.update(numbered(1), H)
-    before = observer.state.copy()
-    s = numbered(2)
-    s.torque[:] = np.nan
-    with pytest.raises(MessageError, match=f"joint_torque: is unknown.*{name} predicts"):
-        observer.update(s, H)
-    assert_array_equal(observer.state, before)
-
-
 def test_a_redesigned_filter_goes_on_from_the_old_ones_state(arm_r):
     old, new = (design_observer("kalman", arm_r, {"torque_noise": [v]}) for v in (0.01, 0.02))
     for k in range(40):

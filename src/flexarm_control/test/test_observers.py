@@ -9,11 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
 from flexarm_control.loop.samples import ArmSample
-from flexarm_control.observers.arm_observer import design_observer
+from flexarm_control.observers.arm_observer import OBSERVERS, design_observer
+from flexarm_dynamics import registry
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.singular_perturbation import fast_subsystem
-
-NAMES = ("true_rates", "filtered_derivative", "luenberger")
 
 
 def sample(amplitude, rate=None, torque=0.0, position=0.0, velocity=0.0):
@@ -220,14 +219,16 @@ def test_true_rates_without_rates_says_what_to_do(arm_r):
 # --------------------------------------------------------------------------- all of them
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", registry.names(OBSERVERS))
 def test_after_a_reset_an_observer_is_as_new(arm_r, name):
     def run(observer):
         estimates = []
-        for k in range(30):
-            amplitude = [0.01 * np.sin(0.1 * k), 0.001 * k]
-            observer.update(sample(amplitude, [0.1, k], 0.5), 1e-3 if k else 0.0)
-            estimates.append([*observer.amplitude, *observer.rate, observer.converged])
+        for k in range(60):
+            amplitude = [1e-3 * np.sin(0.3 * k), 1e-3 * np.sin(0.3 * k)]
+            observer.update(sample(amplitude, [0.1, k], 0.5, 0.01 * k, 5.0), 2e-3 if k else 0.0)
+            estimate = [*observer.amplitude, *observer.rate, *observer.covariance_diagonal]
+            parameters = observer.parameters_estimated.values()
+            estimates.append([*estimate, *parameters, observer.converged])
         return np.array(estimates)
 
     observer = design_observer(name, arm_r, {})
@@ -239,7 +240,7 @@ def test_after_a_reset_an_observer_is_as_new(arm_r, name):
     assert_array_equal(run(observer), first)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["true_rates", "filtered_derivative", "luenberger"])
 def test_an_observer_keeps_no_hold_on_the_callers_arrays(arm_r, name):
     observer, s = design_observer(name, arm_r, {}), sample([0.1, 0.2], [3.0, 4.0])
     observer.update(s, 0.0)
