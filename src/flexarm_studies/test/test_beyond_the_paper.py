@@ -21,17 +21,18 @@ MANIFOLD = {"type": "corrected"}
 LIMIT = [3.2 * POUND_FORCE_FOOT]
 
 
-def case(feedforward, observer=None, simulator=None, arm="R"):
-    """Metrics of the case study under the default control."""
-    loop = ClosedLoop(
-        arm,
-        SLOW,
-        FAST,
+def default_loop(controller, observer=None, simulator=None, arm="R"):
+    """The loop under the default control, with true rates unless there is another observer."""
+    observer, simulator = (
         observer or {"type": "true_rates"},
         {"publish_rates": True} | (simulator or {}),
-        {"feedforward": feedforward, "torque_limit": LIMIT},
-        MANIFOLD,
     )
+    return ClosedLoop(arm, SLOW, FAST, observer, simulator, controller, MANIFOLD)
+
+
+def case(feedforward, *others):
+    """Metrics of the case study under the default control; `others` are those of `default_loop`."""
+    loop = default_loop({"feedforward": feedforward, "torque_limit": LIMIT}, *others)
     record = loop.run(case_study.paper_trajectory(loop.model.joint_names), 8.0)
     assert not loop.unprepared
     return metrics.case_study_metrics(record, loop.model, until=8.0)
@@ -72,14 +73,8 @@ TWO_LINK = {
 
 def test_two_soft_links_come_to_rest_with_the_trajectory():
     """60 deg in 2 s, a period of the lowest mode with the joints locked."""
-    _, found = run(
-        Scenario(
-            "two_link",
-            TWO_LINK | {"feedforward": "preview"},
-            "quintic:to=1.0472;1.0472,duration=2",
-            window=1.5,
-        )
-    )
+    motion, values = "quintic:to=1.0472;1.0472,duration=2", TWO_LINK | {"feedforward": "preview"}
+    _, found = run(Scenario("two_link", values, motion, window=1.5))
     assert not found["lost"]
     assert found["settling_time_s"] == pytest.approx(0.05)
     assert found["residual_tip_rms_mm"] < 1.0
@@ -88,25 +83,15 @@ def test_two_soft_links_come_to_rest_with_the_trajectory():
 @pytest.mark.parametrize("payload", [0.0, 2.0, 3.0])
 def test_an_unknown_payload(payload):
     """Stays stable and settles, on the paper's arm."""
-    _, found = run(
-        Scenario(
-            "R",
-            {"observer.type": "true_rates"},
-            "paper",
-            payload_scale=payload,
-            window=4.5,
-        )
-    )
+    values = {"observer.type": "true_rates"}
+    _, found = run(Scenario("R", values, "paper", rate=500.0, payload_scale=payload, window=4.5))
     assert not found["lost"]
     assert found["final_tip_error_mm"] < 1.0
     assert np.isfinite(found["settling_time_s"])
 
 
 def test_a_plan_that_the_torque_does_not_allow_is_reported_and_skipped():
-    loop = ClosedLoop(
-        "R", SLOW, FAST, {"type": "true_rates"}, {"publish_rates": True},
-        {"feedforward": "preview", "torque_limit": [2.0]}, MANIFOLD,
-    )  # fmt: skip
+    loop = default_loop({"feedforward": "preview", "torque_limit": [2.0]})
     loop.follow(case_study.paper_trajectory(loop.model.joint_names), 0.2)
     assert (
         "no motion within the torque limits" in loop.unprepared and "([2.0] N m)" in loop.unprepared
@@ -115,10 +100,7 @@ def test_a_plan_that_the_torque_does_not_allow_is_reported_and_skipped():
 
 def test_a_gap_in_the_samples_does_not_shake_the_simulated_arm():
     """The model runs over the true time step: three samples lost on the way change next to nothing."""
-    loop = ClosedLoop(
-        "R", SLOW, FAST, {"type": "true_rates"}, {"publish_rates": True},
-        {"feedforward": "model"}, MANIFOLD,
-    )  # fmt: skip
+    loop = default_loop({"feedforward": "model"})
     motion = case_study.paper_trajectory(loop.model.joint_names)
     loop._answer()
     assert loop.controller.offer(motion).accepted
@@ -137,6 +119,7 @@ def test_a_gap_in_the_samples_does_not_shake_the_simulated_arm():
 def test_an_unknown_payload_is_learnt_by_the_second_time(payload):
     """Peak joint error below 0.5 deg the second time, of 0.8 to 1.9 deg the first."""
     values = parameters("adaptive") | {"observer.type": "true_rates"}
-    _, found = run(Scenario("R", values, "paper", payload_scale=payload, repeat=2, window=1.5))
+    motion = Scenario("R", values, "paper", rate=500.0, payload_scale=payload, repeat=2, window=1.5)
+    _, found = run(motion)
     first, second = (np.degrees(p["peak_joint_error_rad"][0]) for p in found["passes"])
     assert second < 0.5 < first

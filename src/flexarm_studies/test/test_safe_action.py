@@ -11,14 +11,13 @@ from flexarm_studies.loop import scenario
 
 #: Of a driver: the last torque acts for so long yet [s].
 TORQUE_TIMEOUT = 0.05
+#: Parameters beyond the shipped ones, and the move; without a plan of the motion, which takes seconds.
+PAPER = {"feedforward": "none", "manifold.type": "quasi_steady"}
 MOVES = {
-    "R": (
-        {"feedforward": "none", "manifold.type": "quasi_steady"},
-        "quintic:to=1.57,duration=2",
-    ),
-    "two_link": (None, "quintic:to=1.047;1.047,duration=2"),
+    "R": (PAPER, "quintic:to=1.57,duration=2"),
+    "two_link": ({"feedforward": "none"}, "quintic:to=1.047;1.047,duration=2"),
     "long_reach": (
-        None,
+        {"feedforward": "none"},
         "quintic:from=0;1.2;0.8;-0.8,to=1.0472;0.1528;1.8472;0.2472,duration=2",
     ),
 }
@@ -29,7 +28,8 @@ def broken_off(name, time, **joint):
     arm = arm_file.load(name)
     arm = replace(arm, joints=tuple(replace(j, **joint) for j in arm.joints))
     values, motion = MOVES[name]
-    values = scenario.parameters(name) if values is None else values
+    if name != "R":
+        values = scenario.parameters(name) | values
     run = scenario.Scenario(arm, controller=values, trajectory=motion, duration=time)
     loop = scenario.run_loop(run)[2]
     assert not loop.lost
