@@ -21,6 +21,8 @@ from flexarm_dynamics.models.model import ArmModel
 from flexarm_dynamics.processes import end_with, step_back
 
 _MODEL = "model"
+#: What pickle raises for things that can't be sent.
+NOT_SENT = (pickle.PicklingError, TypeError, AttributeError)
 
 
 class AwayError(DesignError):
@@ -55,10 +57,7 @@ class _Unpickler(pickle.Unpickler):
 def dumps(thing, arm):
     """A `thing`, such as a law or a plan, as bytes without the models of `arm`.
 
-    Raises
-    ------
-    pickle.PicklingError, TypeError, AttributeError
-        For what can't be sent, such as a law with a model of another arm.
+    What can't be sent, such as a law with a model of another arm, raises one of `NOT_SENT`.
     """
     file = io.BytesIO()
     _Pickler(file, arm).dump(thing)
@@ -88,9 +87,7 @@ def _work(function, data):
 
 
 class DesignProcess:
-    """Calls functions in a second process that has a model of the same arm, one after the other.
-
-    Called from threads that may wait.
+    """Calls functions in a second process that has a model of the same arm, one after the other; its callers may wait.
 
     The process is started by the first call, and again after it has died. It ends with `close`, with the thread
     that made the first call, and with this process.
@@ -112,16 +109,7 @@ class DesignProcess:
     def call(self, function, *arguments):
         """``function(model, *arguments)`` in the process.
 
-        Parameters
-        ----------
-        function : callable
-            A function of a module.
-        *arguments
-            They can be pickled, models of this arm aside; so can the result.
-
-        Returns
-        -------
-        object
+        The `function` is one of a module; the `arguments` and the result can be pickled, models of this arm aside.
 
         Raises
         ------
@@ -139,7 +127,7 @@ class DesignProcess:
             raise AwayError(
                 "the process that designs has died (killed, or out of memory); a new one is started for the next design"
             ) from None
-        except (pickle.PicklingError, TypeError, AttributeError) as error:
+        except NOT_SENT as error:
             raise AwayError(f"this design can't be sent to another process: {error}") from error
 
     def _running(self):

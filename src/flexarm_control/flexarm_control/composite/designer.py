@@ -50,23 +50,7 @@ class Designer:
                     self._warn(str(error))
 
     def design(self, values):
-        """The control that flat parameters describe, as `assembly.control`.
-
-        Parameters
-        ----------
-        values : mapping
-
-        Returns
-        -------
-        CompositeControl
-
-        Raises
-        ------
-        FlexarmError
-            What the design raises.
-        CancelledError
-            After `close`.
-        """
+        """The control that flat parameters describe, as `assembly.control`; a `CancelledError` after `close`."""
         try:
             return self._in_process(control, values)
         except AwayError:
@@ -74,19 +58,7 @@ class Designer:
             return control(build(self.model.arm), values)
 
     def prepare(self, feedforward, trajectory, start):
-        """As `Feedforward.prepare`; errors as for `design`.
-
-        Parameters
-        ----------
-        feedforward : Feedforward
-        trajectory : JointTrajectoryData
-        start : ndarray, shape (3, n)
-            Position, velocity and acceleration of the reference where the trajectory begins.
-
-        Returns
-        -------
-        object or None
-        """
+        """What `Feedforward.prepare` makes of the same arguments; a `CancelledError` after `close`."""
         try:
             return self._in_process(prepare, feedforward, trajectory, start)
         except AwayError:

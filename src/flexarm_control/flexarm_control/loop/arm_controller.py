@@ -133,12 +133,9 @@ class ArmController:
         return self.supervisor.reason or self._trajectory_reason
 
     def view(self):
-        """What there is to see of the last sample, by the field names of `CompositeState`.
+        """What there is to see of the last sample: arrays by the field names of `CompositeState`.
 
-        Returns
-        -------
-        dict of str to ndarray
-            Reference and torque; errors, parts of the torque and deflections are 0.0 where no torque was computed.
+        Errors, parts of the torque and deflections are 0.0 where no torque was computed.
         """
         reference, law = self.reference, self.answered_by
         computed = {
@@ -179,21 +176,14 @@ class ArmController:
         return self.law.feedforward.prepare(trajectory, start)
 
     def offer(self, trajectory, plan=None):
-        """Offer a trajectory.
+        """Offer a `trajectory`, with the `plan` that `prepare` made for it; a refusal is kept in `reason`.
 
         While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
         explicit start passes before that is given up.
 
-        Parameters
-        ----------
-        trajectory : JointTrajectoryData
-        plan : object, optional
-            What `prepare` made for it.
-
         Returns
         -------
         Verdict
-            Refusals are kept in `reason`; repeats are none.
         """
         if self.state == State.FAULT:
             verdict = Verdict(False, f"in fault, call ~/recover first: {self.supervisor.reason}", 0)
@@ -284,11 +274,8 @@ class ArmController:
 
     def _fast_fraction(self, fraction, dt):
         """Fraction of the fast torque that is applied: it follows `enable_fast` in a ramp."""
-        goal = 1.0 if self.fast_enabled else 0.0
-        if fraction == goal:
-            return goal
-        step = dt / FAST_RAMP
-        return min(goal, fraction + step) if goal > fraction else max(goal, fraction - step)
+        goal, step = float(self.fast_enabled), dt / FAST_RAMP
+        return min(max(goal, fraction - step), fraction + step)
 
     def warm_up(self):
         """Run three samples and a trajectory on a second controller, so that compiled code is loaded."""
@@ -310,12 +297,8 @@ class ArmController:
     def brake(self, reason):
         """Bring the reference to rest smoothly, and hold it there; trajectories are given up.
 
-        The `reason` is what the log and the controller's state then give.
-
-        Returns
-        -------
-        bool
-            False where there is no torque to do it with: nothing has changed.
+        The log and the controller's state give the `reason`. False where there is no torque to do it with: nothing
+        has changed.
         """
         if not self.enabled:
             return False

@@ -47,15 +47,9 @@ class ObserverStatistics:
             self._innovation.add(self._size.max(initial=0.0))
 
     def diagnose(self, core, name, active):
-        """Return level, message and values of the last second.
+        """Level, message and values of the last second; `core` is the `ArmObserver`, whose observer has this `name`.
 
-        Parameters
-        ----------
-        core : ArmObserver
-        name : str
-            Of the observer.
-        active : bool
-            Whether the node is active.
+        `active` says whether the node is.
         """
         observer = core.observer
         rate, self._samples_before = self._samples - self._samples_before, self._samples

@@ -16,24 +16,7 @@ MAX_POINTS = 10_000
 
 
 def read(raw, arm):
-    """A serialised message as data that the arm can follow.
-
-    Parameters
-    ----------
-    raw : bytes
-        A serialised `JointTrajectory`.
-    arm : Arm
-        Its joints and their limits.
-
-    Returns
-    -------
-    JointTrajectoryData
-
-    Raises
-    ------
-    TrajectoryError
-        For anything that is no trajectory of this arm.
-    """
+    """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be."""
     try:
         count = trajectory_points(raw)
         if count > MAX_POINTS:

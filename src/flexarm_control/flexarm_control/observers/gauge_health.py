@@ -175,16 +175,11 @@ class GaugeHealth:
         self.health[suspect] = SUSPECT
 
     def amplitudes(self, strain, out=None):
-        """Modal amplitudes from the usable gauges, shape (modes,) [m, rad].
+        """Modal amplitudes from the usable gauges, shape (modes,) [m, rad]; `strain` and `out` as in `StrainMap`.
 
-        Raises
-        ------
-        MessageError
-            If these don't give all observed modes; with gauges and modes.
+        A `MessageError` names gauges and modes if the usable ones don't give all observed modes.
         """
-        self.lost = ()
-        if self._holding:
-            self.lost = self._left_out(strain)
+        self.lost = self._left_out(strain) if self._holding else ()
         return self.strain_map.amplitudes_without(self.lost, strain, out)
 
     def _left_out(self, strain):
@@ -270,12 +265,8 @@ class BiasCalibration:
     def bias(self):
         """The new bias, shape (gauges,) [strain].
 
-        Raises
-        ------
-        MessageError
-            If there are too few samples, a gauge is bad, or the arm is not at rest.
-        ModelError
-            If the arm has no static deflection here.
+        A `MessageError` if there are too few samples, a gauge is bad, or the arm is not at rest; a `ModelError` if it
+        has no static deflection here.
         """
         if self.count < self.samples:
             raise MessageError(

@@ -225,15 +225,8 @@ class Kalman(Observer):
 def measurement_covariance(model, parameters, strain_map=None, lost=()):
     """R of joint positions and modal amplitudes, shape (n + m, n + m) [rad^2, m^2].
 
-    Parameters
-    ----------
-    model : ArmModel
-    parameters : mapping
-        ``strain_noise``, ``position_noise`` and ``amplitude_noise``.
-    strain_map : StrainMap, optional
-        Of the model, if it exists already.
-    lost : tuple of int
-        Gauges that the amplitudes are made without; the others must suffice.
+    `parameters` are those of `NOISE`; the `strain_map` of the model is made if it does not exist already; the
+    amplitudes are made without the `lost` gauges, whose indices these are.
     """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))
