@@ -72,6 +72,20 @@ observed_modes: [fore_y_mode1, upper_y_mode1, upper_y_mode2]
 TREE = yaml.safe_load(FULL)
 
 
+def dumped(tree):
+    """As YAML, by the C library: ten times as fast."""
+    return yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True)
+
+
+def all_paths(node, path=()):
+    """Path of every node below the root."""
+    items = node.items() if isinstance(node, dict) else enumerate(node)
+    for key, child in items:
+        yield (*path, key)
+        if isinstance(child, (dict, list)):
+            yield from all_paths(child, (*path, key))
+
+
 def parent(tree, path):
     """The collection in which a path ends."""
     return reduce(getitem, path[:-1], tree)
@@ -81,13 +95,13 @@ def changed(path, value):
     """`FULL` with one field set; a path ends in a key or an index, value None-able."""
     tree = copy.deepcopy(TREE)
     parent(tree, path)[path[-1]] = value
-    return yaml.safe_dump(tree)
+    return dumped(tree)
 
 
 def without(path):
     tree = copy.deepcopy(TREE)
     del parent(tree, path)[path[-1]]
-    return yaml.safe_dump(tree)
+    return dumped(tree)
 
 
 def refused(text):
@@ -172,7 +186,7 @@ def test_observed_modes_come_in_the_order_of_the_modal_coordinates():
     assert arm.observed_modes == ("upper_y_mode1", "upper_y_mode2", "fore_y_mode1")
     tree = copy.deepcopy(TREE)  # all, unless the file names some
     del tree["observed_modes"], tree["gauges"]
-    arm = arm_file.parse(yaml.safe_dump(tree))
+    arm = arm_file.parse(dumped(tree))
     assert arm.observed_modes == arm.mode_names
 
 
@@ -264,7 +278,7 @@ def test_imperial_and_si_describe_the_same_arm():
     }
     gauge["position"] *= FOOT
     gauge["surface_distance"] *= FOOT
-    imperial, si = arm_file.parse(IMPERIAL), arm_file.parse(yaml.safe_dump(tree))
+    imperial, si = arm_file.parse(IMPERIAL), arm_file.parse(dumped(tree))
     for (path, a), (same, b) in zip(leaves(imperial), leaves(si), strict=True):
         assert path == same
         assert a == (pytest.approx(b, rel=1e-14) if isinstance(b, float) else b), path
@@ -276,7 +290,7 @@ def test_imperial_section_is_converted():
     link = tree["links"][0]
     del link["mass_per_length"], link["EI_y"]
     link["section"] = section | {"youngs_modulus": 1.44e9}
-    converted = arm_file.parse(yaml.safe_dump(tree)).links[0]
+    converted = arm_file.parse(dumped(tree)).links[0]
     assert converted.mass_per_length == pytest.approx(
         5.25 * 0.015625 * 0.0625 * POUND_FORCE / FOOT**2, rel=1e-13
     )
@@ -339,70 +353,25 @@ def test_errors_of_a_file_name_the_file_first(tmp_path):
 
 # --- what is refused ---------------------------------------------------------------------------
 
+COUNTS_AND_FLAGS = ("foreshortening", "finite_slope", "modes", "bits", "encoder_counts")
+ANY_SIGN = ("position", "surface_distance", "gain", "bias")
+ABOVE_ZERO = (
+    "gear_ratio", "smoothing", "velocity", "torque", "length", "mass_per_length", "EI_y", "EI_z", "GJ",
+    "size_y", "size_z", "density", "youngs_modulus", "full_scale",
+)  # fmt: skip
+#: Path of every number in `FULL`.
 NUMBERS = [
-    ("joints", 0, "hub_inertia"),
-    ("joints", 0, "motor_mass"),
-    ("joints", 0, "rotor_inertia"),
-    ("joints", 0, "gear_ratio"),
-    ("joints", 0, "friction", "viscous"),
-    ("joints", 0, "friction", "coulomb"),
-    ("joints", 0, "friction", "smoothing"),
-    ("joints", 0, "limits", "velocity"),
-    ("joints", 0, "limits", "torque"),
-    ("joints", 0, "brake_torque"),
-    ("joints", 0, "damp_coefficient"),
-    ("links", 0, "length"),
-    ("links", 0, "mass_per_length"),
-    ("links", 0, "EI_y"),
-    ("links", 0, "GJ"),
-    ("links", 0, "polar_inertia_per_length"),
-    ("links", 0, "flexible", "z", "damping"),
-    ("links", 1, "section", "size_y"),
-    ("links", 1, "section", "density"),
-    ("links", 1, "section", "youngs_modulus"),
-    ("payload", "mass"),
-    ("gauges", 0, "noise"),
-    ("gauges", 0, "full_scale"),
-    ("gauges", 0, "drift"),
+    path
+    for path in all_paths(TREE)
+    if isinstance(reduce(getitem, path, TREE), (int, float)) and path[-1] not in COUNTS_AND_FLAGS
 ]
-ANY_SIGN = [
-    ("gauges", 0, "position"),
-    ("gauges", 0, "surface_distance"),
-    ("gauges", 0, "gain"),
-    ("gauges", 0, "bias"),
-]
-POSITIVE = [
-    p
-    for p in NUMBERS
-    if p[-1]
-    in (
-        "gear_ratio",
-        "smoothing",
-        "velocity",
-        "torque",
-        "length",
-        "mass_per_length",
-        "EI_y",
-        "GJ",
-        "full_scale",
-    )
-    or "section" in p
-]
-IN_LISTS = [
-    ("gravity", 1),
-    ("joints", 0, "axis", 2),
-    ("joints", 0, "origin", "rpy", 0),
-    ("joints", 0, "limits", "position", 1),
-    ("links", 0, "flexible", "y", "damping", 1),
-    ("links", 0, "flexible", "z", "frequencies", 0),
-    ("payload", "inertia", 5),
-    ("payload", "offset", 0),
-]
+NOT_NEGATIVE = [p for p in NUMBERS if isinstance(p[-1], str) and p[-1] not in ANY_SIGN]
+POSITIVE = [p for p in NUMBERS if p[-1] in ABOVE_ZERO]
 #: One of each reader: a number, and one in a list.
 READERS = [("links", 0, "length"), ("gravity", 1)]
 
 
-@pytest.mark.parametrize("path", NUMBERS, ids=spelled)
+@pytest.mark.parametrize("path", NOT_NEGATIVE, ids=spelled)
 def test_a_negative_number_is_refused(path):
     assert refused(changed(path, -0.5)).startswith(f"{spelled(path)}: ")
 
@@ -414,7 +383,7 @@ def test_zero_is_refused_where_it_has_no_meaning(path):
     assert refused(changed(path, 1e-200)).endswith("is too small (at least 1e-30)")
 
 
-@pytest.mark.parametrize("path", NUMBERS + ANY_SIGN + IN_LISTS, ids=spelled)
+@pytest.mark.parametrize("path", NUMBERS, ids=spelled)
 def test_every_number_is_checked(path):
     field = re.escape(spelled(path))
     assert re.match(rf"{field}: nan is not finite$", refused(changed(path, math.nan)))
@@ -490,7 +459,7 @@ def test_a_misspelt_field_is_named_with_what_is_meant(path, wrong, hint):
     tree = copy.deepcopy(TREE)
     node = parent(tree, path)
     node[wrong] = node.pop(path[-1])
-    message = refused(yaml.safe_dump(tree))
+    message = refused(dumped(tree))
     missing = spelled(path) + ": missing"
     assert message.startswith((spelled((*path[:-1], wrong)) + ": no such field", missing))
     assert hint in message
@@ -543,11 +512,7 @@ def test_a_field_given_twice_is_refused(text, start):
         (("joints", 0, "origin"), [0, 0, 0], "a mapping is wanted, not a list"),
         (("joints", 0, "limits", "position"), [1.0, -1.0], "low must be below high"),
         (("joints", 0, "limits", "position"), [1.0, 1.0], "low must be below high"),
-        (
-            ("joints", 0, "safe_action"),
-            "stop",
-            "'stop' is not one of the choices (brake, damp, zero)",
-        ),
+        (("joints", 0, "safe_action"), "stop", "'stop' is not one of the choices (brake, damp, zero)"),
         (("joints", 0, "encoder_counts"), 1.5, "1.5 is not an integer"),
         (("joints", 0, "encoder_counts"), True, "True is not an integer"),
         (("joints", 0, "encoder_counts"), -1, "-1 is out of range (0 to"),
@@ -556,16 +521,8 @@ def test_a_field_given_twice_is_refused(text, start):
         (("links", 0, "flexible", "y", "modes"), 0, "0 is out of range (1 to 20)"),
         (("links", 0, "flexible", "y", "modes"), 21, "21 is out of range (1 to 20)"),
         (("links", 0, "flexible", "y", "modes"), 2.0, "2.0 is not an integer"),
-        (
-            ("links", 0, "flexible", "y", "shape"),
-            "free",
-            "is not one of the choices (clamped_free, loaded",
-        ),
-        (
-            ("links", 0, "flexible", "y", "damping"),
-            [0.1, 1.0],
-            "is out of range (from 0 to below 1)",
-        ),
+        (("links", 0, "flexible", "y", "shape"), "free", "is not one of the choices (clamped_free, loaded"),
+        (("links", 0, "flexible", "y", "damping"), [0.1, 1.0], "is out of range (from 0 to below 1)"),
         (("links", 0, "flexible", "y", "damping"), [-0.1], "is out of range (from 0 to below 1)"),
         (("links", 0, "flexible", "z", "frequencies"), [11.0, 2.0], "positive and ascending"),
         (("links", 0, "flexible", "z", "frequencies"), [2.0, 2.0], "positive and ascending"),
@@ -573,30 +530,18 @@ def test_a_field_given_twice_is_refused(text, start):
         (("links", 0, "flexible", "z", "frequencies"), [], "0 frequencies for 1 modes"),
         (("links", 0, "flexible", "z", "frequencies"), 2.0, "a list of 1 numbers is wanted"),
         (("links", 0, "flexible", "x"), {"modes": 1}, "no such field"),
-        (
-            ("links", 1, "section", "shape"),
-            "disc",
-            "'disc' is not one of the choices (rectangle, tube)",
-        ),
+        (("links", 1, "section", "shape"), "disc", "'disc' is not one of the choices (rectangle, tube)"),
         (("links", 1, "EI_y"), 1.0, "beside a section; give either a section or the stiffnesses"),
         (("links", 1, "mass_per_length"), 1.0, "give either a section or the stiffnesses"),
         (("payload", "inertia"), -1.0, "not positive semi-definite"),
         (("payload", "inertia"), [1.0, 1.0, 1.0], "a list of 6 numbers is wanted, not 3 values"),
         (("payload", "inertia"), [1, 1, 1, 2, 0, 0], "not positive semi-definite"),
-        (
-            ("gauges", 0, "link"),
-            "uper",
-            "'uper' is not one of the choices (upper, fore); did you mean 'upper'?",
-        ),
+        (("gauges", 0, "link"), "uper", "'uper' is not one of the choices (upper, fore); did you mean 'upper'?"),
         (("gauges", 0, "position"), 1.3, "1.3 m is outside upper (0 to 1.2 m)"),
         (("gauges", 0, "position"), -0.1, "-0.1 m is outside upper"),
         (("gauges", 0, "direction"), "x", "'x' is not one of the choices (y, z, twist)"),
         (("gauges", 0, "surface_distance"), 0.0, "a gauge on the neutral axis sees nothing"),
-        (
-            ("gauges", 0, "surface_distance"),
-            2.0,
-            "at most half the length of upper, 0.6 m); in mm?",
-        ),
+        (("gauges", 0, "surface_distance"), 2.0, "at most half the length of upper, 0.6 m); in mm?"),
         (("gauges", 0, "gain"), 0.0, "such a gauge sees nothing"),
         (("gauges", 0, "bits"), -1, "-1 is out of range (0 to 32)"),
         (("gauges", 0, "bits"), 33, "33 is out of range (0 to 32)"),
@@ -615,7 +560,7 @@ def test_a_field_given_twice_is_refused(text, start):
         (("finite_slope",), 1, "1 is neither true nor false"),
     ],
     ids=lambda v: spelled(v) if isinstance(v, tuple) else None,
-)
+)  # fmt: skip
 def test_a_value_without_meaning_is_refused(path, value, words):
     message = refused(changed(path, value))
     assert message.startswith(f"{spelled(path)}: ")
@@ -655,9 +600,9 @@ def test_the_appendix_needs_its_section():
     assert refused(changed(("model",), "paper_appendix")).startswith("paper_appendix: missing")
     tree = copy.deepcopy(TREE)
     tree["model"], tree["paper_appendix"] = "paper_appendix", {"beam_mass": 0.3}
-    assert refused(yaml.safe_dump(tree)).startswith("paper_appendix.beam_inertia: missing")
+    assert refused(dumped(tree)).startswith("paper_appendix.beam_inertia: missing")
     tree["paper_appendix"]["beam_inertia"] = 0.1
-    options = arm_file.parse(yaml.safe_dump(tree)).model_options
+    options = arm_file.parse(dumped(tree)).model_options
     assert options == {"beam_mass": 0.3, "beam_inertia": 0.1, "m23_fit": 0.0}
 
 
@@ -746,15 +691,6 @@ JUNK = st.recursive(
 )
 
 
-def all_paths(node, path=()):
-    """Path of every node below the root."""
-    items = node.items() if isinstance(node, dict) else enumerate(node)
-    for key, child in items:
-        yield (*path, key)
-        if isinstance(child, (dict, list)):
-            yield from all_paths(child, (*path, key))
-
-
 BASES = [TREE, yaml.safe_load(IMPERIAL)]
 KEYS = sorted({p[-1] for base in BASES for p in all_paths(base) if isinstance(p[-1], str)})
 
@@ -792,7 +728,7 @@ def test_a_damaged_file_gives_an_arm_or_an_arm_file_error(data):
     for _ in range(data.draw(st.integers(1, 3))):
         if any(True for _ in all_paths(tree)):
             mutate(data.draw, tree)
-    text = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True)
+    text = dumped(tree)
     try:
         arm = arm_file.parse(text)
     except ArmFileError as error:
@@ -845,7 +781,7 @@ def test_a_joint_that_turns_without_moving_mass_is_refused_by_path():
     data["joints"][1] |= {"axis": [1, 0, 0], "hub_inertia": 0.0}
     data["payload"] = {}
     with pytest.raises(ModelError) as error:
-        model.build(arm_file.parse(yaml.safe_dump(data)))
+        model.build(arm_file.parse(dumped(data)))
     assert (error.value.field, error.value.value) == ("joints[1]", "joint2")
 
 

@@ -74,11 +74,64 @@ def rotation(rpy):
     return Rotation.from_euler("xyz", rpy).as_matrix()
 
 
+def quadrature(count):
+    """Gauss's points and weights on [0, 1]."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return (nodes + 1.0) / 2.0, weights / 2.0
+
+
+def inertia_matrix(six):
+    """An inertia from its six numbers in the file's order."""
+    xx, yy, zz, xy, xz, yz = six
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def random_inertia(rng, size):
-    """Inertia of a random rigid body, as a matrix; its six numbers in the file's order."""
+    """Inertia of a random rigid body, six numbers."""
     points = size * rng.standard_normal((4, 3))
     matrix = sum((p @ p) * np.eye(3) - np.outer(p, p) for p in points)
-    return matrix, [matrix[i] for i in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    return np.append(np.diag(matrix), matrix[[0, 0, 1], [1, 2, 2]])
+
+
+def stiffnesses(rng):
+    """Random EI and GJ of a link."""
+    return {key: rng.uniform(2, 9) for key in ("EI_y", "EI_z", "GJ")}
+
+
+def rigid_arm(rng, count):
+    """A random arm of `count` rigid links, as the file's dicts."""
+
+    def origin():
+        return {"xyz": rng.uniform(-0.3, 0.3, 3), "rpy": rng.uniform(-3.0, 3.0, 3)}
+
+    joints = [
+        {
+            "name": f"joint{i + 1}",
+            "axis": rng.standard_normal(3),
+            "origin": origin(),
+            "hub_inertia": rng.uniform(0.01, 0.2),
+            "motor_mass": rng.uniform(0.0, 2.0),
+            "rotor_inertia": rng.uniform(1e-4, 1e-3),
+            "gear_ratio": rng.uniform(1.0, 12.0),
+        }
+        for i in range(count)
+    ]
+    links = [
+        {
+            "name": f"link{i + 1}",
+            "length": rng.uniform(0.1, 1.2),
+            "mass_per_length": rng.uniform(0.2, 3.0),
+            "polar_inertia_per_length": rng.uniform(1e-4, 1e-2),
+        }
+        for i in range(count)
+    ]
+    payload = {
+        "mass": rng.uniform(0.1, 2.0),
+        "inertia": random_inertia(rng, 0.1),
+        "offset": rng.uniform(-0.3, 0.3, 3),
+    }
+    gravity = rng.uniform(-10.0, 10.0, 3)
+    return {"joints": joints, "links": links, "payload": payload, "gravity": gravity}
 
 
 # --- a) two flexible links in a plane, against sympy -------------------------------------------
@@ -107,57 +160,27 @@ class Planar:
         self.base = rotation(rpy) @ turn  # plane of motion -> base frame of the file
         self.start = rng.uniform(-0.5, 0.5, 3)
         across = rng.uniform(-10.0, 10.0) * gravity  # felt by the bearings alone
-        joints, links = [], []
-        for i, shape in enumerate(SHAPES[shapes]):
-            joints.append(
-                {
-                    "name": f"joint{i + 1}",
-                    "axis": axis,
-                    "hub_inertia": rng.uniform(0.01, 0.2),
-                    "rotor_inertia": rng.uniform(1e-4, 1e-3),
-                    "gear_ratio": rng.uniform(5.0, 12.0),
-                    "motor_mass": rng.uniform(0.1, 2.0),
-                }
-            )
+        data = rigid_arm(rng, 2)
+        for joint, link, shape in zip(data["joints"], data["links"], SHAPES[shapes], strict=True):
             bending = {"modes": 2, "shape": shape}
             if shape == "from_frequencies":
                 bending["frequencies"] = np.sort(rng.uniform([1.0, 15.0], [10.0, 60.0]))
-            links.append(
-                {
-                    "name": f"link{i + 1}",
-                    "length": rng.uniform(0.5, 1.5),
-                    "mass_per_length": rng.uniform(0.2, 2.0),
-                    "polar_inertia_per_length": rng.uniform(1e-4, 1e-3),
-                    "EI_y": rng.uniform(2.0, 9.0),
-                    "EI_z": rng.uniform(2.0, 9.0),
-                    "GJ": rng.uniform(2.0, 9.0),
-                    "flexible": {
-                        direction: bending,
-                        **{other: {"modes": 2, "shape": "clamped_free"} for other in others},
-                    },
-                }
-            )
+            flexible = {direction: bending, **{other: {"modes": 2} for other in others}}
+            joint |= {"axis": axis, "origin": {}}
+            link |= {"length": rng.uniform(0.5, 1.5), **stiffnesses(rng), "flexible": flexible}
+        joints, links, payload = data["joints"], data["links"], data["payload"]
         joints[0]["origin"] = {"xyz": self.start, "rpy": rpy}
-        inertia, six = random_inertia(rng, 0.1)
+        payload["offset"][1:] = 0.0
         if others:  # a payload that is its own mirror image in the plane
-            inertia = np.diag(np.diag(inertia))
-            six = [*np.diag(inertia), 0.0, 0.0, 0.0]
-        payload = {
-            "mass": rng.uniform(0.1, 1.0),
-            "inertia": six,
-            "offset": [rng.uniform(-0.3, 0.3), 0, 0],
-        }
-        in_plane = [gx, gy, 0.0 if others else across]
-        self.chain = build(
-            {"gravity": self.base @ in_plane, "joints": joints, "links": links, "payload": payload}
-        )
-        data = [
-            self._link(joint, link, direction) for joint, link in zip(joints, links, strict=True)
-        ]
+            payload["inertia"][3:] = across = 0.0
+        data["gravity"] = self.base @ [gx, gy, across]
+        self.chain = build(data)
+        inertia = inertia_matrix(payload["inertia"])
         normal = turn[:, 2]
         self.twin = symbolic.TwoLink(
-            tuple(data), payload["mass"], normal @ inertia @ normal, payload["offset"][0], (gx, gy)
-        )
+            tuple(self._link(*pair, direction) for pair in zip(joints, links, strict=True)),
+            payload["mass"], normal @ inertia @ normal, payload["offset"][0], (gx, gy),
+        )  # fmt: skip
         wanted = [f"link{i}_{direction}_mode{k}" for i in (1, 2) for k in (1, 2)]
         names = list(self.chain.mode_names)
         self.modes = np.array([names.index(name) for name in wanted])
@@ -167,8 +190,7 @@ class Planar:
     def _link(self, joint, link, direction):
         """Integrals by a quadrature of our own: `ModeShapes` only says what the shapes are."""
         shapes = self.chain.mode_shapes(link["name"], direction)
-        nodes, weights = np.polynomial.legendre.leggauss(100)
-        xi, weights = (nodes + 1.0) / 2.0, weights / 2.0
+        xi, weights = quadrature(100)
         phi, bend = shapes(xi), shapes(xi, 2)
         return symbolic.LinkData(
             length=link["length"],
@@ -311,42 +333,6 @@ def test_planar_control_model(seed, shapes, plane):
 # --- b) rigid spatial arms, against MuJoCo -----------------------------------------------------
 
 
-def rigid_arm(rng, count):
-    """A random arm of `count` rigid links, as the file's dicts."""
-
-    def origin():
-        return {"xyz": rng.uniform(-0.3, 0.3, 3), "rpy": rng.uniform(-3.0, 3.0, 3)}
-
-    joints = [
-        {
-            "name": f"joint{i + 1}",
-            "axis": rng.standard_normal(3),
-            "origin": origin(),
-            "hub_inertia": rng.uniform(0.01, 0.2),
-            "motor_mass": rng.uniform(0.0, 2.0),
-            "rotor_inertia": rng.uniform(1e-4, 1e-3),
-            "gear_ratio": rng.uniform(1.0, 12.0),
-        }
-        for i in range(count)
-    ]
-    links = [
-        {
-            "name": f"link{i + 1}",
-            "length": rng.uniform(0.1, 1.2),
-            "mass_per_length": rng.uniform(0.2, 3.0),
-            "polar_inertia_per_length": rng.uniform(1e-4, 1e-2),
-        }
-        for i in range(count)
-    ]
-    payload = {
-        "mass": rng.uniform(0.1, 2.0),
-        "inertia": random_inertia(rng, 0.1)[1],
-        "offset": rng.uniform(-0.3, 0.3, 3),
-    }
-    gravity = rng.uniform(-10.0, 10.0, 3)
-    return {"joints": joints, "links": links, "payload": payload, "gravity": gravity}
-
-
 class MuJoCo:
     """The same rigid arm in MuJoCo.
 
@@ -413,8 +399,7 @@ class MuJoCo:
             at = tip + following.get("origin", {"xyz": np.zeros(3)})["xyz"]
             parts.append((following["motor_mass"], at, np.zeros((3, 3))))
         else:
-            xx, yy, zz, xy, xz, yz = self.payload["inertia"]
-            inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            inertia = inertia_matrix(self.payload["inertia"])
             parts.append((self.payload["mass"], tip + self.payload["offset"], inertia))
         total = sum(m for m, _, _ in parts)
         centre = sum(m * c for m, c, _ in parts) / total
@@ -588,37 +573,21 @@ def test_twist_closed_form():
     """A shaft turned about its own axis: torsion, with the payload's centre off the axis."""
     rng = np.random.default_rng(11)
     L, polar, GJ, Jh, N, Jr = 0.8, 4e-3, 3.0, 0.02, 6.0, 1e-4
-    mass, offset, (inertia, six) = 0.5, np.array([0.1, 0.07, -0.05]), random_inertia(rng, 0.05)
+    mass, offset, six = 0.5, np.array([0.1, 0.07, -0.05]), random_inertia(rng, 0.05)
+    joint = {"axis": [1, 0, 0], "hub_inertia": Jh, "rotor_inertia": Jr, "gear_ratio": N}
+    link = {"length": L, "mass_per_length": 0.4, "polar_inertia_per_length": polar, "GJ": GJ}
     chain = build(
         {
             "gravity": [1.0, -9.0, 2.0],
-            "joints": [
-                {
-                    "name": "joint1",
-                    "axis": [1, 0, 0],
-                    "hub_inertia": Jh,
-                    "rotor_inertia": Jr,
-                    "gear_ratio": N,
-                }
-            ],
-            "links": [
-                {
-                    "name": "link1",
-                    "length": L,
-                    "mass_per_length": 0.4,
-                    "polar_inertia_per_length": polar,
-                    "GJ": GJ,
-                    "flexible": {"twist": {"modes": 2}},
-                }
-            ],
+            "joints": [{"name": "joint1", **joint}],
+            "links": [{"name": "link1", **link, "flexible": {"twist": {"modes": 2}}}],
             "payload": {"mass": mass, "inertia": six, "offset": offset},
         }
     )
     shapes = chain.mode_shapes("link1", "twist")
-    nodes, weights = np.polynomial.legendre.leggauss(60)
-    xi, weights = (nodes + 1.0) / 2.0, weights / 2.0
+    xi, weights = quadrature(60)
     phi, tip = shapes(xi), shapes(1.0)
-    ends = inertia[0, 0] + mass * (offset[1] ** 2 + offset[2] ** 2)
+    ends = six[0] + mass * (offset[1] ** 2 + offset[2] ** 2)
     beam = np.block(
         [
             [np.ones((1, 1)), (weights @ phi)[None, :]],
@@ -648,7 +617,7 @@ def spatial_arm(seed, count=3):
     every = {"y": {"modes": 2}, "z": {"modes": 1}, "twist": {"modes": 1}}
     for i, link in enumerate(data["links"]):
         link["length"] += 0.3
-        link.update(EI_y=rng.uniform(2, 9), EI_z=rng.uniform(2, 9), GJ=rng.uniform(2, 9))
+        link.update(stiffnesses(rng))
         if i != 1:  # a rigid link among them
             link["flexible"] = every
     data["links"][0]["flexible"] = {"y": {"modes": 2}, "twist": {"modes": 1}}
@@ -749,14 +718,12 @@ def test_spatial_mass_and_gravity(seed):
     for link, flexible in zip(
         data["links"], ({**bends, "twist": {"modes": 1}}, bends), strict=True
     ):
-        link.update(EI_y=rng.uniform(2, 9), EI_z=rng.uniform(2, 9), GJ=rng.uniform(2, 9))
-        link.update(flexible=flexible, length=rng.uniform(0.5, 1.2))
+        link.update(stiffnesses(rng), flexible=flexible, length=rng.uniform(0.5, 1.2))
         link["polar_inertia_per_length"] = 1e-16  # twist carries what is beyond, not the beam
     chain = build(data)
     n, m = 2, chain.n_modes
     tips = [TipFrames(data, 1), TipFrames(data, 2)]
-    nodes, weights = np.polynomial.legendre.leggauss(24)
-    xi, weights = (nodes + 1.0) / 2.0, weights / 2.0
+    xi, weights = quadrature(24)
     columns = {
         (f"link{i + 1}", d): [chain.mode_names.index(f"link{i + 1}_{d}_mode{k}") for k in (1, 2)]
         for i in range(2)
@@ -784,15 +751,10 @@ def test_spatial_mass_and_gravity(seed):
         rows.append((frames[-1][0] + frames[-1][1] @ data["payload"]["offset"])[None, :])
         return np.concatenate(rows + rotations)
 
-    masses = np.concatenate(
-        [
-            np.concatenate(
-                [[joint["motor_mass"]], link["mass_per_length"] * link["length"] * weights]
-            )
-            for joint, link in zip(data["joints"], data["links"], strict=True)
-        ]
-        + [[data["payload"]["mass"]]]
-    )
+    masses = [data["payload"]["mass"]]
+    for joint, link in zip(data["joints"][::-1], data["links"][::-1], strict=True):
+        beam = link["mass_per_length"] * link["length"] * weights
+        masses = np.concatenate([[joint["motor_mass"]], beam, masses])
     K = np.zeros((n + m, n + m))
     for link in data["links"]:
         for d in link["flexible"]:
@@ -809,8 +771,7 @@ def test_spatial_mass_and_gravity(seed):
         skew = dR @ R.T
         return np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
 
-    xx, yy, zz, xy, xz, yz = data["payload"]["inertia"]
-    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    inertia = inertia_matrix(data["payload"]["inertia"])
     for _ in range(2):
         z = np.concatenate([rng.uniform(-3, 3, n), 0.05 * rng.standard_normal(m)])
         here, slopes = configuration(z), differences(configuration, z, n)
