@@ -11,18 +11,10 @@ from ..component import Component
 
 @dataclass(frozen=True)
 class Settings:
-    """What a feed-forward is designed for.
+    """What a feed-forward is designed for."""
 
-    Attributes
-    ----------
-    period : float
-        Of the samples [s].
-    configuration : ndarray, shape (n,)
-        Joint configuration of the design [rad].
-    """
-
-    period: float
-    configuration: np.ndarray
+    period: float  # of the samples [s]
+    configuration: np.ndarray  # of the joints, (n,) [rad]
 
 
 class Feedforward(Component, ABC):
@@ -72,11 +64,9 @@ class Feedforward(Component, ABC):
         """Follow what `prepare` made, or nothing, None, as soon as the reference follows its trajectory."""
 
     def prepare(self, trajectory, start):
-        """Design work for a trajectory that will begin from a state of rest, (3, n); off the control path.
+        """Design work for a trajectory, off the control path; None where there is none to do.
 
-        Returns None where there is none to do.
-
-        `start` has position, velocity and acceleration of the reference where it begins [rad, rad/s, rad/s^2].
+        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n).
         """
         return None
 

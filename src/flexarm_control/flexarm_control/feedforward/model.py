@@ -96,23 +96,12 @@ class Gains:
 
 @dataclass(eq=False)
 class Preparation:
-    """What was designed for one trajectory.
+    """What was designed for one trajectory."""
 
-    Attributes
-    ----------
-    start : ndarray, shape (3, n)
-        State of the reference that it begins from.
-    gains : Gains or None
-    plan : preview.Plan or None
-        A motion, from a feed-forward that plans.
-    trajectory_id : int
-        0 until it is accepted.
-    """
-
-    start: np.ndarray
+    start: np.ndarray  # state of the reference that it begins from, (3, n)
     gains: Gains | None
-    plan: object = None
-    trajectory_id: int = 0
+    plan: object = None  # a `preview.Plan`
+    trajectory_id: int = 0  # 0 until it is accepted
 
 
 def path_of(trajectory, start):

@@ -56,27 +56,13 @@ MAX_STEPS = 20_000
 
 @dataclass(frozen=True)
 class Plan:
-    """A motion of the whole arm from rest to rest, by the time since its start.
+    """A motion of the whole arm from rest to rest, by the time since its start."""
 
-    Attributes
-    ----------
-    duration : float
-        [s]
-    motion : CubicHermiteSpline
-        (q, delta, qd, delta_d) over the elapsed time [s].
-    torque : ndarray, shape (k, n)
-        At the grid's times [N m].
-    step : float
-        Of the grid [s].
-    shift : float
-        Largest shift of a joint from the reference [rad].
-    """
-
-    duration: float
-    motion: CubicHermiteSpline
-    torque: np.ndarray
-    step: float
-    shift: float
+    duration: float  # [s]
+    motion: CubicHermiteSpline  # (q, delta, qd, delta_d)
+    torque: np.ndarray  # at the grid's times, (k, n) [N m]
+    step: float  # of the grid [s]
+    shift: float  # largest, of a joint from the reference [rad]
 
     def torque_at(self, elapsed):
         """Torque (n,) at a time since the start [s]."""

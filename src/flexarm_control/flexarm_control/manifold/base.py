@@ -65,19 +65,9 @@ class Manifold(Component, ABC):
         """
 
     def along(self, reference):
-        """The manifold of the reference itself: no tracking error.
+        """The manifold of the `reference` itself, without tracking error: amplitude, rate and torque.
 
-        Parameters
-        ----------
-        reference : object
-            As for `update`.
-
-        Returns
-        -------
-        amplitude, rate : ndarray, shape (m,)
-            [m, rad], [m/s, rad/s]
-        torque : ndarray, shape (n,)
-            Of the whole motion: the joint rows of (2) [N m].
+        (m,) [m, rad], (m,) [m/s, rad/s], and of the whole motion, from the joint rows of (2), (n,) [N m].
         """
         here, delta, rate, second = self._of_reference(reference)
         return delta, rate, here.torque(delta, rate, second)
@@ -91,19 +81,9 @@ class Manifold(Component, ABC):
         return points[0], *expand(points, self.order)
 
     def error_response(self, q):
-        """How a tracking error moves the manifold and its feed-forward, linearised at rest.
+        """How a tracking error moves the manifold and its feed-forward, linearised at rest in q.
 
-        Parameters
-        ----------
-        q : ndarray, shape (n,)
-            Configuration [rad].
-
-        Returns
-        -------
-        L : ndarray, shape (2m, 2n)
-            z_bar by (q, qd).
-        U : ndarray, shape (n, 2n)
-            Feed-forward by (q, qd).
+        L, the derivative of z_bar by (q, qd), (2m, 2n), and U, that of the feed-forward, (n, 2n).
         """
         n, m = self.model.n_joints, self.model.n_modes
         reference = at_rest(q)

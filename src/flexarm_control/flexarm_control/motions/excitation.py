@@ -27,27 +27,13 @@ from flexarm_dynamics.singular_perturbation import (
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Excitation of the modes by a motion, by the linear theory.
+    """Excitation of the modes by a motion, by the linear theory."""
 
-    Attributes
-    ----------
-    times : (k,) array
-        From 0 to the motion's end [s].
-    torque : (k, n) array
-        Slow torque [N m].
-    quasi_steady : (k, m) array
-        Amplitudes of (9) [m, rad].
-    deviation : (k, 2m) array
-        z_f: amplitudes and rates about the quasi-steady state.
-    energy : (k,) array
-        Energy of the deviation [J].
-    """
-
-    times: np.ndarray
-    torque: np.ndarray
-    quasi_steady: np.ndarray
-    deviation: np.ndarray
-    energy: np.ndarray
+    times: np.ndarray  # from 0 to the motion's end, (k,) [s]
+    torque: np.ndarray  # slow torque, (k, n) [N m]
+    quasi_steady: np.ndarray  # amplitudes of (9), (k, m) [m, rad]
+    deviation: np.ndarray  # z_f, amplitudes and rates about the quasi-steady state, (k, 2m)
+    energy: np.ndarray  # of the deviation, (k,) [J]
 
     @property
     def residual(self):

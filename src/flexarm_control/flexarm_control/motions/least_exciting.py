@@ -50,24 +50,14 @@ _SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LeastExciting:
-    """A least-exciting motion.
-
-    Attributes
-    ----------
-    profile : Profile
-        The motion.
-    excitation : Excitation
-        Its excitation and torque, by the full reduced model.
-    quintic : Excitation
-        The same for the quintic of the same duration, which may exceed the limits.
-    rounds : int
-        Convex programmes solved.
-    """
+    """A least-exciting motion."""
 
     profile: Profile
-    excitation: excitation.Excitation
-    quintic: excitation.Excitation
-    rounds: int
+    excitation: excitation.Excitation  # and torque, by the full reduced model
+    quintic: (
+        excitation.Excitation
+    )  # of the quintic of the same duration, which may exceed the limits
+    rounds: int  # convex programmes solved
 
 
 def least_exciting(

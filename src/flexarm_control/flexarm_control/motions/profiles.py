@@ -54,20 +54,14 @@ class Motion(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Profile(Motion):
-    """A motion in closed form, as in the module.
-
-    Attributes
-    ----------
-    shape : tuple of 3 functions
-        sigma, sigma' and sigma'' of s in [0, 1], elementwise [-].
-    start, angle, duration
-        As for every `Motion`.
-    """
+    """A motion in closed form, as in the module."""
 
     start: np.ndarray
     angle: np.ndarray
     duration: float
-    shape: tuple[Callable, Callable, Callable]
+    shape: tuple[
+        Callable, Callable, Callable
+    ]  # sigma, sigma' and sigma'' of s in [0, 1], elementwise [-]
 
     def derivative(self, order, t):
         # Rest to rest: beyond either end sigma stays, and its derivatives are 0 as at the end.
@@ -191,20 +185,12 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
 
 
 class SampledProfile(NamedTuple):
-    """A profile's points, all fields given: quintic interpolation.
+    """A profile's points, all fields given: quintic interpolation."""
 
-    Attributes
-    ----------
-    times : (k,) array
-        Times from the start, the first 0 [s].
-    positions, velocities, accelerations : (k, n) arrays
-        The motion at these times [rad], [rad/s], [rad/s^2].
-    """
-
-    times: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-    accelerations: np.ndarray
+    times: np.ndarray  # from 0, (k,) [s]
+    positions: np.ndarray  # (k, n) [rad]
+    velocities: np.ndarray  # (k, n) [rad/s]
+    accelerations: np.ndarray  # (k, n) [rad/s^2]
 
 
 def sample(profile, n_points) -> SampledProfile:

@@ -37,18 +37,10 @@ MAX_IMPULSES = 1000
 
 @dataclass(frozen=True, eq=False)
 class Shaper:
-    """A train of impulses.
+    """A train of impulses."""
 
-    Attributes
-    ----------
-    times : (k,) array
-        From 0, ascending [s].
-    amplitudes : (k,) array
-        Above 0, with sum 1 [-].
-    """
-
-    times: np.ndarray
-    amplitudes: np.ndarray
+    times: np.ndarray  # from 0, ascending, (k,) [s]
+    amplitudes: np.ndarray  # above 0, with sum 1, (k,) [-]
 
     @property
     def duration(self):

@@ -47,12 +47,7 @@ class SlowLaw(Law, ABC):
     def nominal(self, terms, acceleration):
         """What this law gives on its reference, learnt states aside: the rigid arm's torque, shape (n,) [N m].
 
-        Parameters
-        ----------
-        terms : Terms
-            Of (2) on the reference.
-        acceleration : ndarray, shape (n,)
-            The reference's [rad/s^2].
+        For `terms` of (2) on the reference, and the reference's `acceleration`, (n,) [rad/s^2].
         """
         return slow_torque(terms, acceleration)
 

@@ -26,21 +26,12 @@ from .values import (
 class Verdict:
     """The decision on an offered trajectory.
 
-    Attributes
-    ----------
-    accepted : bool
-        Whether it will be followed.
-    reason : str
-        Why it is refused, or when it starts and which trajectory it replaces.
-    trajectory_id : int
-        Its number, counted from 1; the number of the repeated trajectory for a repeat; 0 if refused.
-    repeat : bool
-        Whether it is the last accepted one again, which is neither an error nor a new start.
+    A repeat is the last accepted trajectory again: neither an error nor a new start.
     """
 
-    accepted: bool
-    reason: str
-    trajectory_id: int
+    accepted: bool  # it will be followed
+    reason: str  # why it is refused, or when it starts and which trajectory it replaces
+    trajectory_id: int  # counted from 1; of the repeated trajectory for a repeat; 0 if refused
     repeat: bool = False
 
 
@@ -228,9 +219,8 @@ class ReferenceGenerator:
         of the followed trajectory, the reference is the state at that start.
         """
         if self._last_ns is None:
-            raise TrajectoryError(
-                "no state yet", hint="call start with the measured position first"
-            )
+            hint = "call start with the measured position first"
+            raise TrajectoryError("no state yet", hint=hint)
         pending = self._pending
         if pending is not None and stamp_ns >= pending.start_ns:
             # A trajectory that still waits for its first sample would begin later: it is dropped.

@@ -30,30 +30,14 @@ _MAX_NS = 2**63 - 1
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectoryData:
-    """A trajectory that `validate` has passed; its arrays are read-only.
+    """A trajectory that `validate` has passed; its arrays are read-only, their columns in the arm's order."""
 
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp at which it starts [ns]; 0 means now, at the next sample.
-    joint_names : tuple of str
-        The arm's n joints, in the arm's order, which is that of the columns below.
-    times_ns : (k,) int64 array
-        Times of the points from the start, strictly increasing [ns].
-    positions : (k, n) array
-        Positions at the points [rad].
-    velocities : (k, n) array or None
-        Velocities at the points [rad/s]; None: linear interpolation.
-    accelerations : (k, n) array or None
-        Accelerations at the points [rad/s^2]; None: cubic interpolation at most.
-    """
-
-    stamp_ns: int
-    joint_names: tuple
-    times_ns: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray | None = None
-    accelerations: np.ndarray | None = None
+    stamp_ns: int  # at which it starts [ns]; 0 means now, at the next sample
+    joint_names: tuple  # the arm's n joints
+    times_ns: np.ndarray  # of the points from the start, strictly increasing, (k,) int64 [ns]
+    positions: np.ndarray  # (k, n) [rad]
+    velocities: np.ndarray | None = None  # (k, n) [rad/s]; None: linear interpolation
+    accelerations: np.ndarray | None = None  # (k, n) [rad/s^2]; None: cubic interpolation at most
 
     @property
     def times(self) -> np.ndarray:
