@@ -7,18 +7,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 
 def table(columns, rows):
-    """Return the lines of a Markdown table.
-
-    Parameters
-    ----------
-    columns : sequence of str
-    rows : iterable of sequence
-        Numbers get three digits; None is a dash.
-
-    Returns
-    -------
-    list of str
-    """
+    """Lines of a Markdown table; in its `rows`, below the `columns`, floats get three digits and None is a dash."""
     lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
     return lines + ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]
 
@@ -32,19 +21,9 @@ def _cell(value):
 
 
 def write_between(file, begin, end, text):
-    """Replace the text between the markers of a Markdown file.
+    """Replace the text between the markers `begin` and `end`, which stay, of a Markdown `file`.
 
-    Parameters
-    ----------
-    file : str or Path
-    begin, end : str
-        The markers, which stay.
-    text : str
-
-    Raises
-    ------
-    FlexarmError
-        When the file has no markers; it is left unchanged.
+    A file without markers is refused and left unchanged.
     """
     path = Path(file)
     whole = path.read_text(encoding="utf-8")

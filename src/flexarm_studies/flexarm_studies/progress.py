@@ -6,13 +6,7 @@ import time
 
 
 class Progress:
-    """Progress of a long command.
-
-    Parameters
-    ----------
-    stream : file, optional
-        Output; standard error if not given.
-    """
+    """Progress of a long command, written to `stream`, or to standard error."""
 
     WIDTH = 24
 
@@ -24,7 +18,7 @@ class Progress:
 
     def step(self, label, number=None, total=None):
         """Begin a step."""
-        self._finish()
+        self.done()
         self._label = f"[{number}/{total}] {label}" if number else label
         if self._live:
             self.fraction(0.0)
@@ -41,9 +35,6 @@ class Progress:
 
     def done(self):
         """End the last step."""
-        self._finish()
-
-    def _finish(self):
         if self._live and self._label:
             self.fraction(1.0)
             self._stream.write("\n")

@@ -127,13 +127,7 @@ def _numbers(path, lines, header, rows, wanted, finite=False):
 
 
 class Steps:
-    """Values linear between rows; a repeated time is a step; held before the first row and after the last.
-
-    Parameters
-    ----------
-    times : ndarray, shape (k,)
-    values : ndarray, shape (k, n)
-    """
+    """`values` (k, n) linear between `times` (k,); a repeated time is a step; the first and the last are held."""
 
     def __init__(self, times, values):
         self.times, self.values = times, values
@@ -157,25 +151,18 @@ class Steps:
 
 
 class Motion:
-    """Joint motion through the rows of a table: a spline of degree five (three below six rows).
+    """Joint motion through the `positions` (k, n) at `times` (k,): a spline of degree five, or three below six rows.
 
-    Parameters
-    ----------
-    times : ndarray, shape (k,)
-        Ascending.
-    positions : ndarray, shape (k, n)
-    where : str
-        File, for messages.
+    `where` is the file, for messages.
     """
 
     def __init__(self, times, positions, where):
         twice = np.flatnonzero(np.diff(times) <= 0.0)
         if twice.size:
-            raise TableError(
-                f"{where}: t = {times[twice[0]]:g} is there twice; joints can't jump: one row per time"
-            )
+            problem = f"t = {times[twice[0]]:g} is there twice; joints can't jump: one row per time"
+            raise TableError(problem, field=where)
         if times.size < 4:
-            raise TableError(f"{where}: {times.size} rows; at least 4 make a smooth motion")
+            raise TableError(f"{times.size} rows; at least 4 make a smooth motion", field=where)
         self.start, self.end = float(times[0]), float(times[-1])
         spline = make_interp_spline(times, positions, k=5 if times.size >= 6 else 3)
         self._derivatives = [spline, spline.derivative(), spline.derivative(2)]
@@ -185,11 +172,10 @@ class Motion:
         return [d(t) for d in self._derivatives]
 
 
-def write(columns, rows, path=None, digits=12):
-    """Write rows as CSV, with so many significant digits, to a file, its directory made, or to standard output."""
+def write(columns, rows, path=None):
+    """Write rows as CSV, with twelve significant digits, to a file, its directory made, or to standard output."""
     out = io.StringIO()
-    out.write(",".join(columns) + "\n")
-    np.savetxt(out, rows, fmt=f"%.{digits}g", delimiter=",")
+    np.savetxt(out, rows, fmt="%.12g", delimiter=",", header=",".join(columns), comments="")
     if path is None:
         sys.stdout.write(out.getvalue())
         return

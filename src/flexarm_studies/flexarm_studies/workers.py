@@ -12,12 +12,7 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @contextmanager
 def processes(count):
-    """An executor with `count` processes, which end with the context; calls that have not started are dropped.
-
-    Parameters
-    ----------
-    count : int
-    """
+    """An executor with `count` processes, which end with the context; calls that have not started are dropped."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     # Never fork: this process may have threads.

@@ -122,12 +122,8 @@ def study(arm_model, observed, count=None, criterion="A"):
                 limit=f"at least {len(names)}",
             )
         if wanted > GRID:
-            raise FlexarmError(
-                "gauges are more than there are positions",
-                field="--count",
-                value=wanted,
-                limit=GRID,
-            )
+            problem = "gauges are more than there are positions"
+            raise FlexarmError(problem, field="--count", value=wanted, limit=GRID)
         places.append(_place(arm_model, key, names, present, wanted, criterion))
     return {"arm": arm.name, "criterion": criterion, "places": places}
 
@@ -219,19 +215,9 @@ def _quality(rows):
 
 
 def criterion_of(rows, criterion):
-    """The criterion of many sets of gauges; infinite for a set that can't resolve the modes.
+    """One of `CRITERIA` of many sets of gauges, shape (sets,); infinite for a set that can't resolve the modes.
 
-    Parameters
-    ----------
-    rows : ndarray, shape (sets, gauges, modes)
-        Weighted rows.
-    criterion : str
-        One of `CRITERIA`.
-
-    Returns
-    -------
-    ndarray, shape (sets,)
-        Smaller is better.
+    `rows` are weighted, shape (sets, gauges, modes). A smaller criterion is better.
     """
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     scaled = rows / np.where(size > 0.0, size, 1.0)
@@ -253,16 +239,9 @@ def criterion_of(rows, criterion):
 
 
 def best_sets(rows, count, criterion):
-    """The best sets of `count` candidates, best first: tuples of indices, and their criterion.
+    """The best sets of `count` candidates, best first: tuples of indices, and their criterion, one of `CRITERIA`.
 
-    Parameters
-    ----------
-    rows : ndarray, shape (candidates, modes)
-        Weighted.
-    count : int
-        Gauges of a set.
-    criterion : callable
-        Of the rows of a set: the less the better.
+    `rows` are weighted, shape (candidates, modes).
     """
     candidates = rows.shape[0]
     if comb(candidates, count) > MAX_SETS:

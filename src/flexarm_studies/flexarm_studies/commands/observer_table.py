@@ -76,33 +76,22 @@ def observers(options):
 
 
 def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress=None):
-    """Errors of the observers' rates.
+    """Errors of the observers' rates: a list of rows, dicts with the keys `COLUMNS`.
 
     Parameters
     ----------
     arm : str
         Arm file: shipped name or path.
-    rates : sequence of float
-        [Hz]
+    rates, delays : sequence of float
+        [Hz], [s]
     noises : mapping of str to (float, int)
         Strain noise [rms strain] and encoder counts [per turn; 0: not rounded], by a name for the table.
-    delays : sequence of float
-        [s]
     names : sequence of str, optional
         Observers; all installed ones except `LEFT_OUT` if not given.
     duration : float
         [s]
     seed : int
     progress : Progress, optional
-
-    Returns
-    -------
-    list of dict
-        A row each, keys `COLUMNS`.
-
-    Raises
-    ------
-    FlexarmError
     """
     known = arm_file.load(arm)
     if names is None:
@@ -180,24 +169,9 @@ def _with_noise(arm, strain, counts):
 
 
 def estimates(arm, core, states, torques, rate, seed=0):
-    """Estimates of an observer from the samples of a motion.
+    """Estimates (q, delta, qd, delta_d), shape (k, N), that an observer makes of a motion.
 
-    Parameters
-    ----------
-    arm : ArmModel
-        With the gauges and encoders.
-    core : ArmObserver
-    states, torques : ndarray
-        Of `motion`.
-    rate : float
-        [Hz]
-    seed : int
-        Of the noise.
-
-    Returns
-    -------
-    ndarray, shape (k, N)
-        (q, delta, qd, delta_d) as passed on.
+    `arm` has the gauges and encoders, `core` is the `ArmObserver`, `states` and `torques` are those of `motion`.
     """
     n, m, period = arm.n_joints, arm.n_modes, round(1e9 / rate)
     sensors, sample = Sensors(arm, True, seed), ArmSample(n, m, len(arm.arm.gauges))

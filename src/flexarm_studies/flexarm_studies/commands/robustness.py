@@ -118,13 +118,7 @@ def levels_of(option, text, most):
 
 
 class Judge:
-    """Decides whether runs are stable, by comparison with the undisturbed run.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Without loss and jitter.
-    """
+    """Decides whether runs are stable, by comparison with the undisturbed run of a `scenario`."""
 
     def __init__(self, scenario):
         self.scenario = scenario
@@ -141,11 +135,8 @@ class Judge:
     def run(self, **disturbance):
         """Run the scenario with fields replaced by those of the `disturbance`.
 
-        Returns
-        -------
-        tuple of (float, float, float, str)
-            Largest joint error [rad], largest bending relative to the undisturbed one [-], the tip's error at rest
-            [m], and why the run is not stable; empty if it is.
+        Returns the largest joint error [rad], the largest bending relative to the undisturbed one [-], the tip's error
+        at rest [m], and why the run is not stable; empty if it is.
         """
         try:
             record, _, loop = scenarios.run_loop(replace(self.scenario, **disturbance))
@@ -181,30 +172,10 @@ class Judge:
 
 
 def sweep(scenario, what, levels, seeds=3, progress=lambda fraction: None):
-    """Run every level of one disturbance.
+    """Run a `scenario` at every one of the `levels` of one disturbance, `what`: ``loss`` [-] or ``jitter`` [s].
 
-    Parameters
-    ----------
-    scenario : Scenario
-    what : str
-        ``loss`` or ``jitter``.
-    levels : sequence of float
-        [-] or [s]
-    seeds : int
-        Runs at each level.
-    progress : callable
-        Called with the fraction done.
-
-    Returns
-    -------
-    list of dict
-        A row per level with the worst numbers of its runs, keys `COLUMNS` without the controller; None if a run has no
-        number.
-
-    Raises
-    ------
-    FlexarmError
-        If the loop loses the arm undisturbed.
+    Returns a row per level with the worst numbers of its `seeds` runs, keys `COLUMNS` without the controller; None if a
+    run has no number.
     """
     judge, (words, factor, unit), rows = Judge(scenario), SWEPT[what], []
     for i, level in enumerate(levels):
@@ -240,16 +211,13 @@ def breaks(rows):
         bad = next((i for i, r in enumerate(own) if r["stable"] < r["of"]), None)
         unit, runs = own[0]["unit"], f"{own[0]['of']} of {own[0]['of']} runs"
         if bad is None:
-            lines.append(
-                f"{controller}: {what} {own[-1]['level']:g} {unit}, the most tried: {runs} stable"
-            )
-            continue
-        upto = f"stable in {runs} up to {own[bad - 1]['level']:g} {unit}, " if bad else ""
-        first = own[bad]
-        lines.append(
-            f"{controller}: {what}: {upto}breaks at {first['level']:g} {unit} in"
-            f" {first['of'] - first['stable']} of {first['of']}: {first['why']}"
-        )
+            text = f" {own[-1]['level']:g} {unit}, the most tried: {runs} stable"
+        else:
+            first, upto = own[bad], own[bad - 1]["level"]
+            text = f": stable in {runs} up to {upto:g} {unit}, " if bad else ": "
+            text += f"breaks at {first['level']:g} {unit} in {first['of'] - first['stable']} of {first['of']}"
+            text += f": {first['why']}"
+        lines.append(f"{controller}: {what}{text}")
     return lines
 
 

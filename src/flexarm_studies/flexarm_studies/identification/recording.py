@@ -73,10 +73,6 @@ def uniform(arm, time, position, torque, strain, usable=None):
     usable : ndarray of bool, shape (s,), optional
         Samples whose torque says what moved the arm.
 
-    Returns
-    -------
-    Recording
-
     Raises
     ------
     FlexarmError
@@ -129,26 +125,12 @@ def columns(arm):
 
 
 def read_csv(path, arm):
-    """Read a CSV file with the columns of `columns`, in any order; those of gauges may be missing, others are ignored.
-
-    Raises
-    ------
-    FlexarmError
-        For a column that is missing and for text that is no number, naming column and line.
-    """
+    """Read a CSV file with `columns` in any order; others are ignored, those of gauges may be missing."""
     optional = [f"{g}_strain" for g in arm.gauge_names]
     table = tables.read_columns(path, columns(arm), optional)
     n = len(arm.joints)
     t, q, u, e = np.split(table, [1, 1 + n, 1 + 2 * n], axis=1)
     return uniform(arm, t[:, 0], q, u, e)
-
-
-def write_csv(path, recording, arm):
-    """Write a recording as `read_csv` reads it."""
-    table = np.column_stack(
-        [recording.time, recording.position, recording.torque, recording.strain]
-    )
-    tables.write(columns(arm), table, path, digits=17)
 
 
 # Topics ----------------------------------------------------------------------------------------
@@ -158,22 +140,8 @@ def from_tables(states, torques, arm):
     """A recording from the tables of `arm_state` and, where there is one, of the `joint_torque` that answered it.
 
     With torques, only those samples count over which an enabled torque acted: the safe action before and after
-    moves the arm in ways that no torque tells of.
-
-    Parameters
-    ----------
-    states, torques : Table or None
-        Of a bag's `Contents`: arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are
-        kept once.
-    arm : Arm
-
-    Returns
-    -------
-    Recording
-
-    Raises
-    ------
-    FlexarmError
+    moves the arm in ways that no torque tells of. The tables `states` and `torques` are those of a bag's `Contents`:
+    arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once.
     """
     if states is None or not states.stamp.size:
         raise FlexarmError("no arm_state in the recording")

@@ -175,18 +175,7 @@ class ClosedLoop:
         self.simulator.advance(way[0], before, self._share)
 
     def run(self, trajectory, duration):
-        """Offer a trajectory and record `duration` seconds from its start.
-
-        Parameters
-        ----------
-        trajectory : JointTrajectoryData
-            With its stamp on the simulator's clock.
-        duration : float
-            [s]
-
-        Returns
-        -------
-        SimulatedRecord
+        """Offer a trajectory, its stamp on the simulator's clock, and record `duration` seconds from its start.
 
         Raises
         ------
@@ -295,16 +284,8 @@ class ClosedLoop:
         """Rows of time and what `_row` gives as a record."""
         n, m = self.model.n_joints, self.model.n_modes
         widths = [1, n, n, n, n, m, m, m, n, n, n, n, self.simulator.plant.delta.size, 1, 1]
-        parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
-        saturated, state = parts[13][:, 0] > 0.0, parts[14][:, 0].astype(int)
-        return SimulatedRecord(parts[0][:, 0], *parts[1:13], saturated, state)
-
-
-def split_record(rows, n, m):
-    """A `Record` from rows of time and all its vectors in order."""
-    widths = [1, n, n, n, n, m, m, m, n, n, n]
-    parts = np.split(rows, np.cumsum(widths)[:-1], axis=1)
-    return Record(parts[0][:, 0], *parts[1:])
+        time, *vectors, saturated, state = np.split(rows, np.cumsum(widths)[:-1], axis=1)
+        return SimulatedRecord(time[:, 0], *vectors, saturated[:, 0] > 0.0, state[:, 0].astype(int))
 
 
 class _ProfileReference:
@@ -343,14 +324,9 @@ def continuous_loop(model, law, profile, times):
     model : ArmModel
         Plant and controller's model alike.
     law : CompositeControl
-    profile : object
-        Motion profile with `duration`, `position`, `velocity`, `acceleration`.
+    profile : Profile
     times : ndarray, shape (k,)
-        Where samples are wanted, from 0 [s].
-
-    Returns
-    -------
-    Record
+        Of the record's samples, from 0 [s].
     """
     n, m = model.n_joints, model.n_modes
     reference = _ProfileReference(profile)
@@ -373,7 +349,11 @@ def continuous_loop(model, law, profile, times):
     for t, s in zip(times, states, strict=True):
         u = torque(t, s)
         q, delta, qd, delta_d = np.split(s, [n, n + m, 2 * n + m])
-        ref = [reference.position, reference.velocity]
-        control = [law.quasi_steady, law.slow_torque, law.fast_torque, u]
-        rows.append(np.concatenate([[t], *ref, q, qd, delta, delta_d, *control]))
-    return split_record(np.array(rows), n, m)
+        control = [
+            law.quasi_steady.copy(),
+            law.slow_torque.copy(),
+            law.fast_torque.copy(),
+            u.copy(),
+        ]
+        rows.append([t, reference.position, reference.velocity, q, qd, delta, delta_d, *control])
+    return Record(*map(np.array, zip(*rows, strict=True)))

@@ -6,6 +6,7 @@ from pathlib import Path
 import yaml
 
 from flexarm_control.composite import assembly
+from flexarm_dynamics.arm.arm_file import arms_directories
 from flexarm_dynamics.errors import ParameterError
 
 #: Components whose parameters each node has.
@@ -14,19 +15,11 @@ PREFIXES = {"controller": assembly.CONTROL, "observer": ("observer",), "simulato
 
 def directory():
     """Where the shipped controller files are."""
-    from flexarm_dynamics.arm.arm_file import arms_directories
-
     return arms_directories()[0].parent / "controllers"
 
 
 def find(name):
-    """Path of a controller file given as a path or as a shipped name.
-
-    Raises
-    ------
-    ParameterError
-        When there is none; lists the shipped names.
-    """
+    """Path of a controller file, `name` being a path or a shipped name; an error lists the shipped ones."""
     for path in (Path(name).expanduser(), directory() / f"{name}.yaml"):
         if path.is_file():
             return path
@@ -59,11 +52,10 @@ def load(name):
         sections = {key: assembly.flat(section["ros__parameters"]) for key, section in data.items()}
     except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
         # ValueError: text that is no UTF-8, or a scalar that is not what it looks like, as a 13th month.
-        raise ParameterError(f"{path}: can't be read: {error}") from None
+        raise ParameterError(f"can't be read: {error}", field=str(path)) from None
     except (TypeError, KeyError, AttributeError, IndexError):
-        raise ParameterError(
-            f"{path}: not a ROS parameter file (node name: ros__parameters: …)"
-        ) from None
+        hint = "write node name: ros__parameters: …"
+        raise ParameterError("not a ROS parameter file", field=str(path), hint=hint) from None
     return {
         node: {
             name: value

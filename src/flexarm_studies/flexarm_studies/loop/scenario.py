@@ -187,13 +187,7 @@ def _parameter(name, values):
 
 
 def loop_of(scenario):
-    """The scenario's `ClosedLoop`, before its first sample.
-
-    Raises
-    ------
-    FlexarmError
-        For an arm, a parameter or a design that is impossible.
-    """
+    """The scenario's `ClosedLoop`, before its first sample."""
     values = scenario.controller
     simulator, controller = {}, {}
     for name, value in values.items():
@@ -229,10 +223,6 @@ def loop_of(scenario):
 def run(scenario):
     """Run a scenario.
 
-    Parameters
-    ----------
-    scenario : Scenario
-
     Returns
     -------
     record : SimulatedRecord
@@ -253,8 +243,8 @@ def run(scenario):
     Raises
     ------
     FlexarmError
-        For a scenario that can't be run: an arm, a parameter, a design or a trajectory that is refused, or an
-        observer that does not converge. A loop that loses its arm is no error.
+        For a scenario that can't be run: an arm, a parameter, a `repeat`, a design or a trajectory that is refused,
+        or an observer that does not converge. A loop that loses its arm is no error.
     """
     return run_loop(scenario)[:2]
 
@@ -262,17 +252,8 @@ def run(scenario):
 def run_loop(scenario, recorder=None):
     """As `run`, and the `ClosedLoop` in which it ran.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    recorder : callable, optional
-        Called with the loop, the arm file's name and the observer's name; returns a context that records the run,
-        such as ``functools.partial(flexarm_tools.recording.loop_bag.LoopBag, folder)``.
-
-    Raises
-    ------
-    ParameterError
-        For a `repeat` that is no count; and as `run`.
+    A `recorder` is called with the loop, the arm file's name and the observer's name, and returns a context that
+    records the run: ``functools.partial(flexarm_tools.recording.loop_bag.LoopBag, folder)``.
     """
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
         raise ParameterError(
@@ -311,12 +292,8 @@ def _passes(scenario, loop, motion, back, end, duration):
 
 
 def _check_times(scenario, duration):
-    limits = (
-        ("window", scenario.window),
-        ("tolerance", scenario.tolerance),
-        ("duration", duration),
-    )
-    for name, value in limits:
+    limited = {"window": scenario.window, "tolerance": scenario.tolerance, "duration": duration}
+    for name, value in limited.items():
         if not 0.0 <= value <= 1e5:
             raise ParameterError("is out of range", field=name, value=value, limit="from 0 to 1e5")
 
@@ -341,24 +318,9 @@ def _metrics(scenario, loop, record, end, duration):
 
 
 def trajectory_of(given, model, start):
-    """A trajectory from what `Scenario.trajectory` may be.
+    """A `JointTrajectoryData` with stamp 0, now, from what is `given` as in `Scenario.trajectory`.
 
-    Parameters
-    ----------
-    given : str or dict
-    model : ArmModel
-        Of the arm that follows it: its joints and their limits.
-    start : ndarray, shape (n,)
-        Where the joints are [rad].
-
-    Returns
-    -------
-    JointTrajectoryData
-        With stamp 0: now.
-
-    Raises
-    ------
-    TrajectoryError
+    `model` is that of the arm that follows it, with its limits; its joints are at `start` (n,) [rad].
     """
     if isinstance(given, str):
         return specs.load(given, model, start)
@@ -369,9 +331,8 @@ def trajectory_of(given, model, start):
 def _points(given):
     unknown = set(given) - {"times", "positions", "velocities", "accelerations"}
     if unknown or not {"times", "positions"} <= set(given):
-        raise TrajectoryError(
-            f"a trajectory has times, positions, velocities and accelerations, not {', '.join(given)}"
-        )
+        names = "times, positions, velocities, accelerations"
+        raise TrajectoryError("has other fields", field="trajectory", value=[*given], limit=names)
     times = [round(1e9 * t) for t in given["times"]]
     fields = [given.get(k, [()] * len(times)) for k in ("positions", "velocities", "accelerations")]
     return [(*point, ()) for point in zip(times, *fields, strict=True)]
