@@ -2,6 +2,10 @@
 """How tests are spread over processes, and which of them get a second try."""
 
 import pytest
+from hypothesis import Phase, settings
+
+# For `make mutants`: one example that fails is enough. To make it smaller takes minutes.
+settings.register_profile("first_failure", phases=[Phase.explicit, Phase.generate])
 
 
 @pytest.hookimpl(wrapper=True)  # before and after xdist reads the groups

@@ -535,6 +535,7 @@ def run_tests(mutant, copy, cache):
     if cache is not None and "/kernels/" in mutant.file:  # compiled anew, and never run again
         environment |= {"FLEXARM_CACHE": str(cache), "NUMBA_OPT": "1"}
     words = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
+    words += ["--hypothesis-profile=first_failure"]
     words += [f"src/{w}" if w.startswith("flexarm_") else w for w in mutant.tests.split()]
     return subprocess.run(
         words, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT
