@@ -171,13 +171,14 @@ def add_arguments(parser):
         "The case study of Siciliano & Book (1986): three nodes, seven runs, about a minute."
     )
     parser.epilog = "example: flexarm demo --out results/case_study"
-    parser.add_argument("--out", default="results/case_study", help="directory of the results")
-    parser.add_argument(
+    add = parser.add_argument
+    add("--out", default="results/case_study", help="directory of the results")
+    add(
         "--without-ros",
         action="store_true",
         help="the same objects in one process, no DDS, no bags",
     )
-    parser.add_argument("--json", action="store_true", help="print summary.json, not the tables")
+    add("--json", action="store_true", help="print summary.json, not the tables")
 
 
 def run_demo(options):

@@ -32,13 +32,12 @@ def add_arguments(parser):
         "file. Exit code 1 when a check fails."
     )
     parser.epilog = "example: flexarm check_driver R --rate 200 --allow-motion"
-    parser.add_argument("arm", help="arm file: a shipped name or a path")
-    parser.add_argument(
-        "--allow-motion", action="store_true", help="push each joint a little; stand clear"
-    )
-    parser.add_argument("--angle", type=_positive, default=0.05, help="how far to push [rad]")
-    parser.add_argument("--duration", type=_positive, default=2.0, help="time to listen [s]")
-    parser.add_argument("--rate", type=_positive, help="expected samples per second [Hz]")
+    add = parser.add_argument
+    add("arm", help="arm file: a shipped name or a path")
+    add("--allow-motion", action="store_true", help="push each joint a little; stand clear")
+    add("--angle", type=_positive, default=0.05, help="how far to push [rad]")
+    add("--duration", type=_positive, default=2.0, help="time to listen [s]")
+    add("--rate", type=_positive, help="expected samples per second [Hz]")
     defaults = Tolerances()
     for name, unit, text in (
         ("rate_error", "", "relative error of the rate"),
@@ -49,14 +48,10 @@ def add_arguments(parser):
     ):
         default = getattr(defaults, name)
         words = f"{text}{f' [{unit}]' if unit else ''} (default {default:g})"
-        parser.add_argument(
-            "--" + name.replace("_", "-"), type=_positive, default=default, help=words
-        )
-    parser.add_argument("--namespace", default="", help="namespace of the driver's topics")
-    parser.add_argument(
-        "--timeout", type=_positive, default=10.0, help="longest wait for a state [s]"
-    )
-    parser.add_argument("--json", action="store_true", help="findings as JSON")
+        add("--" + name.replace("_", "-"), type=_positive, default=default, help=words)
+    add("--namespace", default="", help="namespace of the driver's topics")
+    add("--timeout", type=_positive, default=10.0, help="longest wait for a state [s]")
+    add("--json", action="store_true", help="findings as JSON")
 
 
 def _positive(text):

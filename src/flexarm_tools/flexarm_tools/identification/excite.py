@@ -31,25 +31,22 @@ def add_arguments(parser):
         "example: flexarm excite my_arm.yaml --kind sweep --amplitude 2 --out results/sweep "
         "--allow-motion"
     )
-    parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
-    parser.add_argument(
-        "--out", required=True, metavar="BAG", help="directory of the bag, a new one"
-    )
-    parser.add_argument(
-        "--allow-motion", action="store_true", help="stand clear: the arm will move"
-    )
+    add = parser.add_argument
+    add("arm", metavar="ARM", help="arm file: a shipped name or a path")
+    add("--out", required=True, metavar="BAG", help="directory of the bag, a new one")
+    add("--allow-motion", action="store_true", help="stand clear: the arm will move")
     for p in excitation_run.PARAMETERS:
         unit = f" [{p.unit}]" if p.unit != "-" else ""
         default = f" (default {p.default:g})" if p.kind == "float" else ""
-        parser.add_argument(
+        add(
             "--" + p.name.replace("_", "-"),
             type=float if p.kind == "float" else str,
             choices=p.choices or None,
             default=p.default,
             help=f"{p.description}{unit}{default}".replace("%", "%%"),
         )
-    parser.add_argument("--namespace", default="", help="of the arm's topics")
-    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
+    add("--namespace", default="", help="of the arm's topics")
+    add("--json", action="store_true", help="say what was recorded as JSON")
 
 
 def excite(options):

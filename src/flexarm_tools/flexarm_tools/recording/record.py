@@ -29,17 +29,14 @@ def add_arguments(parser):
         "the arm file in it; nothing of the running nodes changes."
     )
     parser.epilog = "example: flexarm record --out results/run1 --duration 20"
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "--out", metavar="FOLDER", help="of the bag, a new one (results/bag-DATE-TIME if not given)"
     )
-    parser.add_argument("--namespace", default="", metavar="NS", help="of the arm's topics")
-    parser.add_argument(
-        "--duration", type=float, metavar="S", help="seconds to record; until Ctrl-C if not given"
-    )
-    parser.add_argument(
-        "--arm", help="arm file that goes into the bag; asked of the nodes if not given"
-    )
-    parser.add_argument("--json", action="store_true", help="say what was recorded as JSON")
+    add("--namespace", default="", metavar="NS", help="of the arm's topics")
+    add("--duration", type=float, metavar="S", help="seconds to record; until Ctrl-C if not given")
+    add("--arm", help="arm file that goes into the bag; asked of the nodes if not given")
+    add("--json", action="store_true", help="say what was recorded as JSON")
 
 
 def record(options):

@@ -17,30 +17,27 @@ def add_arguments(parser):
         "bag record`, and writes one page that needs no network."
     )
     parser.epilog = "example: flexarm report results/run1 results/run2 --out results/report.html"
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "bags",
         nargs="+",
         metavar="BAG",
         help="folder of a rosbag2 bag, a folder with one in it, or a .mcap or .db3 file; several are compared",
     )
-    parser.add_argument(
+    add(
         "--out",
         default="results/report.html",
         metavar="FILE.html",
         help="the page (results/report.html)",
     )
-    parser.add_argument(
-        "--arm", help="arm file: a shipped name or a path; not needed where the bag has its own"
-    )
-    parser.add_argument(
+    add("--arm", help="arm file: a shipped name or a path; not needed where the bag has its own")
+    add(
         "--namespace",
         metavar="NS",
         help="of the one arm that is wanted; all in the bag if not given",
     )
-    parser.add_argument(
-        "--json", action="store_true", help="print the summary's numbers of each run as JSON"
-    )
-    parser.add_argument("--open", action="store_true", help="open the page in a browser")
+    add("--json", action="store_true", help="print the summary's numbers of each run as JSON")
+    add("--open", action="store_true", help="open the page in a browser")
 
 
 def report(options):
