@@ -120,7 +120,6 @@ class Soak:
         self.pids = {name: p.pid for name, p in bench.processes.running.items()}
         self.arm = harness.Arm(bench, joints=self.description.joint_names)
         self.bench.wait_for("the controller to be ready", lambda: self.drain() and self.running())
-        self.arm_now = None
 
     # Messages ----------------------------------------------------------------------------------
 

@@ -96,7 +96,7 @@ class StateReader:
             For names or lengths that are not this arm's, or nanoseconds of a second and more.
         """
         stamp = msg.header.stamp
-        # What answers a refused message carries its stamp, which must be one that a message holds.
+        # The answer to a refused message carries its stamp: it must be one that a message can hold.
         sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
         if stamp.nanosec >= SECOND:
@@ -134,11 +134,11 @@ def _floats(msg, field, size):
 
 
 class StateWriter:
-    """An `ArmState` message whose arrays are written in place; `frame_id` is the `arm`'s base frame."""
+    """An `ArmState` message whose arrays are written in place."""
 
-    def __init__(self, arm, frame_id="base_link"):
+    def __init__(self, arm):
         self.message = msg = ArmState()
-        msg.header.frame_id = frame_id
+        msg.header.frame_id = "base_link"
         msg.joint_names = list(arm.joint_names)
         msg.gauge_names = list(arm.gauge_names)
         msg.mode_names = list(arm.observed_modes)
@@ -272,7 +272,7 @@ class ObserverStateWriter:
         msg.mode_names, msg.gauge_names = list(arm.observed_modes), list(arm.gauge_names)
 
     def fill(self, sample, name, observer, strain, health=None):
-        """Copy what the observer holds; without `health` (gauges,), a gauge is good that is finite."""
+        """Copy what the observer holds; without `health` (gauges,), every finite gauge is good."""
         msg = self.message
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
@@ -302,7 +302,7 @@ def trajectory_points(raw):
     unpack = struct.Struct("<I" if raw[1] & 1 else ">I").unpack_from
 
     def number(at):
-        """The uint32 at, or after, an offset; and what comes after it."""
+        """The first aligned uint32 from an offset on, and the offset after it."""
         at += -at % 4
         return unpack(raw, at)[0], at + 4
 

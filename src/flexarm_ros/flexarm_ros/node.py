@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frame of every node: lifecycle with autostart, diagnostics, clean exit on signals."""
+"""Base class of every node: lifecycle with autostart, diagnostics, clean exit on signals."""
 
 import gc
 import re
@@ -40,7 +40,7 @@ COMMON = (AUTOSTART, *scheduling.PARAMETERS)
 
 
 class ArmNode(LifecycleNode):
-    """A lifecycle node that configures whole or not at all.
+    """A lifecycle node that is configured completely or not at all.
 
     Subclasses implement `build` (parameters to objects, publishers, subscriptions), `start`, `stop` and
     `diagnose`; what they create with the ``create_*`` methods is destroyed on clean-up.
@@ -71,7 +71,7 @@ class ArmNode(LifecycleNode):
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self.failure = ""
 
-    # What subclasses fill in -----------------------------------------------------------------
+    # What subclasses implement ----------------------------------------------------------------
 
     def build(self):
         """Build everything from the parameters; raise a FlexarmError to refuse."""
@@ -223,7 +223,7 @@ class ArmNode(LifecycleNode):
         self._diagnostics.publish(array)
 
     def _now(self):
-        """ROS time, for a stamp that people read; with `use_sim_time` and no /clock yet that of the system."""
+        """ROS time, for stamps that people read; the system's time while `use_sim_time` waits for /clock."""
         now = self.get_clock().now()
         return now if now.nanoseconds else self._system.now()
 
@@ -237,7 +237,7 @@ class ArmNode(LifecycleNode):
         return max(level, WARN), message, {**values, **shown}
 
     def report(self, text):
-        """Log a refusal: at once when it is a new one, else every ten seconds; numbers aside."""
+        """Log a refusal: a new one at once, one that differs only in numbers every ten seconds."""
         kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
         if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:

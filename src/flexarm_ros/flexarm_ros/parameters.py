@@ -32,7 +32,7 @@ def descriptor(parameter):
         description=text,
         additional_constraints="; ".join(limits),
         read_only=parameter.read_only,
-        # Typed by our own check, whose refusal says what to write instead.
+        # Our own check looks at the type: its refusal says what to write instead.
         dynamic_typing=True,
     )
     if parameter.low is not None and parameter.high is not None:
@@ -95,7 +95,7 @@ class NodeParameters:
                 )
 
     def resolve(self, sizes):
-        """Check again with the lengths that are known once the arm is.
+        """Check again, with the lengths that are known once the arm is loaded.
 
         `sizes` maps the names that declarations give as lengths, ``joints`` say, to numbers.
 

@@ -27,7 +27,7 @@ CONTROL_PATH = QoSProfile(
     durability=QoSDurabilityPolicy.VOLATILE,
 )
 
-#: For trajectories: none of several sent at once is to be lost.
+#: For trajectories: when several are sent at once, none may be lost.
 COMMAND = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST,
     depth=10,
@@ -42,7 +42,7 @@ OVERRIDABLE = (
     QoSPolicyKind.RELIABILITY,
     QoSPolicyKind.DURABILITY,
 )
-#: The values of a policy of which one end may offer less than the other asks for: less, more.
+#: Policies of which a publisher may offer less than a subscription asks for: the lesser value, the greater one.
 VALUES = {"reliability": ("best_effort", "reliable"), "durability": ("volatile", "transient_local")}
 
 
@@ -142,12 +142,12 @@ class Mismatches:
         self._found = {k: m for k, m in self._found.items() if id(m.end) not in gone}
 
     def texts(self):
-        """The present mismatches, by topic; those that were fixed or have left are dropped. Not on the control path."""
+        """The present mismatches, by topic, without those that were fixed or whose other end has left."""
         self._found = {k: m for k, m in self._found.items() if self._lasts(m)}
         return {topic: m.text for (topic, _, _), m in self._found.items()}
 
     def _lasts(self, mismatch):
-        """Whether there is still an other end that does not match; not found yet counts as yes."""
+        """Whether an incompatible other end still exists; one that is not discovered yet counts."""
         node, end = self._node, mismatch.end
         look = (
             node.get_subscriptions_info_by_topic
@@ -164,5 +164,5 @@ class Mismatches:
 
 
 def _apart(policy, own, other):
-    """Whether two ends that don't match in a policy may be these; where policies have an order, by their values."""
+    """Whether these may be the two ends that don't match in a policy; policies with an order are compared by value."""
     return policy not in VALUES or getattr(own, policy) != getattr(other, policy)

@@ -27,7 +27,7 @@ _spare = set()
 
 
 def spare():
-    """CPUs that this process might run on and is not bound to; empty unless `apply` has bound it to some."""
+    """The allowed CPUs that `apply` has left out when it bound this process to others; empty before."""
     return frozenset(_spare)
 
 

@@ -16,7 +16,7 @@ from . import moving
 from .listening import Tolerances, check_layout, check_listening
 from .samples import Finding, Received, Verdict, samples
 
-#: Half the duration of a jolt forth and back; how long torques that must not be applied are sent [s].
+#: Half the duration of a jolt forth and back; time for which torques that must be refused are sent [s].
 JOLT, REFUSED = 0.15, 0.15
 #: Attempts at a push, when too many samples were lost to judge it.
 TRIES = 3

@@ -56,7 +56,7 @@ KINDS = {
 }
 #: What every table has beside its fields, and as what.
 _HEAD = {"stamp": np.int64, "session": np.int64, "sequence": np.int64, "reason": np.int32}
-#: So many messages, or bytes, are read before they are put into columns.
+#: Number of messages, or of bytes, that are read before they are put into columns.
 BLOCK, BLOCK_BYTES = 40_000, 32_000_000
 #: Different reasons of refusal that are kept.
 MAX_REASONS = 500
@@ -88,7 +88,7 @@ class Table:
 
 @dataclass
 class Contents:
-    """What a bag has of one arm.
+    """What a bag holds of one arm.
 
     Attributes
     ----------
@@ -259,7 +259,7 @@ def _wanted(topic, kind, namespace):
 
 
 class _Source:
-    """The messages of a bag, as far as it goes."""
+    """The messages of a bag, up to where it is truncated."""
 
     def __init__(self, path, notes):
         self.path, self.notes, self.topics, self.count = path, notes, {}, 0

@@ -136,7 +136,7 @@ class Taken:
         return 0.0 if self._from is None else 1e-9 * (self._to - self._from)
 
     def show(self, elapsed):
-        """A line that is written over, on a terminal."""
+        """Write the status line over the last one, on a terminal."""
         if sys.stderr.isatty():
             n = self.counts["arm_state"]
             sys.stderr.write(

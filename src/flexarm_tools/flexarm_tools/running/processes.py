@@ -108,7 +108,7 @@ def arguments(parameters=None, file=None, remaps=()):
 
 
 class Processes:
-    """Child processes that end with the context, however it ends; nodes and modules with this process, too.
+    """Child processes that end with the context, however that ends, and with this process.
 
     Parameters
     ----------

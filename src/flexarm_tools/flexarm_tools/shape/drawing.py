@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a picture of an arm is made of: lines along its links, the way of its tip, arrows for its torques. No ROS."""
+"""A picture of an arm: lines along its links, the path of its tip, arrows for its torques. No ROS."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class Drawer:
         slow, fast : (n,) array_like, optional
             Torques [N m].
         exaggeration : float
-            The deflections are drawn so many times as large; other than 1, at first order.
+            Factor by which the deflections are enlarged; other than 1, at first order.
 
         Raises
         ------
@@ -118,22 +118,22 @@ class Drawer:
 
 
 class Trail:
-    """The way of the tip, the newest part of it.
+    """The newest part of the tip's path.
 
     Parameters
     ----------
-    most : int
-        So many points are kept.
+    count : int
+        Number of points that are kept.
     gap : float
         A point nearer than this to the one before is left out [m].
     """
 
-    def __init__(self, most, gap):
-        self._points, self._gap = deque(maxlen=most), gap
+    def __init__(self, count, gap):
+        self._points, self._gap = deque(maxlen=count), gap
         self._session = None
 
     def add(self, point, session=0):
-        """Go on to a point; in another session of the source the way begins anew."""
+        """Add a point; another `session` of the source starts the path again."""
         if session != self._session:
             self._points.clear()
             self._session = session
@@ -141,7 +141,7 @@ class Trail:
             self._points.append(np.array(point))
 
     def clear(self):
-        """Forget it all."""
+        """Remove all points."""
         self._points.clear()
 
     @property

@@ -14,15 +14,15 @@ from flexarm_dynamics.models import model
 from flexarm_dynamics.processes import step_back
 from flexarm_studies.loop import parameter_files
 
-#: Pictures per second, and the most of them.
+#: Default and largest number of pictures per second.
 RATE, MAX_RATE = 30.0, 100.0
-#: Points of the tip's way.
+#: Points of the tip's path.
 TRAIL = 300
-#: The page's process, beside the nodes'.
+#: Niceness of the page's process: the nodes go first.
 NICENESS = 10
 #: How far the first target is from where the arm is [rad].
 STEP = 1.0
-#: Without a state for so long the page says so [s].
+#: After this long without a state the page says so [s].
 SILENCE = 2.0
 
 

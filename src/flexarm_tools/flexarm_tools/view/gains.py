@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of a controller's parameters are gains to turn by hand, and from where to where. No ROS."""
+"""Sliders for a controller's gains: which parameters have one, and its range. No ROS."""
 
 import re
 from dataclasses import dataclass, replace
 
 #: Prefixes of the laws' parameters.
 LAWS = {"slow.": "flexarm.slow_laws", "fast.": "flexarm.fast_laws"}
-#: A slider goes to so many times the value at the start, within the declared range.
+#: A slider ends at this multiple of the starting value, within the declared range.
 SPAN = 4.0
-#: To where it goes from a value of zero.
+#: Its end where the starting value is zero.
 FROM_ZERO = 1.0
 STEPS = 400
 
@@ -77,7 +77,7 @@ def of_parameters(values, ranges, hints, laws=None):
 
 
 def span(value, low, high):
-    """Where a slider begins and ends: a range to turn by hand, within the declared one."""
+    """Ends of a slider that starts at `value`, within the declared range `low` to `high`."""
     size = SPAN * abs(value) or FROM_ZERO
     return max(low, -size if low < 0.0 else 0.0), min(high, size)
 

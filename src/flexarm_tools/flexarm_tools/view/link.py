@@ -26,7 +26,7 @@ from flexarm_ros.session import Latest, Session, parameter_messages, plain
 from ..shape.amplitudes import Amplitudes
 from . import gains
 
-#: Gains that are turned are sent once they have rested for so long [s].
+#: A gain that was turned is sent when its slider has rested for this long [s].
 REST = 0.25
 
 
@@ -59,7 +59,7 @@ class Link:
     processes : Processes, optional
         Watched while this serves.
     say : callable
-        Takes what a person should read: (text, whether it is bad news).
+        Shows a message to the user; called with the text, and whether it is an error.
     """
 
     def __init__(self, namespace="", domain=None, processes=None, say=lambda text, bad: None):

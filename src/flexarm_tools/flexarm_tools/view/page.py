@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: a scene, plots, gains and buttons, by viser. It knows no ROS: what is done on it goes into a queue."""
+"""The page: a scene, plots, gains and buttons, by viser. No ROS: what the user does goes into a queue."""
 
 import html
 import queue
@@ -21,7 +21,7 @@ BEAM, GHOST, TRAIL, TIP = (28, 126, 214), (173, 181, 189), (224, 49, 49), (224, 
 SLOW, FAST, HUB = (247, 103, 7), (47, 158, 68), (52, 58, 64)
 #: Span of the plots [s], and how often they are drawn [Hz].
 WINDOW, PLOT_RATE = 10.0, 6.0
-#: So many of the last messages are shown.
+#: Number of messages that are shown.
 MESSAGES = 3
 #: Largest factor of the deflections.
 EXAGGERATION = 20.0
