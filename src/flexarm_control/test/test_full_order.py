@@ -94,14 +94,17 @@ def test_delays_are_those_of_the_loop_that_runs(arm_r, delay):
 
 def test_an_unstable_design_is_refused_naming_its_pole():
     model = build(arm_file.load("two_link"))
-    with pytest.raises(DesignError, match=r"pole at .* 1/s, not left of -stability_margin = -0"):
+    with pytest.raises(DesignError, match="is not left of -stability_margin") as refused:
         design(model, SLOW, {"type": "lqr"}, {"type": "corrected"}, {})
+    assert refused.value.value.real > refused.value.limit == 0.0
 
 
 def test_a_margin_that_is_not_kept_is_refused(arm_r):
     design(arm_r, SLOW, {"type": "lqr"}, {"type": "corrected"}, {"stability_margin": 2.0})
-    with pytest.raises(DesignError, match=r"-2\.4.*not left of -stability_margin = -3"):
+    with pytest.raises(DesignError) as refused:
         design(arm_r, SLOW, {"type": "lqr"}, {"type": "corrected"}, {"stability_margin": 3.0})
+    assert refused.value.value.real == pytest.approx(-2.4, abs=0.1)
+    assert refused.value.limit == -3.0
 
 
 def test_without_a_slow_law_the_joints_drift_and_nothing_is_asked(arm_r):

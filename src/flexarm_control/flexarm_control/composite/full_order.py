@@ -122,18 +122,19 @@ def check(law, q, rate, margin=0.0):
     DesignError
         Naming the pole of the `law` in the configuration q of its design.
     """
+    field = f"poles of the full-order closed loop, sampled at {rate:g} Hz"
     try:
         slowest = poles(law, q, 1.0 / rate)[0]
     except np.linalg.LinAlgError as error:
-        raise DesignError(
-            f"the poles of the full-order closed loop, sampled at {rate:g} Hz, can't be computed ({error})",
-            hint="lower the gains, they are beyond what a double holds",
-        ) from None
+        hint = "lower the gains, they are beyond what a double holds"
+        raise DesignError(f"can't be computed ({error})", field=field, hint=hint) from None
     if slowest.real < -margin + ROUNDING:
         return
-    where = f"{slowest.real:.4g}" + (f" +- {abs(slowest.imag):.4g}j" if slowest.imag else "")
+    real, imag = (float(f"{part:.4g}") for part in (slowest.real, abs(slowest.imag)))
     raise DesignError(
-        f"the full-order closed loop, sampled at {rate:g} Hz, has a pole at {where} 1/s, not left of"
-        f" -stability_margin = {-margin:g}, at joint configuration {np.round(q, 4).tolist()}",
+        f"1/s at joint configuration {np.round(q, 4).tolist()} is not left of -stability_margin",
+        field=field,
+        value=complex(real, imag) if imag else real,
+        limit=0.0 - margin,
         hint="lower the gains (slow.kp, slow.kv, fast.q, fast.alpha), take manifold.type corrected, or a higher rate",
     )
