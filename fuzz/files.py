@@ -4,10 +4,8 @@
 import copy
 import csv
 import io
-import tempfile
 from array import array
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import yaml
@@ -32,7 +30,7 @@ from flexarm_tools.recording import bag
 
 from . import odd
 from .messages import good_state, spoil_state
-from .reader import Reader, demand
+from .reader import FileReader, Reader, demand
 from .trajectories import dump
 
 ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
@@ -195,17 +193,7 @@ class Parameters(Reader):
             demand(parameter.high is None or number <= parameter.high, f"{parameter.name} too high")
 
 
-class _Text(Reader):
-    """Readers of a path."""
-
-    suffix = ""
-
-    def __init__(self):
-        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
-        self.path = Path(self._folder.name) / f"given{self.suffix}"
-
-
-class ParameterFiles(_Text):
+class ParameterFiles(FileReader):
     """`parameter_files.load`, and the check of what it finds."""
 
     name, weight, error, suffix = "parameter file", 0.8, ParameterError, ".yaml"
@@ -241,7 +229,7 @@ class ParameterFiles(_Text):
             demand(all(isinstance(name, str) for name in values), "names that are no text")
 
 
-class Csv(_Text):
+class Csv(FileReader):
     """`recording.read_csv`."""
 
     name, weight, suffix = "recording CSV", 1.0, ".csv"

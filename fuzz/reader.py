@@ -2,6 +2,8 @@
 """Base class of what is fuzzed: readers, each with its inputs and with what must hold for every input."""
 
 import reprlib
+import tempfile
+from pathlib import Path
 from random import Random
 
 from flexarm_dynamics.errors import FlexarmError
@@ -82,6 +84,16 @@ class Reader:
 
     def renew(self):
         """Start again after a failure."""
+
+
+class FileReader(Reader):
+    """A reader of a file: `read` writes its input to `path`, whose name ends in `suffix`."""
+
+    suffix = ""
+
+    def __init__(self):
+        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
+        self.path = Path(self._folder.name) / f"given{self.suffix}"
 
 
 _SHORT = reprlib.Repr()

@@ -2,9 +2,7 @@
 """Readers of motions: messages, files, written motions, and the reference that follows them."""
 
 import copy
-import tempfile
 from array import array
-from pathlib import Path
 
 import numpy as np
 import yaml
@@ -16,7 +14,7 @@ from flexarm_dynamics.errors import TrajectoryError
 from flexarm_dynamics.models import model
 
 from . import odd
-from .reader import Reader, demand
+from .reader import FileReader, Reader, demand
 
 JOINTS = ("joint1", "joint2")
 LOW, HIGH, FASTEST = (-3.0, -2.0), (3.0, 2.0), (4.0, 5.0)
@@ -177,15 +175,10 @@ def _numbers(reference):
     return (*np.concatenate(state).tolist(), *map(float, flags))
 
 
-class _Files(Reader):
+class _Files(FileReader):
     """Files of a trajectory: good ones with bytes or entries changed."""
 
     error, words = TrajectoryError, (*WORDS, "YAML", ".yaml", ".csv", "column")
-    suffix = ""
-
-    def __init__(self):
-        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
-        self.path = Path(self._folder.name) / f"trajectory{self.suffix}"
 
     def read(self, given):
         self.path.write_bytes(given)
@@ -238,7 +231,6 @@ class Written(Reader):
     """`specs.from_spec`: motions written in a line."""
 
     name, weight = "written motion", 0.3
-    words = ("motion", "quintic", "paper", "smooth", "least", "line", "arc", *specs.FAMILIES)
     GOOD = (
         "quintic:to=0.5;0.3,duration=2,points=11",
         "paper:to=0.5,duration=1.5,points=21",
@@ -276,14 +268,6 @@ class Written(Reader):
 
     def check(self, given, result):
         check_trajectory(result, self.model.joint_names, *specs.limits(self.model))
-
-    def check_message(self, error):
-        self_words = self.words
-        self.words = ()  # families of motion have words of their own
-        try:
-            super().check_message(error)
-        finally:
-            self.words = self_words
 
 
 def dump(tree):
