@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`flexarm report`: its numbers against the record itself, its page, and broken bags."""
 
+import contextlib
+import io
 import json
 import re
 from dataclasses import replace
@@ -270,11 +272,17 @@ def checked(text):
 
 
 @pytest.fixture(scope="module")
-def compared(recorded, tmp_path_factory):
-    """The page of both runs."""
+def reported(recorded, tmp_path_factory):
+    """The page of both runs, and what the command prints."""
     out = tmp_path_factory.mktemp("page") / "both.html"
-    flexarm("report", *(path for path, _, _ in recorded.values()), "--out", out)
-    return out.read_text(encoding="utf-8")
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        flexarm("report", *(path for path, _, _ in recorded.values()), "--out", out, "--json")
+    return out, json.loads(printed.getvalue())
+
+
+@pytest.fixture(scope="module")
+def compared(reported):
+    return reported[0].read_text(encoding="utf-8")
 
 
 def test_the_page_is_whole_small_and_needs_no_network(compared):
@@ -284,11 +292,9 @@ def test_the_page_is_whole_small_and_needs_no_network(compared):
     assert set(sections.split()) <= set(checker.ids)
 
 
-def test_the_numbers_of_the_page_as_json(recorded, runs, tmp_path, capsys):
-    paths = [path for path, _, _ in recorded.values()]
-    flexarm("report", *paths, "--out", tmp_path / "both.html", "--json")
-    printed = json.loads(capsys.readouterr().out)
-    assert (tmp_path / "both.html").is_file() and printed["report"] == str(tmp_path / "both.html")
+def test_the_numbers_of_the_page_as_json(reported, runs):
+    out, printed = reported
+    assert printed["report"] == str(out) and list(printed["runs"]) == ["composite", "slow"]
     for name, numbers in printed["runs"].items():
         assert numbers["residual_m"] == pytest.approx(analysis.summary(runs[name])["residual_m"])
 
@@ -390,10 +396,11 @@ def read(path, **options):
     return command.read([path], **options)[0]
 
 
-def test_an_arm_state_alone_makes_a_report(tmp_path):
+def test_an_arm_state_alone_makes_a_report(tmp_path, capsys):
     path = _made_up(tmp_path / "alone", 400)
-    made = command.make([path], tmp_path / "alone.html")
-    text = made.read_text(encoding="utf-8")
+    flexarm("report", path, "--out", tmp_path / "alone.html")
+    assert "alone.html" in capsys.readouterr().out
+    text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     checked(text)
     assert "controller/state is not in the bag" in text
     run = read(path)
