@@ -8,12 +8,12 @@ The boundary layer (11), :math:`\dot z_f = A_2 z_f + B_2 u_f`, taken at one join
 
 with the damping ratio :math:`\zeta_i` and the factor :math:`c_i` of the open frequency. Modes are counted by
 ascending open frequency of the boundary layer, the joints free to move: not the links' own frequencies.
-:math:`\zeta_i = 0` leaves a mode as it is, to the pole: K_f then feeds back the modal coordinates of the
-others alone (left eigenvectors of A2), so that a mode no torque reaches may be left out of the demand.
+:math:`\zeta_i = 0` leaves the poles of a mode exactly as they are: K_f then feeds back only the modal coordinates of
+the others (left eigenvectors of A2). So a mode that no torque reaches can be left out.
 
-One torque: K_f is the only one. Several: modes are moved one after the other, each by the combination of
-torques that reaches it best (modal control, Simon & Mitter 1968); feedback of a mode's own coordinates leaves the
-others' poles. A pole that is not where it belongs in the end refuses the design.
+For one torque K_f is unique. For several, modes are moved one after the other, each by the combination of torques that
+reaches it best (modal control, Simon & Mitter 1968); feedback of a mode's own coordinates does not move the others'
+poles. A design with a pole that is not where it belongs is refused.
 """
 
 import numpy as np

@@ -61,7 +61,7 @@ class Feedforward(Component, ABC):
         return out
 
     def take(self, plan, trajectory_id):
-        """Follow what `prepare` made, or nothing, None, as soon as the reference follows its trajectory."""
+        """Follow `plan`, the result of `prepare` or None, as soon as the reference follows its trajectory."""
 
     def prepare(self, trajectory, start):
         """Design work for a trajectory, off the control path; None where there is none to do.
@@ -83,7 +83,7 @@ class Feedforward(Component, ABC):
         """
 
     def look_ahead(self, reference, dt):
-        """Work beforehand on the sample that will come after `dt` [s], between two samples; changes no result.
+        """Compute ahead, between two samples, for the sample that comes after `dt` [s]; changes no result.
 
         Returns
         -------

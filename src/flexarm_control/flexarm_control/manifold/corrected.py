@@ -20,9 +20,9 @@ is left out is of order mu^(k+1). With the joint rows of (2) the joints then mov
 .. math:: u = \bar u + M_{12}\ddot\delta + C_1\dot\delta + K_1(\delta - \delta^{(0)}) .
 
 The derivatives are taken along the slow motion through the present state, by central differences over
-`expansion.step`: the reference goes on as it is known to, and the tracking error decays as the slow law makes it,
-:math:`\ddot e = -k_v\dot e - k_p e`, so that the manifold holds off the reference, too, and the slow poles stay
-where they were placed. The derivation, beside a manifold found numerically: docs/control.md.
+`expansion.step`. The reference is known, and under the slow law the tracking error decays by
+:math:`\ddot e = -k_v\dot e - k_p e`. So the manifold holds off the reference, too, and the slow poles stay where they
+were placed. docs/control.md has the derivation, beside a manifold found numerically.
 """
 
 import numpy as np
@@ -77,7 +77,7 @@ class CorrectedManifold(Manifold):
         """Position, velocity, acceleration of the slow motion at a point of the stencil, (3, n)."""
         motion, t, n = reference.near(j * self._step).copy(), j * self._step, self.model.n_joints
         if self._flow is None:
-            # A law of another kind: what it adds to the reference's acceleration stays for this while.
+            # A law of another kind: what it adds to the reference's acceleration is taken as constant.
             motion[0] += -error[:n] - t * error[n:] + 0.5 * t * t * extra
             motion[1] += -error[n:] + t * extra
             motion[2] += extra

@@ -8,8 +8,8 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 def step(order):
     """Step of the central differences [s].
 
-    Of a motion within a second they are off by 1e-6 at most, and rounding by less. From order 3 on differences are
-    taken of differences: there a longer step keeps rounding down.
+    For a motion of a second their error is at most 1e-6, and rounding is less. From order 3 on differences are taken of
+    differences: a longer step then keeps rounding small.
     """
     return 1e-3 if order <= 2 else 4e-3
 

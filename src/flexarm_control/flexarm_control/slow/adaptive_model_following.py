@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Model following that learns the payload (Slotine & Li 1987), on the slow subsystem (10).
 
-The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file
-(the centre of mass stays where it is). The regressor Y is what one payload more takes, the difference of two rigid
-arms. With C in Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's
+The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file, with
+the same centre of mass. The regressor Y is the torque of one more payload, the difference of two rigid arms. With C in Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's
 estimate,
 
 .. math::
@@ -15,22 +14,22 @@ estimate,
 :math:`V = \tfrac12 s^TM_ps + (\hat p - p)^2/2\gamma` has :math:`\dot V = -s^TM_{\hat p}\Lambda_2 s \le 0` (for
 joints of equal rates): s and with it the error vanish, whatever the payload, and :math:`\hat p \to p` where the
 motion excites it. -Lambda and -Lambda_2 are the poles of `kp` and `kv`, :math:`(\sigma + \Lambda)(\sigma +
-\Lambda_2) = \sigma^2 + k_v\sigma + k_p`: with the payload known this is model following (13) but for C s, and
-without for one joint.
+\Lambda_2) = \sigma^2 + k_v\sigma + k_p`: with the payload known this is model following (13) plus C s, which is
+zero for one joint.
 
-The estimate belongs to the law's `model`, so that the slow manifold, too, bends the links as that payload would: else
-the fast control works against every payload but the arm file's, and the estimate goes astray by it.
+The estimate is part of the law's `model`, so that the slow manifold bends the links as that payload would. Otherwise
+the fast control would work against any payload but the arm file's, and mislead the estimate.
 
-Nothing leaks: where the arm rests without gravity Y vanishes and the estimate stays. It is kept over trajectories, so
-that the next one starts from what the last one taught, and forgotten when a session begins. While the slow torque is
-beyond a joint's limit nothing is learnt, nor from s within `dead_zone`: these errors are not the payload's.
+There is no leakage: at rest without gravity Y vanishes and the estimate stays. It is kept from one trajectory to the
+next and forgotten when a session begins. Nothing is learnt while the slow torque is beyond a joint's limit, or from s
+within `dead_zone`: these errors do not come from the payload.
 
 gamma is normalised by the arm, so that `adaptation_gain` means the same for each: under a steady acceleration A of
 one joint the estimate's error obeys :math:`\ddot{\tilde p} + \Lambda_2\dot{\tilde p} + \Gamma A^2\tilde p = 0`;
 under gravity gamma is lowered so that the weight alone adds no more than :math:`\Lambda_2^2` to the last factor.
 
-Assumes that everything but the payload is known, and that the payload in the arm file is not zero: it is the
-direction in which the estimate looks.
+Assumes that everything but the payload is known, and that the payload in the arm file is not zero: the estimate is a
+multiple of it.
 """
 
 import numpy as np

@@ -9,12 +9,12 @@ the inverse dynamics of the rigid arm (Coriolis, gravity and friction are in a) 
 1980; Sciavicco & Siciliano, *Modelling and control of robot manipulators*, ch. 6). With ``ki = 0`` and
 ``feedforward_at: state`` it is `model_following` (13) itself. It differs in two things:
 
-- the integral w takes away what is left at rest of an error in payload, gravity or friction, where (13) keeps
-  B d / kp for ever. It is stable for ki < kp kv (Routh); w stops at its clamp, and while the slow torque is beyond
-  a joint's limit it does not grow in that direction;
+- the integral w removes the error at rest that a wrong payload, gravity or friction d causes; (13) keeps B d / kp.
+  It is stable for ki < kp kv (Routh). w stops at its clamp, and while the slow torque is beyond a joint's limit it
+  does not grow in that direction;
 - x_c, where a and B are taken: the measured state, or with ``feedforward_at: reference`` the reference
-  (q_ref, qd_ref). Then no measured speed goes through Coulomb friction or Coriolis terms, whose noise is not fed
-  back; but they are cancelled to first order in the error only, so that the gains have to carry the rest.
+  (q_ref, qd_ref). Then no noise of measured speeds is fed back through Coulomb friction and Coriolis terms. They are
+  cancelled to first order in the error only; the gains must do the rest.
 
 Assumes that a and B are known up to a slowly varying torque; linear error dynamics with ``state`` alone.
 """

@@ -13,9 +13,9 @@ y_0 in the directions that do not move the tip (the null space, for redundant ar
 
 :math:`J^*` is the damped inverse of Nakamura & Hanafusa (1986), :math:`\sigma/(\sigma^2 + \lambda^2)` for each
 singular value, with the damping :math:`\lambda^2 = \varepsilon^2 - \sigma^2` that sets in where sigma is below
-epsilon and grows towards the singularity: 1/sigma above epsilon, sigma/epsilon^2 below. What the tip gives up in
-such a direction y_0 takes over, in the shares (sigma/epsilon)^2 and 1 - (sigma/epsilon)^2. So a stretched arm, or
-a direction in which a planar arm or one joint can't move its tip, needs no case of its own.
+epsilon and grows towards the singularity: 1/sigma above epsilon, sigma/epsilon^2 below. There the tip's law has the
+weight (sigma/epsilon)^2 and y_0 has the rest. So a stretched arm, or a direction in which a planar arm or one joint
+can't move its tip, needs no case of its own.
 
 Assumes that a and B are known as in the arm file, and that the arm is on the same side of a singularity as its
 reference (elbow up or down): else the tip arrives with the other elbow.

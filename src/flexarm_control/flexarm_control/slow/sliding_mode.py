@@ -16,12 +16,12 @@ the bounds `disturbance_bound` (payload's weight, friction, a push) and `inertia
     K = \frac{\max_i(F_i + \eta_i) + \rho w}{1 - \rho},
 
 every joint outside its layer fulfils the sliding condition :math:`\tfrac12\tfrac{d}{dt}s_i^2 \le -\eta_i|s_i|`:
-K is the largest k, so that k_i holds against what the other joints' switching leaks through the wrong inertia. The
-layer is reached within :math:`(|s_i(0)| - \phi_i)/\eta_i` and kept, and in it :math:`|e_i|` falls to
+K is the largest k: k_i also covers the other joints' switching, which acts through the wrong inertia. The layer is
+reached within :math:`(|s_i(0)| - \phi_i)/\eta_i` and kept, and in it :math:`|e_i|` falls to
 :math:`\phi_i/\Lambda_i`.
 
-Inside the layer the law is linear, with the bandwidth k/phi: that is what meets the bending of the links. A layer
-too thin for it (`warnings`) makes the switching excite the fast subsystem that (10) leaves out.
+Inside the layer the law is linear, with bandwidth k/phi. If the layer is too thin, that bandwidth excites the fast
+subsystem, which (10) leaves out; `warnings` names the width to take.
 """
 
 import numpy as np
