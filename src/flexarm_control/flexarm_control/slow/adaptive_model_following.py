@@ -2,8 +2,8 @@
 r"""Model following that learns the payload (Slotine & Li 1987), on the slow subsystem (10).
 
 The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file, with
-the same centre of mass. The regressor Y is the torque of one more payload, the difference of two rigid arms. With C in Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's
-estimate,
+the same centre of mass. The regressor Y is the torque of one more payload, the difference of two rigid arms. With C in
+Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's estimate,
 
 .. math::
     s &= \dot e + \Lambda e, \qquad \dot q_r = \dot q_{ref} + \Lambda e, \qquad e = q_{ref} - q, \\
