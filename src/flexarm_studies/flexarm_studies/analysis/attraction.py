@@ -53,17 +53,9 @@ def lowest_shape(case):
 
 
 def comes_back(case, joint, bend, watched):
-    """Whether the loop brings the arm back from an offset to the motion's end.
+    """Whether the loop brings the arm back from an offset to the motion's end, while it is `watched` [s].
 
-    Parameters
-    ----------
-    case : Case
-    joint : ndarray, shape (n,)
-        [rad]
-    bend : ndarray, shape (m,)
-        About the static deflection [m, rad].
-    watched : float
-        [s]
+    The offset is `joint` (n,) [rad], and `bend` (m,) about the static deflection [m, rad].
     """
     q = case.q
     values = case.scenario.controller | {"start_tolerance": 10.0}
@@ -91,20 +83,10 @@ def comes_back(case, joint, bend, watched):
 
 
 def study(case, steps=5, progress=None):
-    """Largest scale along each ray from which the arm comes back.
+    """Largest scale along each ray from which the arm comes back, by so many `steps` of bisection.
 
-    Parameters
-    ----------
-    case : Case
-    steps : int
-        Number of bisections, after the largest offset has failed.
-    progress : Progress, optional
-
-    Returns
-    -------
-    dict
-        ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
-        ``searched``, the largest one tried. `scale` is equal to it where the arm came back even from there.
+    Returns ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
+    ``searched``, the largest one tried. The scale is equal to it where the arm came back even from there.
     """
     if case.without_poles:
         return {"reason": case.without_poles, "rays": []}

@@ -67,18 +67,12 @@ class Blocks:
 
 
 def blocks(case):
-    """The case's loop as `Blocks`.
-
-    Raises
-    ------
-    DesignError
-        For a fast law with states, and for an arm without modes.
-    """
+    """The case's loop as `Blocks`; refused for a fast law with states, and for an arm without modes."""
     model, law, q = case.model, case.law, case.q
     n, m = model.n_joints, model.n_modes
     K = law.fast.gain(q)
     if not m:
-        raise DesignError(f"{model.arm.name} has no modes: there is no fast subsystem")
+        raise DesignError("has no modes: there is no fast subsystem", field=model.arm.name)
     if K is None:
         raise DesignError("the fast law has states: the theorem is applied to K_f z_f only")
     A, B = linear.linear_plant(model, q)
@@ -118,23 +112,9 @@ def constants(b, S1, S2):
 
 
 def optimised(b, evaluations=2500):
-    """The largest bound that a search over the weights finds; see `constants`.
+    """`constants` with the largest bound that a search over the weights finds, in about so many `evaluations`.
 
-    Parameters
-    ----------
-    b : Blocks
-    evaluations : int
-        About how often the bound is computed.
-
-    Returns
-    -------
-    dict
-        As `constants`.
-
-    Raises
-    ------
-    DesignError
-        When the slow or the fast part alone is unstable: the theorem does not apply.
+    `b` are the `Blocks`; where the slow or the fast part alone is unstable the theorem does not apply: a DesignError.
     """
     for name, A in (("slow", b.A11), ("fast", b.A_f)):
         worst = np.linalg.eigvals(A).real.max()
@@ -216,10 +196,7 @@ def stable_factor(b, until=MAX_FACTOR):
 def redesign_factor(case, until=MAX_FACTOR):
     """Factor of mu up to which a design made for the slower bending is stable, by the poles of the sampled loop.
 
-    Returns
-    -------
-    float or None
-        None if it is stable up to `until`.
+    None if it is stable up to `until`.
     """
 
     def stable(factor):
@@ -247,23 +224,12 @@ def simulated(case, factor):
 
 
 def study(case, mu, quick=False):
-    """The bound, and the mu at which the loop in fact becomes unstable.
+    """The bound, and the mu at which the loop in fact becomes unstable; if `quick` by a shorter search, without runs.
 
-    Parameters
-    ----------
-    case : Case
-    mu : float
-        Of the design.
-    quick : bool
-        A shorter search, no runs.
-
-    Returns
-    -------
-    dict
-        ``mu``; ``bound``, a mu, and its constants; ``linear_limit`` and ``redesign_limit``, mu where the linear
-        family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: the design is
-        unstable); ``simulated``, whether nonlinear runs on either side of the latter are stable; or ``reason``, why
-        there is no bound.
+    Returns ``mu``, that of the design; ``bound``, a mu, and its constants; ``linear_limit`` and ``redesign_limit``, mu
+    where the linear family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: the design
+    is unstable); ``simulated``, whether nonlinear runs on either side of the latter are stable; or ``reason``, why
+    there is no bound.
     """
     found = {"mu": mu, "searched": MAX_FACTOR * mu}
     reason = case.without_poles

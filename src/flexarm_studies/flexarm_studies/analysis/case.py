@@ -9,6 +9,7 @@ import numpy as np
 from flexarm_control.composite import full_order
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm, scaled
+from flexarm_dynamics.models import model
 
 from ..loop import scenario as scenarios
 
@@ -73,8 +74,6 @@ class Case:
         gain : float
             Of the torque on its way to the arm [-].
         """
-        from flexarm_dynamics.models import model
-
         met = None if plant is None else model.build(plant)
         return full_order.poles(self.law, self.q, period or self.period, delay, met, gain)
 
@@ -89,13 +88,7 @@ def unchecked(scenario):
 
 
 def of(scenario):
-    """The case that a scenario describes.
-
-    Raises
-    ------
-    FlexarmError
-        For an impossible arm, parameter, design or trajectory.
-    """
+    """The case that a `scenario` describes."""
     scenario = unchecked(scenario)
     loop = scenarios.loop_of(scenario)
     motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
@@ -128,16 +121,7 @@ def slower_bending(scenario, factor):
     control is redesigned for the same loop in its own time: in (18) :math:`\delta/\mu^2`, :math:`\dot\delta/\mu` and
     :math:`t/\mu` replace delta, its rate and t. Gains of other laws follow from the arm.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    factor : float
-        Above 0 [-].
-
-    Returns
-    -------
-    Scenario
-        Its `arm` is an `Arm`.
+    Returns the `scenario` with an `Arm` as its arm.
     """
     arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
     kind = scenarios.type_of("fast", scenario.controller)

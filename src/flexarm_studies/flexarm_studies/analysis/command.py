@@ -3,6 +3,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 
@@ -73,8 +74,6 @@ def analyze(options):
     found = study(scenario, options, Progress())
     text = json.dumps(found, allow_nan=False)
     if options.out:
-        from pathlib import Path
-
         from . import figures
 
         directory = Path(options.out)

@@ -83,21 +83,10 @@ TRIED = ("delay", "gain_high")
 
 
 def study(case, runs=True, tried=TRIED, progress=None):
-    """All margins.
+    """All margins; with `runs`, nonlinear runs confirm those of `tried`, and noise is judged.
 
-    Parameters
-    ----------
-    case : Case
-    runs : bool
-        Whether nonlinear runs confirm those of `tried`, and noise is judged.
-    tried : sequence of str
-    progress : Progress, optional
-
-    Returns
-    -------
-    dict
-        ``reason``; ``decay_per_s``; per margin ``value`` (None: none up to ``searched``) and, where tried,
-        ``confirmed`` and ``simulated``; ``plants``: how fast the loop dies out on other arms; ``noise``.
+    Returns ``reason``; ``decay_per_s``; per margin ``value`` (None: none up to ``searched``) and, where tried,
+    ``confirmed`` and ``simulated``; ``plants``: how fast the loop dies out on other arms; ``noise``.
     """
     if case.without_poles:
         return {"reason": case.without_poles, "stable": None}
@@ -105,13 +94,10 @@ def study(case, runs=True, tried=TRIED, progress=None):
     found = {"reason": "", "stable": nominal > -full_order.ROUNDING, "decay_per_s": nominal}
     every = {kind.name: of_poles(case, kind) for kind in kinds(case)}
     found["margins"] = every
+    decays = [case.decay(plant=scaled(case.arm, **{name: v})) for name, v in PLANTS]
     found["plants"] = [
-        {
-            "what": name,
-            "factor": v,
-            "decay_per_s": case.decay(plant=scaled(case.arm, **{name: v})),
-        }
-        for name, v in PLANTS
+        {"what": name, "factor": v, "decay_per_s": decay}
+        for (name, v), decay in zip(PLANTS, decays, strict=True)
     ]
     if runs and found["stable"]:
         names = [k for k in kinds(case) if k.name in tried and every[k.name]["value"] is not None]
@@ -144,16 +130,11 @@ def _beside(kind, value, fraction):
 
 
 def by_runs(case, kind, value):
-    """Check a margin by nonlinear runs.
+    """Check a margin by nonlinear runs; `kind` is the `Margin`, `value` that of the linear loop.
 
-    `kind` is the `Margin`, `value` that of the linear loop.
-
-    Returns
-    -------
-    dict
-        ``confirmed``: stable at 0.9 and unstable at 1.1 of the margin (of its logarithm for factors); ``simulated``:
-        the margin of the loop with its observer where it differs, else None; ``at_least``: whether that is only
-        the largest value tried.
+    Returns ``confirmed``: stable at 0.9 and unstable at 1.1 of the margin (of its logarithm for factors);
+    ``simulated``: the margin of the loop with its observer where it differs, else None; ``at_least``: whether that is
+    only the largest value tried.
     """
     unstable = kind.poles(case, _beside(kind, value, 1.02))
     watched = trial.long_enough(case.poles(**unstable)[0])

@@ -65,13 +65,7 @@ class Specification:
 
 
 def specification(scenario, seed=0):
-    """The specification of runs about a scenario.
-
-    Raises
-    ------
-    FlexarmError
-        For a negative seed, and a missing arm file.
-    """
+    """The specification of runs about a `scenario`; a negative seed and a missing arm file are refused."""
     if seed < 0:
         raise ParameterError("is too small", field="--seed", value=seed, limit="0 or more")
     arms = {a for a in (scenario.arm, scenario.plant_arm) if a}
@@ -89,11 +83,8 @@ def draw(spec, number):
 def sample(spec, number):
     """Run sample `number` of the specification `spec`; also called in other processes.
 
-    Returns
-    -------
-    dict
-        ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; of metrics per joint the
-        largest. A refused run counts as lost, with its error as the reason.
+    Returns ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; of metrics per joint the
+    largest. A refused run counts as lost, with its error as the reason.
     """
     drawn = draw(spec, number)
     try:
@@ -228,7 +219,7 @@ class Store:
             self.results = {row["sample"]: row for row in whole[1:]}
         self._file = self.path.open("a", encoding="utf-8")
         if not whole:
-            self._write(header)
+            self.append(header)
 
     def _whole(self):
         """Rows of the complete lines; the file is cut after them."""
@@ -262,11 +253,8 @@ class Store:
             hint="use another --out, or remove the file",
         )
 
-    def append(self, result):
-        """Write a result to the file at once."""
-        self._write(result)
-
-    def _write(self, row):
+    def append(self, row):
+        """Write a `row` to the file at once."""
         self._file.write(json.dumps(row, allow_nan=False) + "\n")
         self._file.flush()
 
@@ -276,18 +264,10 @@ class Store:
 
 
 def summary(results):
-    """Fraction of lost runs, and quantiles of the other runs' metrics.
+    """Fraction of lost runs among the `results`, and quantiles of the other runs' metrics.
 
-    Parameters
-    ----------
-    results : list of dict
-
-    Returns
-    -------
-    dict
-        ``samples``, ``lost``, ``lost_share`` (a fraction), ``lost_share_95``: its 95 % interval after Wilson;
-        ``not_settled``; ``quantiles``: per metric those of `QUANTILES`, and ``max``; ``lost_samples``: numbers and
-        reasons.
+    Returns ``samples``, ``lost``, ``lost_share`` (a fraction), ``lost_share_95``: its 95 % interval after Wilson;
+    ``not_settled``; ``quantiles``: per metric those of `QUANTILES`, and ``max``; ``lost_samples``: numbers and reasons.
     """
     lost = [r for r in results if r["metrics"]["lost"]]
     kept = [r["metrics"] for r in results if not r["metrics"]["lost"]]

@@ -44,12 +44,9 @@ def slow_poles(case):
 
 
 def at(case, q, qd, slow):
-    """Time scales and reachability at one state.
+    """Time scales and reachability at one state, for these poles of the `slow` subsystem [1/s].
 
-    Returns
-    -------
-    dict
-        ``mu``, ``mu_closed`` (of the controlled boundary layer), ``singular_value`` of Hautus' test.
+    Returns ``mu``, ``mu_closed`` (of the controlled boundary layer), and ``singular_value`` of Hautus' test.
     """
     terms = case.model.terms(q, qd)
     A2, B2 = fast_subsystem(terms)
@@ -83,19 +80,9 @@ def configurations(model, count, seed):
 
 
 def study(case, count=200, seed=0):
-    """Time scales along the motion and over the workspace.
+    """Time scales along the motion and in `count` configurations of the workspace.
 
-    Parameters
-    ----------
-    case : Case
-    count : int
-        Configurations of the workspace.
-    seed : int
-
-    Returns
-    -------
-    dict
-        Ready for JSON; without a slow loop or modes only ``reason``.
+    Ready for JSON; without a slow loop or modes only ``reason``.
     """
     slow = slow_poles(case)
     if slow is None or not case.model.n_modes:
@@ -154,13 +141,9 @@ def spectra(case, slow):
 def gain_sweep(case, factors=GAINS):
     """How a faster slow loop affects the bending: full-order poles over slow.kp, with kv for critical damping.
 
-    `factors` multiply slow.kp [-].
-
-    Returns
-    -------
-    dict
-        ``reason``, or ``rows``: per factor of kp the fast modes' frequency [rad/s] and damping ratio (those of
-        the 2m fastest poles), the slowest pole's real part and the poles; a row whose design fails has None.
+    `factors` multiply slow.kp [-]. Returns ``reason``, or ``rows``: per factor the fast modes' frequency [rad/s] and
+    damping ratio (those of the 2m fastest poles), the slowest pole's real part and the poles; a row whose design fails
+    has None.
     """
     parameters = case.law.slow.parameters
     if not {"kp", "kv"} <= set(parameters):

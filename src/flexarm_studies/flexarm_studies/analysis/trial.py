@@ -35,24 +35,11 @@ def small_motion(q):
 
 
 def dies_out(scenario, q, gain=1.0, watched=WATCHED):
-    """Whether the vibration that a small motion to q leaves dies out.
+    """Whether the vibration that a small motion to q leaves dies out, while it is `watched` [s].
 
-    Parameters
-    ----------
-    scenario : Scenario
-        Its trajectory is replaced.
-    q : ndarray, shape (n,)
-        [rad]
-    gain : float
-        Factor on the torque between controller and arm [-].
-    watched : float
-        [s]
-
-    Returns
-    -------
-    bool
-        False if joints and deflections, or the torque, move in the last third of the time as much as in the third
-        before; if the torque is at its limit in the last third; if the loop loses the arm or is refused.
+    The `scenario` has its trajectory replaced; `gain` is a factor on the torque between controller and arm [-]. False
+    if joints and deflections, or the torque, move in the last third of the time as much as in the third before; if the
+    torque is at its limit in the last third; if the loop loses the arm or is refused.
     """
     trial = replace(scenario, trajectory=small_motion(q), repeat=1)
     try:

@@ -29,11 +29,7 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 class Baseline:
     """What `ArmController` and `ClosedLoop` need from a control law.
 
-    Parameters
-    ----------
-    model : ArmModel
-    seen : dict, optional
-        Results of `along`; laws of the same arm that run the same motion may share them.
+    `seen` has results of `along`; laws of the same arm that run the same motion may share it.
 
     Attributes
     ----------
@@ -83,14 +79,8 @@ class Baseline:
 class JointPid(Baseline):
     """PID of each joint; see the module.
 
-    Parameters
-    ----------
-    model : ArmModel
-    gains : mapping of str to ndarray, shape (n,)
-        ``p`` [N m/rad], ``i`` [N m/(rad s)], ``d`` [N m s/rad], ``i_clamp`` [N m], ``velocity`` [N m s/rad],
-        ``acceleration`` [kg m^2].
-    seen : callable, optional
-        As in `Baseline`.
+    The `gains`, each (n,), are ``p`` [N m/rad], ``i`` [N m/(rad s)], ``d`` [N m s/rad], ``i_clamp`` [N m],
+    ``velocity`` [N m s/rad] and ``acceleration`` [kg m^2].
     """
 
     def __init__(self, model, gains, seen=None):
@@ -146,13 +136,8 @@ class FullStateLqr(Baseline):
         alpha, the prescribed degree of stability [1/s].
     feedforward : float
         Fraction of the rigid arm's torque for the reference's acceleration [-].
-    seen : callable, optional
+    seen : dict, optional
         As in `Baseline`.
-
-    Raises
-    ------
-    DesignError
-        When the Riccati equation has no stabilising solution.
     """
 
     def __init__(self, model, q, rate, sizes, decay=0.0, feedforward=1.0, seen=None):
@@ -196,7 +181,8 @@ def lqr_gain(model, q, rate, sizes, decay=0.0):
     try:
         P = solve_discrete_are(Phi, Gamma, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:
+        problem = f"the Riccati equation has no stabilising solution: {error}"
         raise DesignError(
-            f"LQR of {model.arm.name}: no stabilising solution of the Riccati equation ({error}); other sizes"
+            problem, field=f"LQR of {model.arm.name}", hint="try other sizes"
         ) from None
     return np.linalg.solve(R + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)

@@ -69,19 +69,12 @@ CASES = (
 
 
 def find(names):
-    """The cases of the arms `names`.
-
-    Raises
-    ------
-    FlexarmError
-        For an unknown name.
-    """
+    """The cases of the arms `names`."""
     known = {s.arm: s for s in CASES}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise FlexarmError(
-            "is unknown", field="--arms", value=",".join(unknown), limit=", ".join(known)
-        )
+        given, limit = ",".join(unknown), ", ".join(known)
+        raise FlexarmError("is unknown", field="--arms", value=given, limit=limit)
     return [known[name] for name in names]
 
 

@@ -12,6 +12,7 @@ from itertools import product
 
 import numpy as np
 
+from ..loop.scenario import type_of
 from . import cases
 from .controllers import Setup
 
@@ -34,12 +35,7 @@ DAMPING = 0.4
 def shipped(case):
     """The parts of the shipped controller, in the order of `PARTS`."""
     values = case.values()
-    named = [values.get(f"{p}.type") for p in PARTS[:3]]
-    defaults = ("linear_model_following", "lqr", "corrected")
-    return (
-        *(n or d for n, d in zip(named, defaults, strict=True)),
-        values.get("feedforward", "model"),
-    )
+    return *(type_of(part, values) for part in PARTS[:3]), values.get("feedforward", "model")
 
 
 def of(case):

@@ -16,7 +16,7 @@ from ..progress import Progress
 from ..workers import processes
 from . import cases, combinations, report
 from .controllers import CONTROLLERS, PREVIEW, prepared
-from .trial import run
+from .trial import REFUSED, run
 from .tuning import tune
 
 #: For `--quick`: the one arm, the number of simulations, and the window after the motion [s].
@@ -78,13 +78,7 @@ def store(found, path):
 
 
 def load(path):
-    """Stored rows.
-
-    Raises
-    ------
-    FlexarmError
-        For a file that --json did not write.
-    """
+    """Stored rows; a file that --json did not write is refused."""
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         found["subjects"][0]["contenders"]
@@ -94,13 +88,7 @@ def load(path):
 
 
 def merged(runs):
-    """Merge comparisons into one: rows of the same arm are put together.
-
-    Raises
-    ------
-    FlexarmError
-        When runs on the same arm differ in motion, rate, window, budget or seed.
-    """
+    """Merge `runs` into one comparison: rows of the same arm, which must agree in motion, rate, window and so on."""
     by_arm = {}
     for run_ in runs:
         for case in run_["subjects"]:
@@ -129,9 +117,7 @@ def chosen(options):
     if options.contenders == "none":
         names = []
     elif options.contenders:
-        names = [name.strip() for name in options.contenders.split(",")]
-        # "joint PID, ZV shaper" has a comma of its own.
-        names = _joined(names)
+        names = _joined([name.strip() for name in options.contenders.split(",")])
     wanted = cases.find([QUICK] if options.quick else options.arms.split(","))
     if options.quick:
         wanted = [replace(s, window=QUICK_WINDOW, depth="star") for s in wanted]
@@ -144,6 +130,7 @@ def chosen(options):
 
 
 def _joined(words):
+    """Names of controllers from what stands between commas: "joint PID, ZV shaper" has a comma of its own."""
     names, rest = [], list(words)
     while rest:
         for count in (2, 1):
@@ -172,12 +159,10 @@ def jobs_of(wanted, names):
 
 
 def evaluate(case, name, seed):
-    """Tune a controller and run it without and with noise; also called in other processes.
+    """Tune the controller `name` and run it without and with noise; also called in other processes.
 
-    Returns
-    -------
-    dict
-        ``row`` and ``noisy`` as `trial.run` has them, ``gains`` by name, ``simulations``, ``first`` and ``best`` cost.
+    Returns ``row`` and ``noisy`` as `trial.run` has them, ``gains`` by name, ``simulations``, and the ``first`` and
+    ``best`` cost.
     """
     candidate = CONTROLLERS[name]
     free = candidate.free(case)
@@ -186,7 +171,7 @@ def evaluate(case, name, seed):
         try:
             return run(case, prepared(case, name, values), **noise)
         except FlexarmError as error:
-            return {"refused": str(error), "cost": 1e4}
+            return {"refused": str(error), "cost": REFUSED}
 
     screen = candidate.screen and partial(candidate.screen, case)
     values, history = [], []
@@ -213,33 +198,27 @@ def _do(job, seed):
 
 
 def study(options, progress, each=lambda found: None):
-    """Tune and run all controllers.
+    """Tune and run all controllers; `each` is called with the results so far after every job.
 
-    Parameters
-    ----------
-    options : namespace
-    progress : Progress
-    each : callable, optional
-        Called with the results so far after every job.
-
-    Returns
-    -------
-    dict
-        As in docs/comparison.json: ``seed``, and a list of cases, each with ``arm``, ``motion``, ``rate_Hz``,
-        ``window_s``, ``budget``, the controllers by name, and the list ``combinations``.
+    Returns what docs/comparison.json holds: ``seed``, and a list of cases, each with ``arm``, ``motion``, ``rate_Hz``,
+    ``window_s``, ``budget``, the controllers by name, and the list ``combinations``.
     """
     wanted, names = chosen(options)
     jobs = jobs_of(wanted, names)
     results = {}
     workers = min(options.workers or os.cpu_count() or 1, len(jobs))
+
+    def gathered():
+        return {"seed": options.seed, "subjects": [_of_arm(s, jobs, results) for s in wanted]}
+
     for i, found in _results(jobs, options.seed, workers):
         results[i] = found
         case, what = jobs[i]
         label = what if isinstance(what, str) else " + ".join(what)
         progress.step(f"{case.arm}: {label}", len(results), len(jobs))
-        each(_gathered(options.seed, wanted, jobs, results))
+        each(gathered())
     progress.done()
-    return _gathered(options.seed, wanted, jobs, results)
+    return gathered()
 
 
 def _results(jobs, seed, workers):
@@ -254,12 +233,8 @@ def _results(jobs, seed, workers):
             yield waiting[future], future.result()
 
 
-def _gathered(seed, wanted, jobs, results):
-    """Rows by arm of the finished jobs, in the jobs' order."""
-    return {"seed": seed, "subjects": [_of_arm(s, jobs, results) for s in wanted]}
-
-
 def _of_arm(case, jobs, results):
+    """Rows of the finished jobs of a case, in the jobs' order."""
     mine = [(w, results[i]) for i, (s, w) in enumerate(jobs) if s == case and i in results]
     return {
         "arm": case.arm,

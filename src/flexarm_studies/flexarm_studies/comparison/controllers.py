@@ -99,21 +99,13 @@ def _shipped_setup(case, values):
     return Setup(case.values())
 
 
-def _preview_setup(case, values):
-    return Setup(case.values() | {"feedforward": "preview"})
-
-
 def _composite_free(case):
-    alpha = float(_alpha(case.values()))
+    alpha = float(case.values().get("fast.alpha", 5.0))
     return (
         Free("slow poles, times", 0.3, 3.0, 1.0, log=True),
         Free("fast.q, times", 1e-2, 1e2, 1.0, log=True),
         Free("fast.alpha [1/s]", 0.0, max(2.0 * alpha, 2.0), alpha),
     )
-
-
-def _alpha(values):
-    return values.get("fast.alpha", 5.0)
 
 
 def _composite_setup(case, values):
@@ -238,23 +230,18 @@ def _shaped_screen(case, values):
 
 
 def shaper_for(case, gains, kind):
-    """Shaper of the lowest modes that ring under the PID law, at the motion's end.
+    """Shaper of the lowest modes that ring under the PID law with these `gains` at the motion's end.
 
-    `kind` is zv or zvd.
-
-    Raises
-    ------
-    DesignError
-        When none rings, or the law alone is unstable.
+    `kind` is zv or zvd. Refused where none rings, or the law alone is unstable.
     """
     end = cases.ends_of(case)[1]
     poles = JointPid(cases.model_of(case.arm), gains).poles(end)
     omega, zeta = frequencies_and_damping(poles)
     if poles.real.max() > 0.0:
-        raise DesignError(f"{case.arm}: the joints' PID alone is unstable")
+        raise DesignError("the joints' PID alone is unstable", field=case.arm)
     rings = zeta < DAMPED
     if not rings.any():
-        raise DesignError(f"{case.arm}: nothing rings under the joints' PID: no shaper")
+        raise DesignError("nothing rings under the joints' PID: no shaper", field=case.arm)
     return shapers.for_modes(kind, omega[rings][:SHAPED], np.maximum(zeta[rings][:SHAPED], 0.0))
 
 
@@ -330,7 +317,11 @@ CONTROLLERS = {
     c.name: c
     for c in (
         Candidate(SHIPPED, lambda case: (), _shipped_setup),
-        Candidate(PREVIEW, lambda case: (), _preview_setup),
+        Candidate(
+            PREVIEW,
+            lambda case: (),
+            lambda case, values: Setup(case.values() | {"feedforward": "preview"}),
+        ),
         Candidate(TUNED, _composite_free, _composite_setup),
         Candidate(PID, _pid_free, _pid_setup, _pid_screen),
         Candidate("joint PID, ZV shaper", _shaped_free, _shaped_setup("zv"), _shaped_screen),
@@ -349,14 +340,9 @@ def allowed(case):
 
 
 def prepared(case, name, values):
-    """Setup of a controller; a baseline gets no more torque than the shipped controller takes on this motion.
+    """Setup of the controller `name` with its tuned numbers; where there is no such design it is refused.
 
-    `name` is the controller's, `values` its tuned numbers.
-
-    Raises
-    ------
-    FlexarmError
-        Where there is no such design.
+    A baseline gets no more torque than the shipped controller takes on this motion.
     """
     setup = CONTROLLERS[name].setup(case, values)
     if name in OWN:

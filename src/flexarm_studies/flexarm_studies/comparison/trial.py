@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexarm_control.feedforward.model import Preparation
-from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.errors import FlexarmError
 
 from ..loop import scenario as scenarios
 from ..loop.metrics import tracking_metrics
@@ -21,21 +21,10 @@ MAX_ERROR = 0.7
 
 
 def run(case, setup, noisy=False, seed=0):
-    """Run a controller on a case.
+    """Run a controller, the `setup`, on a case, if `noisy` with noise of the sensors.
 
-    Parameters
-    ----------
-    case : Case
-    setup : Setup
-    noisy : bool
-        Whether the sensors have noise.
-    seed : int
-        Of the noise.
-
-    Returns
-    -------
-    dict
-        Ready for JSON; see `row_of`. For a refused design ``refused``, the reason, and ``cost``.
+    Returns the row of `row_of`; for a refused design ``refused``, the reason, and ``cost``; for a lost arm ``lost``,
+    the reason, and ``cost``.
     """
     try:
         return _run(case, setup, noisy, seed)
@@ -59,10 +48,7 @@ def _run(case, setup, noisy, seed):
     if controller.plans:
         _reuse_plan(case, setup.controller["feedforward"], controller)
     end = 1e-9 * int(wanted.times_ns[-1])
-    try:
-        record = loop.follow(motion, end + case.window)
-    except MessageError as error:
-        return {"refused": str(error), "cost": REFUSED}
+    record = loop.follow(motion, end + case.window)
     if loop.lost:
         done = float(record.time[-1]) / (end + case.window)
         return {"lost": loop.lost, "cost": LOST * (2.0 - done)}
@@ -78,22 +64,11 @@ def _run(case, setup, noisy, seed):
 
 
 def row_of(found, case, length):
-    """The numbers that are compared, from `tracking_metrics`.
+    """The numbers that are compared, from those `found` by `tracking_metrics`; `length` is that of the arm [m].
 
-    Parameters
-    ----------
-    found : dict
-    case : Case
-    length : float
-        Of the arm [m].
-
-    Returns
-    -------
-    dict
-        ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag where there is gravity),
-        ``residual_mm`` (from the motion's end on, over the case's window), ``settling_s`` (None: not within the
-        window), ``peak_torque_Nm`` (per joint),
-        ``saturation_share`` and ``cost``.
+    Returns ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag where there is gravity),
+    ``residual_mm`` (from the motion's end on, over the case's window), ``settling_s`` (None: not within the window),
+    ``peak_torque_Nm`` (per joint), ``saturation_share`` and ``cost``.
     """
     about = "about_sag_mm" if "static_sag_mm" in found else "mm"
     row = {

@@ -82,15 +82,17 @@ def tune(cost, free, budget, seed=0, screen=None):
     """
     tried = []
 
+    def values_at(x):
+        return [f.at(p) for f, p in zip(free, x, strict=True)]
+
     def at(x):
         if len(tried) >= budget:
             raise _Spent
         x = np.clip(x, 0.0, 1.0)
-        value = float(cost([f.at(p) for f, p in zip(free, x, strict=True)]))
+        value = float(cost(values_at(x)))
         tried.append((value, x))
         return value
 
-    d = len(free)
     at(np.array([f.place for f in free]))
     explore = max(1, round(EXPLORING * budget)) - 1
     try:
@@ -98,26 +100,17 @@ def tune(cost, free, budget, seed=0, screen=None):
             at(x)
         seeds = sorted(tried, key=lambda t: t[0])
         for _, x in seeds:
-            minimize(
-                at,
-                x,
-                method="Nelder-Mead",
-                bounds=[(0.0, 1.0)] * d,
-                options={
-                    "initial_simplex": _simplex(x),
-                    "maxfev": budget,
-                    "xatol": CLOSE,
-                    "fatol": CLOSE,
-                },
-            )
+            options = {
+                "initial_simplex": _simplex(x),
+                "maxfev": budget,
+                "xatol": CLOSE,
+                "fatol": CLOSE,
+            }
+            minimize(at, x, method="Nelder-Mead", bounds=[(0.0, 1.0)] * len(free), options=options)
     except _Spent:
         pass
     best, x = min(tried, key=lambda t: t[0])
-    return (
-        [f.at(p) for f, p in zip(free, x, strict=True)],
-        best,
-        [float(value) for value, _ in tried],
-    )
+    return values_at(x), best, [value for value, _ in tried]
 
 
 def _explored(free, count, seed, screen):
@@ -133,7 +126,4 @@ def _explored(free, count, seed, screen):
 
 def _simplex(x):
     """First simplex; its edges point into the range."""
-    corners = np.tile(x, (x.size + 1, 1))
-    for i in range(x.size):
-        corners[i + 1, i] += EDGE if x[i] < 0.5 else -EDGE
-    return corners
+    return np.vstack([x, x + np.diag(np.where(x < 0.5, EDGE, -EDGE))])

@@ -25,24 +25,9 @@ class _Number(str):
 
 
 def rewritten(text, identified, heading=()):
-    """Text of the arm file with the identified values.
+    """The `text` of the arm file that the fit started from with the `identified` values, below a comment, `heading`.
 
-    Parameters
-    ----------
-    text : str
-        Of the file that the fit started from.
-    identified : Identified
-    heading : sequence of str
-        Lines of a comment put before it all.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    FlexarmError
-        When the new text does not read as the identified arm.
+    Refused when the new text does not read as the identified arm.
     """
     try:
         made = _edited(text, identified)

@@ -63,24 +63,9 @@ def _still(arm):
 
 
 def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
-    """Readings of a simulated arm's encoder and gauges during the excitation.
+    """A `Recording` of a simulated arm's encoder and gauges during the excitation with these `settings`.
 
-    Parameters
-    ----------
-    arm : Arm
-        The truth.
-    settings : mapping
-        Of `ExcitationTorque`.
-    rate : float
-        Samples per second [Hz].
-    seed : int
-        Of the noise.
-    drive : Arm, optional
-        The arm for which the excitation is planned; the truth if not given.
-
-    Returns
-    -------
-    Recording
+    The excitation is planned for `drive`, an arm; for the arm itself if none is given.
     """
     built = model.build(arm)
     plant = Plant(built, 1.0 / rate)
@@ -100,14 +85,10 @@ def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
 
 
 def run(arms, seed=0, rate=250.0, settings=SETTINGS, progress=None):
-    """Identify `arms` arms; a row per parameter and derived value.
+    """Identify so many `arms`, excited with these `settings`; a row per parameter and derived value.
 
-    `settings` are those of the identification.
-
-    Returns
-    -------
-    dict
-        Name to {"covered": arms, "half_width": median, relative, "left_out": arms}; errors for tests.
+    A row has how many intervals covered the truth, the relative widths, the errors in half-widths, and how often it was
+    left out.
     """
     given, table = nominal(), {}
     for k in range(arms):

@@ -39,19 +39,9 @@ class Derived:
 
 
 def derived(arm, position, identified=None):
-    """Frequencies, damping ratios and coupling of an arm at joint angles (n,).
+    """Frequencies, damping ratios and coupling of an arm at a joint `position` (n,) [rad], as a list of `Derived`.
 
-    Parameters
-    ----------
-    arm : Arm
-    position : ndarray, shape (n,)
-        [rad]
-    identified : Identified, optional
-        Gives intervals.
-
-    Returns
-    -------
-    list of Derived
+    What was `identified` gives their intervals.
     """
     names, values = values_of(arm, position)
     widths = np.full(values.size, np.nan)

@@ -29,13 +29,9 @@ STABLE = 3.0
 
 
 class Predictor:
-    """Predicts measurements of arms with the same structure.
+    """Predicts the measurements of a `recording` for arms with the same structure.
 
-    Parameters
-    ----------
-    arm : Arm
-        The file's arm, which fixes the number of integration steps.
-    recording : Recording
+    `arm` is the file's, which fixes the number of integration steps.
     """
 
     def __init__(self, arm, recording):
@@ -49,16 +45,9 @@ class Predictor:
         self.torque = np.ascontiguousarray(recording.torque[1:])
 
     def states(self, arm, initial, samples=None):
-        """States at each sample, shape (s, 2 (n + m)), and the model.
+        """States at so many `samples`, or at all, shape (s, 2 (n + m)), from the `initial` one, and the model.
 
         NaN where the model diverges; None in place of a model where the arm can have none.
-
-        Parameters
-        ----------
-        arm : Arm
-        initial : ndarray, shape (2 (n + m),)
-        samples : int, optional
-            Number of samples; all if not given.
         """
         try:
             built = model.build(arm)
@@ -128,12 +117,10 @@ def _friction_rate(built, recording):
 
 
 def stepper(built):
-    """The compiled stepper of a model that is used once.
+    """The compiled stepper of a `built` model that is used once.
 
     A chain's straight-line code contains its numbers. Compiling it for each set of parameters would take longer than
     simulating the motion, so the general code is used.
-
-    `built` is the model.
     """
     method = integrators.METHODS[METHOD]
     return built.stepper(method, False) if isinstance(built, Chain) else built.stepper(method)

@@ -52,15 +52,7 @@ class Quantity:
 def quantities(arm, recording):
     """All quantities of an arm that can be identified, in the file's order.
 
-    Parameters
-    ----------
-    arm : Arm
-    recording : Recording
-        Its torques and speeds give friction a scale where the file has none.
-
-    Returns
-    -------
-    list of Quantity
+    The torques and speeds of the `recording` give friction a scale where the file has none.
     """
     found = []
     torque = np.abs(recording.torque).max(axis=0)
@@ -105,27 +97,15 @@ def _of(arm, name, kind, where, unit, dimension, least, low=0.0):
 
 
 def held(found, patterns):
-    """Names of the quantities that match one of the patterns.
-
-    `found` has the quantities by name.
-
-    Raises
-    ------
-    FlexarmError
-        For a pattern that matches none.
-    """
+    """Names of those of the quantities `found` that match one of the `patterns`; one that matches none is refused."""
     names = set()
     for pattern in patterns:
         # The brackets of a path are literal, not a character class.
         literal = pattern.replace("[", "[[]")
         match = {q.name for q in found if fnmatch(q.name, literal)}
         if not match:
-            raise FlexarmError(
-                "matches no parameter",
-                field="--hold",
-                value=pattern,
-                limit=", ".join(q.name for q in found),
-            )
+            known = ", ".join(q.name for q in found)
+            raise FlexarmError("matches no parameter", field="--hold", value=pattern, limit=known)
         names |= match
     return names
 
