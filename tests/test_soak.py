@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parents[1])
-)  # the folders are no packages of the workspace
+# The folders are no packages of the workspace.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
@@ -18,11 +17,12 @@ from soak.invariants import Invariants
 
 
 def test_a_short_life_with_faults_breaks_no_invariant():
-    options = command.parser().parse_args(["--rounds", "2", "--minutes", "60", "--seed", "2"])
+    # This seed's first round has three faults, a new gain, a refused one and a stop.
+    options = command.parser().parse_args(["--rounds", "1", "--minutes", "60", "--seed", "103"])
     life, trouble = command.soak(options, lambda text: None)
     lines, good = command.report(life, trouble)
     assert good, "\n".join(lines)
-    assert (life.rounds, life.motions) == (2, 2)
+    assert (life.rounds, life.motions, life.refusals) == (1, 1, 1)
     assert life.invariants.counts["enabled"] > 1000
 
 
@@ -73,6 +73,6 @@ def test_a_fault_with_a_torque_is_seen():
 def test_running_nodes_survive_malformed_messages():
     from fuzz import nodes
 
-    tallies = nodes.fuzz(200, 1, lambda tally: None)
+    tallies = nodes.fuzz(120, 1, lambda tally: None)
     assert sum(tally.inputs for tally in tallies) >= 100
     assert not any(t.failures for t in tallies), [t.first for t in tallies]
