@@ -13,7 +13,6 @@ from flexarm_control.composite.design import design
 from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
 from flexarm_dynamics.errors import DesignError, ParameterError
 from flexarm_dynamics.models.model import build
@@ -44,6 +43,18 @@ def controller(model, law=None, **settings):
     law = law or design(model, SLOW, FAST)
     checked = check_all(PARAMETERS, settings, {"joints": model.n_joints, "modes": model.n_modes})
     return ArmController(model, law, checked)
+
+
+def started(model, law=None, **settings):
+    """A controller that has answered sample 0."""
+    core = controller(model, law, **settings)
+    core.step(sample(0))
+    return core
+
+
+def feed(core, numbers, *position):
+    """Answers to the samples of these numbers."""
+    return [core.step(sample(k, *position)) for k in numbers]
 
 
 def motion(end=0.1, duration=0.02, start=0.0, at_ns=0):
@@ -157,8 +168,7 @@ def test_a_new_session_starts_at_the_measured_position_with_no_trajectory(arm_r)
     core = controller(arm_r)
     core.step(sample(50))
     core.offer(motion())
-    for k in range(51, 60):
-        core.step(sample(k))
+    feed(core, range(51, 60))
     assert core.state == State.TRACKING
     # earlier stamps and numbers: the simulator was reset
     for k in range(40):
@@ -205,8 +215,7 @@ def test_a_clock_that_goes_back_is_a_fault_and_after_recovery_the_new_time_count
 
 
 def test_a_stamp_that_jumps_ahead_is_a_fault_a_short_gap_is_bridged(arm_r):
-    core = controller(arm_r, max_gap=0.1)
-    core.step(sample(0))
+    core = started(arm_r, max_gap=0.1)
     assert core.step(sample(100)) is True
     assert core.missed == 99
     assert core.step(sample(201)) is False
@@ -261,8 +270,7 @@ def test_an_unusable_sample_is_a_fault_with_the_reason_and_forgets_the_trajector
     assert core.state == State.INACTIVE and reason in core.reason
     assert core.step(sample(1)) is True
     core.offer(motion(end=0.1, duration=0.5))
-    for k in range(2, 10):
-        core.step(sample(k, 0.05))
+    feed(core, range(2, 10), 0.05)
     assert core.state == State.TRACKING
     assert abs(core.torque[0]) > 0.01
     for _ in range(2):  # sent again, the answer is the same
@@ -285,8 +293,7 @@ def test_an_unusable_sample_is_a_fault_with_the_reason_and_forgets_the_trajector
 
 
 def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready_once_recovered(arm_r):
-    core = controller(arm_r)
-    core.step(sample(0))
+    core = started(arm_r)
     core.step(sample(1, 0.2))
     core.distrust("no arm_state_estimate for 0.5 s")
     assert (core.enabled, core.reason) == (False, "no arm_state_estimate for 0.5 s")
@@ -317,8 +324,7 @@ FAILURES = {
 def test_whatever_a_law_raises_and_a_torque_that_is_no_number_disable_with_the_reason(
     arm_r, reason
 ):
-    core = controller(arm_r, Scripted(3.0, FAILURES[reason], 4.0))
-    core.step(sample(0))
+    core = started(arm_r, Scripted(3.0, FAILURES[reason], 4.0))
     core.offer(motion(end=5.0, duration=9.0))
     assert core.torque[0] == 3.0
     for _ in range(2):
@@ -373,8 +379,7 @@ def test_the_rate_limit_counts_from_the_torque_that_the_size_limit_let_through(a
 
 def test_after_a_disable_the_rate_limit_starts_from_no_torque(arm_r):
     law = Scripted(0.0, 8.0, 8.0, 8.0)
-    core = controller(arm_r, law, torque_rate_limit=[8000.0])
-    core.step(sample(0))
+    core = started(arm_r, law, torque_rate_limit=[8000.0])
     core.step(sample(1))
     assert_allclose(core.torque, [8.0])
     core.step(sample(2, np.nan))
@@ -385,19 +390,15 @@ def test_after_a_disable_the_rate_limit_starts_from_no_torque(arm_r):
     assert_allclose(core.torque, [8.0])
 
 
-def test_each_joint_has_its_own_limits():
-    arm = arm_file.load("two_link")
+def test_each_joint_has_its_own_limits(two_link):
     joints = [
         replace(joint, limits=replace(joint.limits, torque=most))
-        for joint, most in zip(arm.joints, (5.0, np.inf), strict=True)
+        for joint, most in zip(two_link.arm.joints, (5.0, np.inf), strict=True)
     ]
-    two = build(replace(arm, joints=tuple(joints)))
-    m = two.n_modes
+    two = build(replace(two_link.arm, joints=tuple(joints)))
 
     def still(k):
-        s = sample(k, n=2)
-        s.amplitude, s.rate = np.zeros(m), np.zeros(m)
-        return s
+        return sample(k, n=2, amplitude=np.zeros(two.n_modes), rate=np.zeros(two.n_modes))
 
     law = Scripted([9.0, 9.0], [9.0, -9.0], [9.0, 1e9])
     core = controller(two, law, torque_rate_limit=[1000.0, 0.0])
@@ -411,8 +412,7 @@ def test_each_joint_has_its_own_limits():
 
 
 def test_limits_can_change_between_two_samples(arm_r):
-    core = controller(arm_r, Scripted(9.0, 9.0))
-    core.step(sample(0))
+    core = started(arm_r, Scripted(9.0, 9.0))
     assert_array_equal(core.torque, [9.0])
     core.configure(check_all(PARAMETERS, {"torque_limit": [1.0]}, {"joints": 1, "modes": 2}))
     core.step(sample(1))
@@ -438,8 +438,7 @@ def test_a_trajectory_is_refused_before_the_first_state_and_after_a_disable_sayi
 
 
 def test_a_refused_trajectory_leaves_the_present_one_and_shows_until_the_next_is_accepted(arm_r):
-    core = controller(arm_r)
-    core.step(sample(0))
+    core = started(arm_r)
     core.offer(motion(duration=0.5))
     core.step(sample(1))
     assert core.offer(motion(start=2.0)).accepted is False
@@ -454,8 +453,7 @@ def test_a_refused_trajectory_leaves_the_present_one_and_shows_until_the_next_is
 
 
 def test_why_the_state_is_bad_comes_before_why_a_trajectory_was_refused(arm_r):
-    core = controller(arm_r)
-    core.step(sample(0))
+    core = started(arm_r)
     core.refuse("no points")
     core.step(sample(1, np.nan))
     assert "joint_position" in core.reason
@@ -465,8 +463,7 @@ def test_why_the_state_is_bad_comes_before_why_a_trajectory_was_refused(arm_r):
 
 
 def test_an_identical_trajectory_sent_again_is_no_refusal_and_no_restart(arm_r):
-    core = controller(arm_r)
-    core.step(sample(0))
+    core = started(arm_r)
     assert core.offer(motion(duration=0.5)).accepted
     core.step(sample(1))
     core.step(sample(100))
@@ -479,8 +476,7 @@ def test_an_identical_trajectory_sent_again_is_no_refusal_and_no_restart(arm_r):
 
 
 def test_a_trajectory_stamped_zero_starts_at_the_first_state_after_it(arm_r):
-    core = controller(arm_r)
-    core.step(sample(0))
+    core = started(arm_r)
     core.offer(motion(duration=0.02))
     core.step(sample(0))  # a repeat is no later state
     core.step(sample(5))
@@ -622,8 +618,7 @@ def test_a_joint_that_stays_behind_is_stopped_then_a_fault(arm_r):
     ids=["far beyond", "for long", "forgiven"],
 )
 def test_a_limit_exceeded_by_half_or_for_long_is_a_fault(arm_r, position, fault, why):
-    core = controller(arm_r, tracking_error_limit=0.2, limit_patience=0.1)
-    core.step(sample(0))
+    core = started(arm_r, tracking_error_limit=0.2, limit_patience=0.1)
     enabled = [core.step(sample(k, position(k))) for k in range(1, 500)]
     assert enabled.count(True) == pytest.approx(499 if fault is None else fault - 1, abs=1)
     assert core.state == (State.READY if fault is None else State.FAULT)
@@ -633,44 +628,38 @@ def test_a_limit_exceeded_by_half_or_for_long_is_a_fault(arm_r, position, fault,
 
 BEYOND = {
     "velocity of joint1 is 13 rad/s": ({"position_margin": 0.0}, {"velocity": [13.0]}),
-    "deflection of link1_y_mode1 is 0.03": (
-        {"deflection_limit": [0.025, 0.0]},
-        {"amplitude": [-0.03, 0.0]},
-    ),
+    "deflection of link1_y_mode1 is 0.03": ({"deflection_limit": [0.025, 0.0]}, {"amplitude": [-0.03, 0.0]}),
     "strain of root is 0.0": ({"strain_limit": 1e-4}, {"amplitude": [-0.011, 0.0]}),
     "position of joint1 is 0.06 rad out": ({"tracking_error_limit": 0.0}, {"position": 3.2}),
-    "position of joint1 is 0.07": (
-        {"tracking_error_limit": 0.0},
-        {"position": 3.0, "velocity": [9.0]},
-    ),
-}
+    "position of joint1 is 0.07": ({"tracking_error_limit": 0.0}, {"position": 3.0, "velocity": [9.0]}),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("reason", BEYOND)
-def test_every_limit_stops_a_motion_and_says_which(reason):
+def test_every_limit_stops_a_motion_and_says_which(limited, reason):
     settings, change = BEYOND[reason]
-    core = controller(limited(), **settings)
+    core = controller(limited, **settings)
     k = tracking(core, 20)
     core.step(sample(k, **change))
     assert core.state == State.STOPPING, core.reason
     assert reason in core.reason
 
 
-def limited():
-    """Arm R with limits of position and velocity, and deflections that are watched."""
-    arm = arm_file.load("one_link")
-    joint = arm.joints[0]
+@pytest.fixture(scope="module")
+def limited(one_link):
+    """An arm of one link with limits of position and velocity."""
+    (joint,) = one_link.arm.joints
     limits = replace(joint.limits, position=(-3.14, 3.14), velocity=10.0)
-    return build(replace(arm, joints=(replace(joint, limits=limits),)))
+    return build(replace(one_link.arm, joints=(replace(joint, limits=limits),)))
 
 
 @pytest.mark.parametrize(("beyond", "state"), [(-0.005, State.TRACKING), (0.005, State.STOPPING)])
-def test_the_range_of_a_joint_is_kept_with_its_braking_distance(beyond, state):
-    model, limit, speed, margin = limited(), 10.0, 5.0, 0.05
-    _, B = slow_subsystem(model.terms(np.zeros(1), np.zeros(1)))
+def test_the_range_of_a_joint_is_kept_with_its_braking_distance(limited, beyond, state):
+    limit, speed, margin = 10.0, 5.0, 0.05
+    _, B = slow_subsystem(limited.terms(np.zeros(1), np.zeros(1)))
     distance = speed**2 / (2.0 * B[0, 0] * limit)
     settings = {"tracking_error_limit": 0.0, "position_margin": margin, "torque_limit": [limit]}
-    core = controller(model, **settings)
+    core = controller(limited, **settings)
     k = tracking(core, 20)
     core.step(sample(k, 3.14 + margin - distance + beyond, velocity=[speed]))
     assert core.state == state, core.reason
@@ -689,14 +678,12 @@ def test_a_torque_at_its_limit_for_long_stops_the_arm(arm_r):
 
 
 def test_what_nothing_holds_to_the_reference_has_no_tracking_error(arm_r):
-    core = controller(arm_r, design(arm_r, {"type": "none"}, FAST))
-    core.step(sample(0))
+    core = started(arm_r, design(arm_r, {"type": "none"}, FAST))
     assert core.step(sample(1, 1.0)) is True
 
 
 def test_the_fast_control_comes_and_goes_in_a_ramp(arm_r):
-    core = controller(arm_r, Scripted(*[1.0] * 1000))
-    core.step(sample(0))
+    core = started(arm_r, Scripted(*[1.0] * 1000))
     core.enable_fast(False)
     shares = []
     for k in range(1, 300):
@@ -719,9 +706,9 @@ def test_the_fast_fraction_is_a_share_of_the_fast_torque(arm_r):
     assert_allclose(u, slow + 0.25 * whole, rtol=1e-15)
 
 
-def test_a_strain_limit_without_gauges_is_refused():
+def test_a_strain_limit_without_gauges_is_refused(rigid):
     with pytest.raises(ParameterError, match="rigid has no gauges") as refused:
-        controller(build(arm_file.load("rigid")), Scripted(0.0), strain_limit=1e-3)
+        controller(rigid, Scripted(0.0), strain_limit=1e-3)
     assert (refused.value.field, refused.value.value) == ("strain_limit", 1e-3)
 
 
@@ -744,8 +731,7 @@ def test_a_warm_up_leaves_nothing_behind(arm_r, slow):
 
 def test_a_repeat_with_another_stamp_begins_nothing(arm_r):
     # Found by fuzzing: the stamp of 2**62 ns made the next time step negative, and the torque 1e12 N m.
-    core = controller(arm_r, Scripted(*[5.0] * 9), torque_rate_limit=[100.0])
-    core.step(sample(0))
+    core = started(arm_r, Scripted(*[5.0] * 9), torque_rate_limit=[100.0])
     core.fail("for the test")
     core.recover()
     assert core.step(sample(0, stamp_ns=2**62)) is False

@@ -13,9 +13,7 @@ from flexarm_control.composite import design_process
 from flexarm_control.composite.design import design
 from flexarm_control.composite.design_process import AwayError, DesignProcess
 from flexarm_dynamics import processes
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
-from flexarm_dynamics.models.model import build
 
 FAST, CORRECTED = {"type": "lqr"}, {"type": "corrected"}
 
@@ -98,10 +96,9 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         worker.close()
 
 
-def test_a_law_of_many_links_travels():
-    model = build(arm_file.load("two_link"))
+def test_a_law_of_many_links_travels(two_link):
     given = {"type": "model_following", "kp": [2.25], "kv": [3.0]}
     fast = {"type": "lqr", "alpha": 2.0, "q": [0.0] * 4 + [0.001] * 4, "configuration": [0.8, 0.8]}
-    made = design(model, given, fast, CORRECTED | {"order": 1})
-    travelled = design_process.loads(design_process.dumps(made, model.arm), model)
+    made = design(two_link, given, fast, CORRECTED | {"order": 1})
+    travelled = design_process.loads(design_process.dumps(made, two_link.arm), two_link)
     np.testing.assert_array_equal(torques(travelled, 2, 4), torques(made, 2, 4))

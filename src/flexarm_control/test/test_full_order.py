@@ -10,9 +10,7 @@ from scipy.linalg import expm
 from flexarm_control.composite import full_order
 from flexarm_control.composite.design import design
 from flexarm_dynamics import linear
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.models.model import build
 from flexarm_dynamics.singular_perturbation import full_order_matrix
 
 SLOW = {"type": "linear_model_following"}
@@ -21,9 +19,9 @@ PAPER = {"type": "lqr", "q": [19.78667553847073] * 2 + [989.3337769235364, 59360
 
 
 @pytest.mark.parametrize("name", ["R", "one_link", "two_link", "long_reach"])
-def test_the_linear_plant_is_the_arms_own_motion(name):
+def test_the_linear_plant_is_the_arms_own_motion(arms, name):
     """A small step of torque, simulated with the full equations, against the exact transition."""
-    model = build(arm_file.load(name))
+    model = arms[name]
     n, m = model.n_joints, model.n_modes
     q = 0.2 + 0.1 * np.arange(n)
     _, Gamma = linear.sampled(*linear.linear_plant(model, q), 1e-3)
@@ -92,10 +90,9 @@ def test_delays_are_those_of_the_loop_that_runs(arm_r, delay):
     assert_allclose(start[:6], state, rtol=1e-9, atol=1e-15)
 
 
-def test_an_unstable_design_is_refused_naming_its_pole():
-    model = build(arm_file.load("two_link"))
+def test_an_unstable_design_is_refused_naming_its_pole(two_link):
     with pytest.raises(DesignError, match="is not left of -stability_margin") as refused:
-        design(model, SLOW, {"type": "lqr"}, {"type": "corrected"}, {})
+        design(two_link, SLOW, {"type": "lqr"}, {"type": "corrected"}, {})
     assert refused.value.value.real > refused.value.limit == 0.0
 
 

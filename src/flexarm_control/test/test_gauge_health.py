@@ -19,7 +19,6 @@ from flexarm_control.observers.gauge_health import (
     BiasCalibration,
     GaugeHealth,
 )
-from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.errors import NOT_GIVEN, MessageError
 from flexarm_dynamics.models import model
@@ -131,9 +130,8 @@ def test_a_gauge_that_can_be_spared_comes_back_after_as_many_good_samples(lab):
     assert out == [()] * 5 + [(1,)] * 20 + [()] * 15
 
 
-def test_gauges_of_another_link_give_theirs_and_the_unobserved_modes_are_named():
-    arm = model.build(arm_file.load("two_link"))
-    health = health_of(arm)
+def test_gauges_of_another_link_give_theirs_and_the_unobserved_modes_are_named(two_link):
+    health = health_of(two_link)
     strain = np.array([1e-5, 1e-5, NAN, 1e-5])
     health.update(strain)
     with pytest.raises(MessageError) as error:
@@ -220,10 +218,9 @@ def test_of_two_gauges_the_one_that_stands_still_is_stuck_and_refused(arm_r):
     assert_allclose(health.amplitudes(rows @ swing(300)), swing(300), rtol=1e-9)
 
 
-def test_the_min_travel_is_the_ratio_of_the_rows():
+def test_the_min_travel_is_the_ratio_of_the_rows(lab):
     rows = np.array([[2.0, 6.0], [1.0, -2.0], [0.0, 3.0]])
-    arm = model.build(arm_file.load("R_lab")).arm
-    gauges = (*arm.gauges[:2], replace(arm.gauges[2], direction="z"))
+    gauges = (*lab.arm.gauges[:2], replace(lab.arm.gauges[2], direction="z"))
     assert_array_equal(
         gauge_health.min_travel(rows, gauges), [[0.0, 2.0, 0.0], [1.0 / 3.0, 0.0, 0.0], [0.0] * 3]
     )

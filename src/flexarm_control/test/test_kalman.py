@@ -271,9 +271,8 @@ def test_a_redesigned_filter_goes_on_from_the_old_ones_state(arm_r):
     assert not new.converged
 
 
-def test_a_rigid_arm_has_a_filter_too():
-    arm = model.build(arm_file.load("rigid"))
-    observer, n = design_observer("kalman", arm, {}), arm.n_joints
+def test_a_rigid_arm_has_a_filter_too(rigid):
+    observer, n = design_observer("kalman", rigid, {}), rigid.n_joints
     s = ArmSample(n)
     s.amplitude, s.torque[:] = np.zeros(0), 0.0
     for k in range(300):
@@ -338,13 +337,12 @@ def test_prediction_across_a_delay_is_exact_on_the_linear_model(linear, name):
     assert core.observer.converged
 
 
-def test_prediction_of_a_two_link_arm_is_close_to_its_integration():
-    arm = model.build(arm_file.load("two_link"))
-    n, m = arm.n_joints, arm.n_modes
-    core = observe(arm, "true_rates", {"delay": 0.02})
+def test_prediction_of_a_two_link_arm_is_close_to_its_integration(two_link):
+    n, m = two_link.n_joints, two_link.n_modes
+    core = observe(two_link, "true_rates", {"delay": 0.02})
     rest = np.concatenate([[0.4, -0.7], np.zeros(m), [1.0, -2.0], np.zeros(m)])
     u = np.array([0.5, -0.2])
-    states = integrate(arm, rest, lambda t, s: u, np.array([0.0, 0.1, 0.12]))
+    states = integrate(two_link, rest, lambda t, s: u, np.array([0.0, 0.1, 0.12]))
     x, wanted = states[1], states[2]
     s = sample(x, u, 0, n, m)
     s.rate = x[2 * n + m :].copy()
