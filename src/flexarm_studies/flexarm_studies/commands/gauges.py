@@ -91,20 +91,8 @@ def gauges(options):
 def study(arm_model, observed, count=None, criterion="A"):
     """Present and best gauges of every link and direction with observed modes, as plain data in SI.
 
-    Parameters
-    ----------
-    arm_model : ArmModel
-    observed : sequence of str
-        Modes that the gauges are to resolve.
-    count : int, optional
-        Gauges per link and direction; if not given, as many as the arm has, at least one per mode.
-    criterion : str
-        One of `CRITERIA`.
-
-    Raises
-    ------
-    FlexarmError
-        For an arm without flexible links, and for fewer gauges than modes.
+    The gauges of `arm_model` are to resolve the `observed` modes, with `count` gauges per link and direction; if not
+    given, as many as the arm has, at least one per mode. `criterion` is one of `CRITERIA`.
     """
     arm = arm_model.arm
     if not observed:
@@ -115,12 +103,9 @@ def study(arm_model, observed, count=None, criterion="A"):
         present = [g for g in arm.gauges if (g.link, g.direction) == key]
         wanted = max(len(present), len(names)) if count is None else count
         if wanted < len(names):
-            raise FlexarmError(
-                f"gauges can't observe the {len(names)} modes of {key[0]} in {key[1]}",
-                field="--count",
-                value=wanted,
-                limit=f"at least {len(names)}",
-            )
+            problem = f"gauges can't observe the {len(names)} modes of {key[0]} in {key[1]}"
+            limit = f"at least {len(names)}"
+            raise FlexarmError(problem, field="--count", value=wanted, limit=limit)
         if wanted > GRID:
             problem = "gauges are more than there are positions"
             raise FlexarmError(problem, field="--count", value=wanted, limit=GRID)
@@ -172,12 +157,9 @@ def _typical(present):
 
 def _weighted(arm_model, names, present):
     noise, stated = reading_noise(present)
-    gains = np.array([[g.gain] for g in present])
-    return (
-        gains
-        * gauge_rows(arm_model, present, names)
-        / (noise if stated else ASSUMED_NOISE * noise)[:, None]
-    )
+    noise = noise if stated else ASSUMED_NOISE * noise
+    gains = np.array([g.gain for g in present])
+    return gains[:, None] * gauge_rows(arm_model, present, names) / noise[:, None]
 
 
 def _present(arm_model, names, present):

@@ -162,9 +162,8 @@ def describe(arm_model, q):
             for g in arm.gauges
         ],
     }
-    result["sag"], result["strain_map_condition"] = None, None
-    result["warnings"] = warnings(arm_model, q, result)
-    return result
+    result |= {"sag": None, "strain_map_condition": None}
+    return result | {"warnings": warnings(arm_model, q, result)}
 
 
 def warnings(arm_model, q, result):
@@ -214,13 +213,8 @@ def text(d):
     yield f"{d['arm']}: {d['description']}"
     if d["source"]:
         yield f"source: {d['source']}"
-    level = (
-        "finite slope"
-        if d["finite_slope"]
-        else "foreshortening"
-        if d["foreshortening"]
-        else "first order"
-    )
+    level = "foreshortening" if d["foreshortening"] else "first order"
+    level = "finite slope" if d["finite_slope"] else level
     yield f"model {d['model']}, {level}; {d['mass']:.4g} kg in all; gravity {d['gravity']} m/s^2"
     yield ""
     yield f"{'joint':18}{'hub':>10}{'rotor':>10}{'motor':>10}{'all':>12}{'limit':>10}  safe action"

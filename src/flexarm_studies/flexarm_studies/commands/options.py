@@ -40,15 +40,10 @@ def load_arm(options):
         arm = arm.with_modes(options.modes)
     if options.foreshortening or options.finite_slope:
         if arm.model != "chain":
-            raise ModelError(
-                f"of {arm.name} supports neither foreshortening nor finite slope",
-                field="model",
-                value=arm.model,
-                limit="chain",
-            )
-        arm = replace(
-            arm, foreshortening=True, finite_slope=arm.finite_slope or options.finite_slope
-        )
+            problem = f"of {arm.name} supports neither foreshortening nor finite slope"
+            raise ModelError(problem, field="model", value=arm.model, limit="chain")
+        finite_slope = arm.finite_slope or options.finite_slope
+        arm = replace(arm, foreshortening=True, finite_slope=finite_slope)
     return arm
 
 
@@ -80,13 +75,11 @@ def angles(text, arm, option):
         return np.zeros(n)
     values = np.array(numbers(option, text))
     if values.size != n:
-        raise FlexarmError(
+        problem, hint = (
             "is the wrong number of angles",
-            field=option,
-            value=values.size,
-            limit=n,
-            hint=f"give one for each of {', '.join(arm.joint_names)}",
+            f"give one for each of {', '.join(arm.joint_names)}",
         )
+        raise FlexarmError(problem, field=option, value=values.size, limit=n, hint=hint)
     return values
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import model
-from flexarm_dynamics.models.chain import Chain
 from flexarm_sim.integrators import METHODS, substeps
 
 from .. import tables
@@ -22,6 +21,8 @@ from .options import add_arm_arguments, add_model_arguments, angles, chain_of, l
 
 #: More rows must be a mistake in --rate or --duration.
 MAX_ROWS = 10_000_000
+#: More rows show their progress.
+SHOWN = 5000
 #: Defaults of options without a controller.
 DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
 
@@ -99,37 +100,29 @@ def simulate(options, recorder=None):
     kinematics = chain_of(arm_model)
     if options.torque and options.prescribed:
         raise FlexarmError("exclude each other", field="--torque and --prescribed")
-    drive = None
+    drive = motion = None
     if options.torque:
         drive = tables.Steps(*tables.read(options.torque, "tau", arm.joint_names))
-    motion = None
     if options.prescribed:
-        if not isinstance(arm_model, Chain):
-            raise ModelError(
-                f"of {arm.name} supports no --prescribed",
-                field="model",
-                value=arm.model,
-                limit="chain",
-            )
+        if arm_model is not kinematics:
+            problem = f"of {arm.name} supports no --prescribed"
+            raise ModelError(problem, field="model", value=arm.model, limit="chain")
         if options.initial:
-            raise FlexarmError(
-                "is not possible: a prescribed motion starts where its table does",
-                field="--initial",
-            )
+            problem = "is not possible: a prescribed motion starts where its table does"
+            raise FlexarmError(problem, field="--initial")
         table = tables.read(options.prescribed, "q", arm.joint_names)
         motion = tables.Motion(*table, options.prescribed)
     times = _times(options, motion)
     columns = column_names(kinematics)
     q = angles(options.initial, arm, "--initial")
     rows = np.empty((times.size, len(columns)))
-    run = (
-        _free(arm_model, drive, q, times, options)
-        if motion is None
-        else _prescribed(arm_model, motion, times, options)
-    )
-    show, shown = Progress(), 0
-    if times.size > 5000:
-        show.step(f"{arm.name}, {times[-1] - times[0]:g} s")
+    if motion is None:
+        run = _free(arm_model, drive, q, times, options)
+    else:
+        run = _prescribed(arm_model, motion, times, options)
+    progress = Progress() if times.size > SHOWN else None
+    if progress:
+        progress.step(f"{arm.name}, {times[-1] - times[0]:g} s")
     for k, (state, torque) in enumerate(run):
         if not np.isfinite(state).all() or np.abs(state).max() > 1e9:
             raise ModelError(
@@ -138,47 +131,38 @@ def simulate(options, recorder=None):
                 hint="take a shorter --step, or --foreshortening where links spin fast",
             )
         rows[k] = row(kinematics, times[k], state, torque)
-        if times.size > 5000 and k * 50 // times.size > shown:
-            shown = k * 50 // times.size
-            show.fraction(k / times.size)
-    if times.size > 5000:
-        show.done()
+        if progress and k % (times.size // 50) == 0:
+            progress.fraction(k / times.size)
+    if progress:
+        progress.done()
     _report(options, arm_model, columns, rows)
     return columns, rows
 
 
 def _times(options, motion):
     for name in ("rate", "step"):
-        value = getattr(options, name)
-        if not (np.isfinite(value) and value > 0.0):
-            raise FlexarmError(
-                "is out of range", field=f"--{name}", value=value, limit="finite, above 0"
-            )
+        if not 0.0 < (value := getattr(options, name)) < np.inf:
+            limit = "finite, above 0"
+            raise FlexarmError("is out of range", field=f"--{name}", value=value, limit=limit)
     start, end = (0.0, np.inf) if motion is None else (motion.start, motion.end)
     duration = options.duration
     if duration is None:
         duration = min(4.0, end - start)
-    if not (np.isfinite(duration) and duration >= 0.0):
+    if not 0.0 <= duration < np.inf:
         limit = "finite, at least 0"
         raise FlexarmError("is out of range", field="--duration", value=duration, limit=limit)
     if duration > (end - start) * (1.0 + 1e-9) + 1e-9:
-        raise FlexarmError(
+        problem, limit = (
             f"s is longer than the motion in {options.prescribed}",
-            field="--duration",
-            value=duration,
-            limit=f"{end - start:g} s",
+            f"{end - start:g} s",
         )
-    if duration * options.rate > MAX_ROWS:
-        raise FlexarmError(
-            f"s at --rate {options.rate:g} makes {duration * options.rate:.0f} rows",
-            field="--duration",
-            value=duration,
-            limit=f"{MAX_ROWS} rows",
-        )
+        raise FlexarmError(problem, field="--duration", value=duration, limit=limit)
+    if (rows := duration * options.rate) > MAX_ROWS:
+        problem, limit = f"s at --rate {options.rate:g} makes {rows:.0f} rows", f"{MAX_ROWS} rows"
+        raise FlexarmError(problem, field="--duration", value=duration, limit=limit)
     # Only whole rows; the end is one if the rate divides the duration.
-    return np.minimum(
-        start + np.arange(int(duration * options.rate + 1e-9) + 1) / options.rate, end
-    )
+    count = int(duration * options.rate + 1e-9) + 1
+    return np.minimum(start + np.arange(count) / options.rate, end)
 
 
 def _free(arm_model, drive, q, times, options):
@@ -236,12 +220,9 @@ def prescribed_torque(chain, state, acceleration):
 
 def column_names(chain):
     """Columns of the table."""
-    n, links = chain.n_joints, len(chain.arm.links)
-    names = ["t"]
-    for prefix in ("q", "qd", "tau"):
-        names += [f"{prefix}{i + 1}" for i in range(n)]
+    names = ["t", *(f"{what}{i + 1}" for what in ("q", "qd", "tau") for i in range(chain.n_joints))]
     names += [*chain.mode_names, "tip_x", "tip_y", "tip_z"]
-    for i in range(links):
+    for i in range(len(chain.arm.links)):
         names += [f"link{i + 1}_tip_{axis}" for axis in "xyz"]
         if chain.planar_axis is not None:
             names.append(f"link{i + 1}_base_angle")
@@ -253,8 +234,8 @@ def row(chain, t, state, torque):
     """One row of the table."""
     n, m = chain.n_joints, chain.n_modes
     q, delta, qd, _ = np.split(state, [n, n + m, 2 * n + m])
-    ends, values = chain.link_ends(q, delta), [[t], q, qd, torque, delta]
-    values.append(ends[-1])
+    ends = chain.link_ends(q, delta)
+    values = [[t], q, qd, torque, delta, ends[-1]]
     base = chain.base_angles(q, delta) if chain.planar_axis is not None else None
     for i, link in enumerate(chain.arm.links):
         values.append(ends[i])
@@ -266,6 +247,8 @@ def row(chain, t, state, torque):
 
 def _report(options, arm_model, columns, rows):
     arm = arm_model.arm
+    if options.out or not options.json:
+        tables.write(columns, rows, options.out)
     if options.json:
         result = {"arm": arm.name, "model": arm.model, "columns": columns}
         if options.out:
@@ -273,11 +256,8 @@ def _report(options, arm_model, columns, rows):
             result["last"] = dict(zip(columns, rows[-1].tolist(), strict=True))
         else:
             result["rows"] = rows.tolist()
-        if options.out:
-            tables.write(columns, rows, options.out)
         print(json.dumps(result))
         return
-    tables.write(columns, rows, options.out)
     if options.out:
         print(
             f"{options.out}: {arm.name}, {len(rows)} rows of {len(columns)} columns, t = {rows[0, 0]:g} to"

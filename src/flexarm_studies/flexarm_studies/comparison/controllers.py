@@ -9,7 +9,7 @@ last joint's bandwidth and damping to the first joint's.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -114,13 +114,8 @@ def _composite_setup(case, values):
     kp = np.array(shipped.get("slow.kp", [6.25]))
     kv = np.array(shipped.get("slow.kv", [5.0]))
     q = np.array(shipped.get("fast.q", [1.0]))
-    tuned = {
-        "slow.kp": (speed**2 * kp).tolist(),
-        "slow.kv": (speed * kv).tolist(),
-        "fast.q": (weight * q).tolist(),
-        "fast.alpha": alpha,
-    }
-    return Setup(shipped | tuned)
+    tuned = {"slow.kp": (speed**2 * kp).tolist(), "slow.kv": (speed * kv).tolist()}
+    return Setup(shipped | tuned | {"fast.q": (weight * q).tolist(), "fast.alpha": alpha})
 
 
 def bandwidth(case):
@@ -272,12 +267,16 @@ def _lqr_free(case):
 def _lqr_setup(case, values):
     *sizes, decay, feedforward = values
     end = cases.ends_of(case)[1]
-    return Setup(
-        IDLE | _observer(case),
-        lambda model: FullStateLqr(
-            model, end, case.rate, sizes, decay, feedforward, _seen(case, "LQR")
-        ),
+    law = partial(
+        FullStateLqr,
+        q=end,
+        rate=case.rate,
+        sizes=sizes,
+        decay=decay,
+        feedforward=feedforward,
+        seen=_seen(case, "LQR"),
     )
+    return Setup(IDLE | _observer(case), law)
 
 
 def _lqr_screen(case, values):

@@ -325,12 +325,8 @@ class Problem:
         """Names of the channels that the fit does not explain."""
         names = (*self.arm.joint_names, *self.arm.gauge_names)
         used = self.weight.any(axis=0)
-        spread = np.array(
-            [
-                self.measured[w > 0.0, c].std() if w.any() else 0.0
-                for c, w in enumerate(self.weight.T)
-            ]
-        )
+        known = zip(self.measured.T, self.weight.T > 0.0, strict=True)
+        spread = np.array([y[k].std() if k.any() else 0.0 for y, k in known])
         floor = 3.0 * self._prior_noise()
         bad = used & (self.noise > np.maximum(POOR * spread, floor))
         return [name for name, b in zip(names, bad, strict=True) if b]
@@ -345,8 +341,7 @@ class Problem:
         size[size == 0.0] = 1.0
         J /= size
         flat = J.reshape(-1, x.size)
-        bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)
-        white = bread
+        bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)  # of white residuals
         scores = np.einsum("kcx,kc->kx", J, r)
         lags = min(bandwidth(r), whole // 4)
         meat = scores.T @ scores
@@ -355,7 +350,7 @@ class Problem:
             meat += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
         robust = bread @ meat @ bread
         variance = np.maximum(np.diag(robust), 1e-300)
-        grow = np.sqrt(np.maximum(np.diag(white) / variance, 1.0))
+        grow = np.sqrt(np.maximum(np.diag(bread) / variance, 1.0))
         used = np.count_nonzero(self.weight)
         grow *= np.sqrt(used / max(used - x.size, 1))
         return robust * np.outer(grow, grow) / np.outer(size, size)
@@ -374,7 +369,8 @@ class Problem:
         deviation = np.sqrt(np.diag(cov))[: indices.size]
         alike = np.abs(cov[worst, : indices.size]) / (deviation[worst] * deviation)
         partners = [
-            self.found[i].name for k, i in enumerate(indices) if k != worst and alike[k] > TOGETHER
+            self.found[i].name
+            for i in np.delete(indices, worst)[np.delete(alike, worst) > TOGETHER]
         ]
         why = f"its interval would be +-{100.0 * ratio[worst]:.3g} % of it"
         if partners:
@@ -407,14 +403,13 @@ class Problem:
 
     def leave_out(self, index):
         """Keep the file's value of a quantity."""
-        name = self.found[index].name
+        name, kept = self.found[index].name, f"{self.file[index]:.6g} {self.found[index].unit}"
         self.left_out.append(name)
         self.free[index] = False
         self.values[index] = self.file[index]
         self.warnings.append(
-            f"{name} is not determined by this motion and keeps the file's"
-            f" {self.file[index]:.6g} {self.found[index].unit}: {self._because}; the others' intervals hold for"
-            " that value"
+            f"{name} is not determined by this motion and keeps the file's {kept}: {self._because};"
+            " the others' intervals hold for that value"
         )
 
     def _end_at_limits(self):
