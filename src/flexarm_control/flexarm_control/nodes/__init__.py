@@ -1,24 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of this package, and their entry points."""
+"""Nodes of this package, and their entry points, as ``ros2 run flexarm_control observer``."""
+
+from functools import partial
 
 from flexarm_ros.start import start
 
-
-def start_observer():
-    """Entry point of ``ros2 run flexarm_control observer``."""
-    start("flexarm_control.nodes.observer")
-
-
-def start_controller():
-    """Entry point of ``ros2 run flexarm_control controller``."""
-    start("flexarm_control.nodes.controller")
-
-
-def start_observer_controller():
-    """Entry point of ``ros2 run flexarm_control observer_controller``."""
-    start("flexarm_control.nodes.observer_controller")
-
-
-def start_excite():
-    """Entry point of ``ros2 run flexarm_control excite``."""
-    start("flexarm_control.nodes.excite")
+start_observer = partial(start, "flexarm_control.nodes.observer")
+start_controller = partial(start, "flexarm_control.nodes.controller")
+start_observer_controller = partial(start, "flexarm_control.nodes.observer_controller")
+start_excite = partial(start, "flexarm_control.nodes.excite")

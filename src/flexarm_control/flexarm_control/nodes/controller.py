@@ -193,7 +193,3 @@ class ControllerNode(ArmNode):
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control controller``."""
     leave(run(ControllerNode, args))
-
-
-if __name__ == "__main__":
-    main()

@@ -131,7 +131,3 @@ class ExciteNode(ArmNode):
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control excite``."""
     leave(run(ExciteNode, args))
-
-
-if __name__ == "__main__":
-    main()

@@ -126,7 +126,3 @@ class ObserverNode(ArmNode):
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control observer``."""
     leave(run(ObserverNode, args))
-
-
-if __name__ == "__main__":
-    main()

@@ -77,7 +77,3 @@ def nodes():
 def main(args=None):
     """Entry point of ``ros2 run flexarm_control observer_controller``."""
     leave(run(nodes, args))
-
-
-if __name__ == "__main__":
-    main()

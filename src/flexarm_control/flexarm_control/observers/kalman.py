@@ -25,6 +25,8 @@ The recursion of P does not depend on the measurements. Once it has settled, for
 gain and covariance are kept until either changes.
 """
 
+from functools import lru_cache, partial
+
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.stats import chi2
@@ -90,17 +92,13 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
-        self._strain_map = StrainMap(model) if model.arm.gauges else None
-        self.measurement_covariance = measurement_covariance(
-            model, self.parameters, self._strain_map
+        strain_map = StrainMap(model) if model.arm.gauges else None
+        self._covariance_without = lru_cache(
+            partial(measurement_covariance, model, self.parameters, strain_map)
         )
-        self._covariances = {(): self.measurement_covariance}
-        self.density = np.concatenate(
-            [
-                np.square(np.asarray(self.parameters["torque_noise"], float)),
-                np.full(m, self.parameters["modal_force_noise"] ** 2),
-            ]
-        )
+        self.measurement_covariance = self._covariance_without(())
+        noise = [*self.parameters["torque_noise"], *[self.parameters["modal_force_noise"]] * m]
+        self.density = np.square(np.array(noise, float))
         self._bound = float(chi2.ppf(self.QUANTILE, self._p))
         self._measured = np.zeros(self._p)
         self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
@@ -130,11 +128,7 @@ class Kalman(Observer):
     def leave_out(self, lost):
         """As `Observer.leave_out`: R becomes that of the remaining gauges."""
         super().leave_out(lost)
-        if lost not in self._covariances:
-            self._covariances[lost] = measurement_covariance(
-                self.model, self.parameters, self._strain_map, lost
-            )
-        self.measurement_covariance = self._covariances[lost]
+        self.measurement_covariance = self._covariance_without(lost)
         self._steady = False
 
     def rest_at(self, amplitude):
@@ -222,11 +216,11 @@ class Kalman(Observer):
         self.covariance_diagonal[m:] = variance[p + n : 2 * p]
 
 
-def measurement_covariance(model, parameters, strain_map=None, lost=()):
+def measurement_covariance(model, parameters, strain_map, lost):
     """R of joint positions and modal amplitudes, shape (n + m, n + m) [rad^2, m^2].
 
-    `parameters` are those of `NOISE`; the `strain_map` of the model is made if it does not exist already; the
-    amplitudes are made without the `lost` gauges, whose indices these are.
+    `parameters` are those of `NOISE`; `strain_map` is the model's, None without gauges; the amplitudes are made without
+    the `lost` gauges, whose indices these are.
     """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))
@@ -239,7 +233,7 @@ def measurement_covariance(model, parameters, strain_map=None, lost=()):
         return out
     gauges, given = model.arm.gauges, parameters["strain_noise"]
     stated = [given or g.uncertainty or UNSTATED_STRAIN for g in gauges]
-    inverse = (strain_map or StrainMap(model)).inverse_without(lost)
+    inverse = strain_map.inverse_without(lost)
     weighted = inverse * np.array(stated)
     out[n:, n:] = weighted @ weighted.T
     return out

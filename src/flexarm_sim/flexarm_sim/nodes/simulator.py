@@ -174,7 +174,3 @@ class SimulatorNode(Driver):
 def main(args=None):
     """Entry point of ``ros2 run flexarm_sim simulator``."""
     leave(run(SimulatorNode, args))
-
-
-if __name__ == "__main__":
-    main()
