@@ -69,10 +69,9 @@ def made_up_model(couplings, damping):
         M, np.zeros(n), np.zeros(2), np.zeros((n, 2)), np.diag(damping), np.zeros((n, 2)),
         np.diag([9.0, 49.0]),
     )  # fmt: skip
-    joint = SimpleNamespace(limits=SimpleNamespace(position=(-1.0, 1.0)))
     return SimpleNamespace(
         n_joints=n, n_modes=2, mode_names=("slender_mode", "stiff_mode"), terms=lambda q, qd: terms,
-        arm=SimpleNamespace(joints=[joint] * n),
+        arm=SimpleNamespace(position_limits=np.array([[-1.0, 1.0]] * n)),
     )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ class TorqueLimit:
     """
 
     def __init__(self, arm):
-        self._limit = np.array([j.limits.torque for j in arm.joints])
+        self._limit = arm.torque_limits
         self._torque = np.zeros(len(arm.joints))
         self.clipped = 0
 

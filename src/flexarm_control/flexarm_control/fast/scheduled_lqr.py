@@ -130,7 +130,7 @@ class ScheduledLqr(FastLaw):
         """Range of each joint, from the parameters or from the arm file's limits."""
         low, high = np.array(self.parameters["low"]), np.array(self.parameters["high"])
         default = (low == 0.0) & (high == 0.0)
-        limits = np.array([j.limits.position for j in self.model.arm.joints])
+        limits = self.model.arm.position_limits
         self._turns = default & np.isinf(limits).all(axis=1)
         limits = np.where(np.isfinite(limits), limits, [-np.pi, np.pi])
         self.low, self.high = (np.where(default, limits[:, i], (low, high)[i]) for i in (0, 1))

@@ -201,8 +201,7 @@ class ModelFeedforward(Feedforward):
     def _same_everywhere(self):
         """Whether the plant at rest does not change with the joints."""
         draw, n = np.random.default_rng(0), self.model.n_joints
-        limits = np.array([j.limits.position for j in self.model.arm.joints])
-        low, high = np.clip(limits, -np.pi, np.pi).T
+        low, high = np.clip(self.model.arm.position_limits, -np.pi, np.pi).T
         terms = [self.model.terms(draw.uniform(low, high), np.zeros(n)) for _ in range(3)]
         for a, b in pairwise(terms):
             for x, y in ((a.M, b.M), (a.K1, b.K1), (a.K2, b.K2), (a.f1, b.f1)):

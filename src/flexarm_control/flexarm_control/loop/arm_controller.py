@@ -65,7 +65,7 @@ class ArmController:
     def __init__(self, model, law, settings, start_tolerance=0.01):
         n = model.n_joints
         self.model, self.law, self.answered_by = model, law, law
-        fastest = [j.limits.velocity for j in model.arm.joints]
+        fastest = model.arm.velocity_limits
         self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
         self._start_tolerance = start_tolerance
         self.torque = np.zeros(n)
@@ -99,7 +99,7 @@ class ArmController:
         self._take_limits(settings, limit)
 
     def _torque_limit(self, settings):
-        from_file = np.array([j.limits.torque for j in self.model.arm.joints])
+        from_file = self.model.arm.torque_limits
         wanted = np.array(settings["torque_limit"])
         return np.where(wanted > 0.0, np.minimum(wanted, from_file), from_file)
 

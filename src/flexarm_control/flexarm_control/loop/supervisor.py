@@ -133,7 +133,7 @@ class Supervisor:
         bounds = np.cumsum([0, *(len(names) for _, names, _ in watched)])
         self._parts = [slice(a, b) for a, b in pairwise(bounds)]
         self._ratio, self._value = np.zeros((2, len(self._names)))
-        self._low, self._high = np.array([j.limits.position for j in model.arm.joints]).T
+        self._low, self._high = model.arm.position_limits.T
         self._rows = gauge_rows(model, model.arm.gauges)
         self.forget()
         self.configure(settings, torque_limit)
@@ -158,11 +158,10 @@ class Supervisor:
         able = _deceleration(self.model, torque_limit)
         wanted = np.array(settings["stop_deceleration"])
         finite = np.where(np.isfinite(able), STOP_FRACTION * able, FREE_DECELERATION)
-        fastest = np.array([j.limits.velocity for j in arm.joints])
         limit = np.concatenate(
             [
                 np.full(n, or_none(settings["tracking_error_limit"])),
-                fastest * or_none(settings["velocity_margin"]),
+                arm.velocity_limits * or_none(settings["velocity_margin"]),
                 np.full(n, or_none(settings["position_margin"])),
                 or_none(settings["deflection_limit"]),
                 or_none([strain or g.full_scale for g in arm.gauges]),

@@ -75,8 +75,7 @@ class ExcitationRun:
         self.stage, self.reason = Stage.SETTLING, ""
         self.torque = np.zeros(model.n_joints)
         self._order, self._enabled = SampleOrder(), False
-        self._limits = np.array([j.limits.position for j in arm.joints]).T
-        self._max_torque = np.array([j.limits.torque for j in arm.joints])
+        self._limits, self._max_torque = arm.position_limits.T, arm.torque_limits
         self._bias = np.array([g.bias for g in arm.gauges])
         limit = self.settings["strain_limit"]
         self._strain = np.array([limit or FULL_SCALE_FRACTION * g.full_scale for g in arm.gauges])

@@ -90,9 +90,8 @@ def least_exciting(
     base = quintic(start, end, duration)
     if base.start.shape != (model.n_joints,):
         raise ShapeError(f"has shape {base.start.shape}", field="start", limit=(model.n_joints,))
-    joints = [joint.limits for joint in model.arm.joints]
-    torque = _limit("torque_limit", torque_limit, [j.torque for j in joints])
-    speed = _limit("velocity_limit", velocity_limit, [j.velocity for j in joints])
+    torque = _limit("torque_limit", torque_limit, model.arm.torque_limits)
+    speed = _limit("velocity_limit", velocity_limit, model.arm.velocity_limits)
     if not np.any(base.angle):
         raise TrajectoryError("is the start: there is nothing to move", field="end")
     problem = _Problem(model, base, torque, speed, configuration)

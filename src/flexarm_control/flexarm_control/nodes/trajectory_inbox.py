@@ -32,15 +32,13 @@ def read(raw, arm):
             (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
             for p in msg.points
         ]
-        low, high = zip(*(j.limits.position for j in arm.joints), strict=True)
         return trajectory.validate(
             msg.joint_names,
             arm.joint_names,
             stamp_ns(msg.header.stamp),
             points,
-            position_low=list(low),
-            position_high=list(high),
-            velocity_max=[j.limits.velocity for j in arm.joints],
+            *arm.position_limits.T,
+            arm.velocity_limits,
         )
     except TrajectoryError:
         raise

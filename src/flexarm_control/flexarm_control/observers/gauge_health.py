@@ -314,7 +314,7 @@ class BiasCalibration:
 
     def _check_rest(self):
         arm = self.model.arm
-        max_torque = self.REST_TORQUE * np.array([j.limits.torque for j in arm.joints])
+        max_torque = self.REST_TORQUE * arm.torque_limits
         max_strain = self.REST_STRAIN * self._resolution
         speed = np.abs(self._velocity.mean(axis=0))
         torque = np.ptp(self._torque, axis=0)  # NaN where the source does not know it

@@ -40,7 +40,7 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
 from .payload_model import PayloadModel
-from .rigid_arm import rigid_arm, torque_limits
+from .rigid_arm import rigid_arm
 
 #: Configurations over which the adaptation's gain is normalised.
 CONFIGURATIONS = 64
@@ -101,7 +101,7 @@ class AdaptiveModelFollowing(SlowLaw):
             self.parameters["payload_scale_max"],
             self.parameters["dead_zone"],
         )
-        self._limit = torque_limits(model.arm)
+        self._limit = model.arm.torque_limits
         self.learning = 0.0
 
     @property

@@ -26,7 +26,6 @@ from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
-from .rigid_arm import torque_limits
 
 
 class ComputedTorque(SlowLaw):
@@ -65,7 +64,7 @@ class ComputedTorque(SlowLaw):
         )
         self.at_reference = self.parameters["feedforward_at"] == "reference"
         self._check_stability()
-        self._limit = torque_limits(model.arm)
+        self._limit = model.arm.torque_limits
         n = model.n_joints
         self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
 

@@ -22,11 +22,6 @@ def rigid_arm(arm):
     )
 
 
-def torque_limits(arm):
-    """Largest torque of each joint, (n,) [N m]; infinite where the arm file has none."""
-    return np.array([joint.limits.torque for joint in arm.joints])
-
-
 class Tip:
     """Kinematics of the straight arm's tip.
 

@@ -107,9 +107,7 @@ def sampled(profile, model, points=POINTS) -> JointTrajectoryData:
 
 def limits(model):
     """Position limits, low and high, and speed limits of the arm file, each (n,)."""
-    bounds = [joint.limits for joint in model.arm.joints]
-    low, high = np.array([b.position for b in bounds], float).T
-    return low, high, np.array([b.velocity for b in bounds], float)
+    return *model.arm.position_limits.T, model.arm.velocity_limits
 
 
 def parse(text):

@@ -193,6 +193,21 @@ class Arm:
         """Gauge names in the file's order."""
         return tuple(g.name for g in self.gauges)
 
+    @property
+    def position_limits(self):
+        """Least and largest position of each joint, (n, 2) [rad]; infinite where the file has none."""
+        return np.array([j.limits.position for j in self.joints], float)
+
+    @property
+    def velocity_limits(self):
+        """Largest speed of each joint, (n,) [rad/s]; infinite where the file has none."""
+        return np.array([j.limits.velocity for j in self.joints], float)
+
+    @property
+    def torque_limits(self):
+        """Largest torque of each joint, (n,) [N m]; infinite where the file has none."""
+        return np.array([j.limits.torque for j in self.joints], float)
+
     def link(self, name):
         """The link called `name`."""
         return next(link for link in self.links if link.name == name)

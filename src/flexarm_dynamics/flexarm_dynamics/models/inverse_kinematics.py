@@ -62,8 +62,7 @@ class TipKinematics:
     def __init__(self, model, bent=True):
         self.model = model
         self.bent = bool(bent and model.n_modes and any(model.arm.gravity))
-        limits = [joint.limits.position for joint in model.arm.joints]
-        self.low, self.high = np.array(limits, float).T
+        self.low, self.high = model.arm.position_limits.T
 
     def deflection(self, q):
         """Deflections at rest, (m,)."""

@@ -176,7 +176,7 @@ def lqr_gain(model, q, rate, sizes, decay=0.0):
     Phi, Gamma = grown * Phi, grown * Gamma
     joint, speed, modal = (1.0 / size**2 for size in sizes)
     Q = np.diag(np.repeat([joint, 0.0, speed, modal], [n, m, n, m]))
-    largest = np.array([joint.limits.torque for joint in model.arm.joints])
+    largest = model.arm.torque_limits
     R = np.diag(1.0 / np.where(np.isfinite(largest), largest, 1.0) ** 2)
     try:
         P = solve_discrete_are(Phi, Gamma, Q, R)

@@ -123,10 +123,6 @@ def bandwidth(case):
     return float(max(case.values().get("slow.kp", [6.25]))) ** 0.5
 
 
-def _limits(arm):
-    return np.array([joint.limits.torque for joint in arm.arm.joints])
-
-
 def _inertia(case):
     """Inertia of the rigid arm about each joint at the motion's end, (n,) [kg m^2]."""
     arm = cases.model_of(case.arm)
@@ -156,7 +152,7 @@ def pid_gains(case, values):
     """Gains of `JointPid` from the numbers that are tuned."""
     w, zeta, kappa, velocity, acceleration, *ratio = values
     arm = cases.model_of(case.arm)
-    inertia, limit = _inertia(case), _limits(arm)
+    inertia, limit = _inertia(case), arm.arm.torque_limits
     outwards = np.linspace(0.0, 1.0, arm.n_joints)
     faster, stiffer = ratio or (1.0, 1.0)
     w, zeta = w * faster**outwards, zeta * stiffer**outwards
@@ -253,7 +249,7 @@ def shaped_motion(case, gains, kind, shortened):
 
 def _lqr_free(case):
     # The error at which a PD law of the same bandwidth reaches the torque limit.
-    w, limit = bandwidth(case), _limits(cases.model_of(case.arm))
+    w, limit = bandwidth(case), cases.model_of(case.arm).arm.torque_limits
     error = float(np.clip((limit / _inertia(case)).min() / w**2, 1e-2, 100.0))
     return (
         Free("joint error [rad]", 1e-3, 1e3, error, log=True),

@@ -174,7 +174,7 @@ class AdapterNode(Driver):
             permutation("effort_joints", p["effort_joints"], self.arm.joint_names)
         )
         self._damping = np.array(p["safe_damping"]) * (p["safe_action"] == "damp")
-        self._limit = np.array([j.limits.torque for j in self.arm.joints])
+        self._limit = self.arm.torque_limits
         self._velocity, self._moved_at = np.zeros(n), -math.inf
         self._applied, self._sequence = np.zeros(n), 0
         self._position = self._stamp = None

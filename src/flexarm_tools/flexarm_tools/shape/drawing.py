@@ -54,7 +54,7 @@ class Drawer:
         self._sections, self._ends = Sections(model, count), Sections(model, 1)
         self._linear = None
         self._axes = np.array([joint.axis for joint in self.arm.joints])
-        limits = np.array([joint.limits.torque for joint in self.arm.joints])
+        limits = self.arm.torque_limits
         # Where the arm file names no limit, the largest torque so far.
         self._open = ~np.isfinite(limits)
         self._full = np.where(self._open, 1e-9, limits)
