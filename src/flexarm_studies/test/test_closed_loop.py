@@ -72,10 +72,6 @@ def summarised(sampled, run):
 # --------------------------------------------------------------------------- the table
 
 
-def test_the_table_has_a_row_for_every_run_with_true_rates():
-    assert set(reference_rows()) == {run.name for run in TRUE}
-
-
 @pytest.mark.parametrize("run", TRUE, ids=lambda r: r.name)
 def test_the_continuous_loop_is_within_half_a_percent_of_the_errata_in_every_column(run):
     found, wanted = flat(case_study.continuous(run)), reference_rows()[run.name]
@@ -92,6 +88,7 @@ def test_the_loop_at_1_khz_is_within_2_percent_of_the_errata(sampled, run):
 
 
 def test_slow_only_at_1_khz_has_the_late_error_of_the_errata(sampled):
+    assert set(reference_rows()) == {run.name for run in TRUE}
     for name in ("P3_m11_slow", "R_m11_slow"):
         late = sampled[name][1]["max_joint_error_after_3s_deg"]
         assert late == pytest.approx(0.0303, rel=0.002)

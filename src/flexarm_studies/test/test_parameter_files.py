@@ -61,34 +61,21 @@ def test_under_takes_a_prefix_and_no_namesake():
     assert assembly.under(values, "slow") == {"kp": [1.0], "a.b": 2}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "- a list",
-        "just text",
-        "controller: {arm: R}",
-        "controller: {ros__parameters: [1, 2]}",
-        "controller: {ros__parameters: }",
-        "controller:",
-        "controller: {ros__parameters: {slow: {1: 2}}}",
-    ],
-)
-def test_what_is_no_parameter_file_is_refused_naming_it(load, text):
-    with pytest.raises(ParameterError, match=r"some\.yaml: not a ROS parameter file"):
-        load(text)
+NONE_OF_PARAMETERS = (
+    "- a list", "just text", "controller: {arm: R}", "controller: {ros__parameters: [1, 2]}",
+    "controller: {ros__parameters: }", "controller:", "controller: {ros__parameters: {slow: {1: 2}}}",
+)  # fmt: skip
+MALFORMED = ("a: [1, 2", "a: b: c", "\tx: 1", "a: !!python/object:x {}", b"\xff\xfe\x00\xd8")
 
 
-@pytest.mark.parametrize("text", ["a: [1, 2", "a: b: c", "\tx: 1", "a: !!python/object:x {}"])
-def test_malformed_yaml_is_refused_naming_the_file(load, text):
-    with pytest.raises(ParameterError, match=r"some\.yaml: can't be read"):
-        load(text)
-
-
-def test_a_file_that_is_no_text_is_refused(tmp_path):
-    path = tmp_path / "binary.yaml"
-    path.write_bytes(b"\xff\xfe\x00\xd8")
-    with pytest.raises(ParameterError, match=r"binary\.yaml: can't be read"):
+@pytest.mark.parametrize("content", (*NONE_OF_PARAMETERS, *MALFORMED))
+def test_what_is_no_parameter_file_is_refused_naming_it(tmp_path, content):
+    path = tmp_path / "some.yaml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ParameterError) as refused:
         parameter_files.load(path)
+    problem = "can't be read" if content in MALFORMED else "not a ROS parameter file"
+    assert refused.value.field == str(path) and refused.value.problem.startswith(problem)
 
 
 @pytest.mark.parametrize("name", ["paper_composit", "/nowhere/x.yaml", "", "."])
