@@ -339,7 +339,7 @@ def test_whatever_a_law_raises_and_a_torque_that_is_no_number_disable_with_the_r
     assert_array_equal(core.torque, [4.0])
 
 
-def test_an_interrupt_is_nobodys_fault(arm_r):
+def test_an_interrupt_is_passed_on(arm_r):
     with pytest.raises(KeyboardInterrupt):
         controller(arm_r, Scripted(KeyboardInterrupt())).step(sample(0))
 
@@ -685,17 +685,17 @@ def test_what_nothing_holds_to_the_reference_has_no_tracking_error(arm_r):
 def test_the_fast_control_comes_and_goes_in_a_ramp(arm_r):
     core = started(arm_r, Scripted(*[1.0] * 1000))
     core.enable_fast(False)
-    shares = []
+    fractions = []
     for k in range(1, 300):
         if k == 150:
             core.enable_fast(True)
         core.step(sample(k))
-        shares.append(core.law.fast_fraction)
-    assert_allclose(np.abs(np.diff(shares)).max(), 0.01)
-    assert shares[120] == 0.0 and shares[-1] == 1.0
+        fractions.append(core.law.fast_fraction)
+    assert_allclose(np.abs(np.diff(fractions)).max(), 0.01)
+    assert fractions[120] == 0.0 and fractions[-1] == 1.0
 
 
-def test_the_fast_fraction_is_a_share_of_the_fast_torque(arm_r):
+def test_the_fast_fraction_scales_the_fast_torque(arm_r):
     law = design(arm_r, SLOW, FAST)
     state = (np.zeros(1), np.zeros(1), np.array([0.01, 0.0]), np.zeros(2), at_rest([0.0]))
     law.step(*state)

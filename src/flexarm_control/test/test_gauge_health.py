@@ -173,12 +173,16 @@ def test_a_gauge_that_stands_still_while_the_others_move_is_stuck(lab, which):
     assert health.lost == (which,)
 
 
-def test_the_arm_at_rest_is_not_taken_for_stuck_gauges(lab):
-    quiet, noisy = health_of(lab), health_of(lab)
-    for _ in range(200):
-        quiet.update(np.full(4, 5 * COUNT))
-        assert not quiet.health.any()
-    states, _ = run(noisy, lab, 400, delta=lambda k: np.zeros(2))
+@pytest.mark.parametrize(
+    ("count", "speed", "seed"),
+    [(200, 0.0, None), (400, 0.0, 1), (3000, 1e-6, None)],
+    ids=["quiet rest", "noisy rest", "within counts"],
+)
+def test_rest_and_slow_motion_are_not_taken_for_stuck_gauges(lab, count, speed, seed):
+    """In slow motion the outer gauge keeps its count for long while the root goes through several."""
+    states, _ = run(
+        health_of(lab), lab, count, delta=lambda k: np.array([speed * k, 0.0]), seed=seed
+    )
     assert not states.any()
 
 
@@ -195,13 +199,6 @@ def test_gauges_that_jump_do_not_make_the_others_stuck(lab, which, value):
         health.update(strain)
         assert not np.delete(health.health, which).any()
     assert (health.health[which] == SATURATED).all() == (value == 1e-3)
-
-
-def test_slow_motion_within_counts_is_not_stuck(lab):
-    """The outer gauge keeps its count for long while the root goes through several."""
-    health = health_of(lab, 20)
-    states, _ = run(health, lab, 3000, delta=lambda k: np.array([1e-6 * k, 0.0]), seed=None)
-    assert not states.any()
 
 
 def test_of_two_gauges_the_one_that_stands_still_is_stuck_and_refused(arm_r):
