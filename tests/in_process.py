@@ -14,11 +14,15 @@ from unittest import mock
 import rclpy
 from harness import Nodes
 from rclpy.serialization import deserialize_message, serialize_message
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
 from flexarm_ros.session import WaitError
 from flexarm_sim.nodes.simulator import SimulatorNode
+from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
+from flexarm_tools.recording.recorder import Recorder, raw_stamp_ns
 from flexarm_tools.running.processes import arguments, own_domain
 
 CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
@@ -48,22 +52,20 @@ class Queue:
 
     def _deliver(self, kind, topic, raw):
         self.time += self.MESSAGE
-        message = deserialize_message(raw, kind)
-        if tap := self.taps.get(topic):
-            tap.messages.append(message)
-            tap.newest = message
-        for reader in list(self._readers.get(topic, ())):
-            reader.callback(raw if reader.raw else message)
+        readers = list(self._readers.get(topic, ()))
+        if topic in self.taps:
+            readers.append(self.taps[topic])
+        message = None if all(r.raw for r in readers) else deserialize_message(raw, kind)
+        for reader in readers:
+            reader.take(raw if reader.raw else message)
 
     def readers(self, topic):
         """Number of those that get a topic's messages."""
         return len(self._readers.get(topic, ())) + (topic in self.taps)
 
-    def subscribe(self, kind, topic, callback, raw=False):
+    def subscribe(self, topic, callback, raw=False):
         """Have a callback called with a topic's messages."""
-        reader = SimpleNamespace(
-            callback=callback, raw=raw, msg_type=kind, topic_name=topic, handle=None
-        )
+        reader = SimpleNamespace(take=callback, raw=raw, topic_name=topic)
         self._readers.setdefault(topic, []).append(reader)
         return reader
 
@@ -96,6 +98,24 @@ class Queue:
             if timer.alive:
                 timer.callback()
                 self._start(timer)
+        else:
+            raise AssertionError("no message, no timer: nothing can happen any more")
+
+
+class Tap:
+    """Collects the messages of a topic, as `flexarm_ros.session.Tap`."""
+
+    def __init__(self, raw=False):
+        self.raw, self.messages = raw, []
+
+    def take(self, message):
+        """Add a message."""
+        self.messages.append(message)
+
+    @property
+    def newest(self):
+        """The last message; None before the first."""
+        return self.messages[-1] if self.messages else None
 
 
 class AtOnce:
@@ -113,7 +133,7 @@ class _OnQueue:
 
     queue = None
 
-    def _publisher(self, kind, topic, profile, **_):
+    def _publisher(self, kind, topic, *_, **__):
         topic, queue = self.resolve_topic_name(topic), self.queue
         return SimpleNamespace(
             publish=lambda message: queue.publish(kind, topic, message),
@@ -122,9 +142,9 @@ class _OnQueue:
             topic_name=topic,
         )
 
-    def make_subscription(self, kind, topic, callback, profile, raw=False, **_):
+    def make_subscription(self, kind, topic, callback, *_, raw=False, **__):
         topic = self.resolve_topic_name(topic)
-        reader = self.queue.subscribe(kind, topic, callback, raw)
+        reader = self.queue.subscribe(topic, callback, raw)
         return self._keep(self.queue.unsubscribe, reader)
 
     def make_timer(self, period, callback):
@@ -172,7 +192,7 @@ class InProcess(Nodes):
         self.domain = self._domain.__enter__()
 
     def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
-        """Make a node and activate it."""
+        """Make a node and activate it, unless `autostart` is false."""
         context = rclpy.Context()
         self._contexts.append(context)
         args = arguments(parameters, file, remaps)
@@ -182,7 +202,7 @@ class InProcess(Nodes):
             node = kind()
         node._logger = _Log(node.get_fully_qualified_name().lstrip("/"))
         self.nodes[key or name] = node
-        node.autostart()
+        assert node.autostart(), node.failure
         return node
 
     def log(self, key):
@@ -192,10 +212,9 @@ class InProcess(Nodes):
     def check(self):
         """The nodes live as long as this process."""
 
-    def tap(self, kind, topic):
+    def tap(self, kind, topic, raw=False):
         """Collects the messages of a topic from now on; one for each topic."""
-        tap = SimpleNamespace(kind=kind, messages=[], newest=None)
-        return self.queue.taps.setdefault(f"/{topic.lstrip('/')}", tap)
+        return self.queue.taps.setdefault(f"/{topic.lstrip('/')}", Tap(raw))
 
     def publisher(self, kind, topic, readers=1):
         """A publisher of a topic."""
@@ -211,7 +230,7 @@ class InProcess(Nodes):
                     return offered.callback(kind.Request(**request), kind.Response())
         raise AssertionError(f"no service {service}")
 
-    def wait_for(self, what, condition, patience=60.0):
+    def wait_for(self, what, condition, patience=20.0):
         """Serve until a condition holds; its value."""
         end = self.queue.time + patience
         while not (value := condition()):
@@ -220,6 +239,22 @@ class InProcess(Nodes):
                 raise WaitError(f"waited {patience:g} s in vain for {what}", hint=logs)
             self.queue.serve()
         return value
+
+    def record(self, message, duration):
+        """Offer a trajectory that starts at `TRAJECTORY_START_NS`, and run; the samples, as `LockstepRun.run`."""
+        end = TRAJECTORY_START_NS + round(duration * 1e9)
+        recorder = Recorder(self)
+        self.wait_for("every topic", recorder.complete)
+        begin = recorder.latest_ns
+        self.publisher(JointTrajectory, "joint_trajectory").publish(message)
+        self.wait_for("the trajectory", lambda: "accepted" in self.log("controller"))
+        assert self.call(SetBool, "simulator/pause", data=False).success
+
+        def complete():
+            return all(raw_stamp_ns(messages[-1]) >= end for messages in recorder.raw.values())
+
+        self.wait_for("the end", complete)
+        return recorder.samples(begin, end)
 
     def close(self):
         """End the nodes."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms of several links as a user runs them: the simulator node, the composite controller, over DDS."""
+"""Arms of several links as a user runs them: the simulator node, the composite controller."""
 
 import numpy as np
 import pytest
 from harness import Bench
+from in_process import InProcess
 
 from flexarm_control import trajectory
 from flexarm_control.composite.assembly import under
@@ -13,9 +14,7 @@ from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState
 from flexarm_studies.loop import closed_loop, parameter_files
 from flexarm_tools.recording import recorder
-from flexarm_tools.recording.recorder import keep_for_recording
 from flexarm_tools.running import lockstep
-from flexarm_tools.running.processes import Processes, own_domain
 
 FILE, GOAL, DURATION = "two_link_composite", (0.8, 0.8), 6.0
 
@@ -75,19 +74,17 @@ def without_ros():
     )
 
 
-def test_the_composite_controller_moves_the_two_link_arm_and_damps_it(tmp_path):
-    with own_domain() as domain, Processes(domain, tmp_path) as processes:
-        file = parameter_files.find(FILE)
+def test_the_composite_controller_moves_the_two_link_arm_and_damps_it():
+    with InProcess() as nodes:
         for name, own in (("simulator", {"lockstep": True}), ("observer", {}), ("controller", {})):
-            own |= {"arm": "two_link"} | keep_for_recording(name)
-            if name == "controller":
-                own["state_timeout"] = 60.0
-            processes.start_node(name, own, file)
-        with lockstep.LockstepRun(processes) as line:
-            start = closed_loop.TRAJECTORY_START_NS
-            message = lockstep.trajectory_message(("joint1", "joint2"), quintic(), 41, start)
-            samples, _ = line.run(message, DURATION)
-        assert set(processes.stop().values()) == {0}
+            nodes.start(
+                name,
+                {**own, "arm": "two_link", "state_timeout": 60.0},
+                file=parameter_files.find(FILE),
+            )
+        start = closed_loop.TRAJECTORY_START_NS
+        message = lockstep.trajectory_message(("joint1", "joint2"), quintic(), 41, start)
+        samples = nodes.record(message, DURATION)
     nodes = recorder.to_record(samples, start, "two_link")
     alone = without_ros()
     assert nodes.time.size == alone.time.size
