@@ -240,8 +240,12 @@ class InProcess(Nodes):
             self.queue.serve()
         return value
 
+    def start_node(self, name, parameters, file):
+        """Start a node, as `flexarm_tools.running.processes.Processes` does."""
+        self.start(name, parameters, file=file)
+
     def record(self, message, duration):
-        """Offer a trajectory that starts at `TRAJECTORY_START_NS`, and run; the samples, as `LockstepRun.run`."""
+        """Offer a trajectory that starts at `TRAJECTORY_START_NS`, and run; the samples as of `LockstepRun.run`."""
         end = TRAJECTORY_START_NS + round(duration * 1e9)
         recorder = Recorder(self)
         self.wait_for("every topic", recorder.complete)

@@ -1,33 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flexarm demo`: three processes over DDS give the loop without ROS; figures, bags, summary, tables.
+"""`flexarm demo`: the nodes give the loop without ROS; figures, bags, summary, tables.
 
 `test_closed_loop` of flexarm_studies holds the loop without ROS to the paper's rows. Here each run of the nodes is held
-to that loop, sample by sample.
+to that loop, sample by sample: one run over DDS, the others in this process.
 """
 
 import contextlib
 import io
 import json
+import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from in_process import InProcess
 
+from flexarm_control.motions import profiles
+from flexarm_dynamics.arm import arm_file
 from flexarm_studies.case_study import runs as case_study
 from flexarm_studies.case_study import tables
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 from flexarm_studies.progress import Progress
 from flexarm_tools.case_study import demo, nodes
 from flexarm_tools.recording import recorder
+from flexarm_tools.running import lockstep
 
-#: Runs over DDS of the demo below, eight seconds each; the others run alone, for the motion and a little more.
+#: Runs of the nodes in the demo below, eight seconds each; the others run alone, for some of the motion.
 WITH_NODES = [run for run in case_study.RUNS if run.model == "R_m11" and run.rates == "true"]
 ALONE = [run for run in case_study.RUNS if run not in WITH_NODES]
-SHORT = 2.2  # [s] from the start of the trajectory
+SHORT = 0.8  # [s] from the start of the trajectory
 
 
-def follows_the_loop_without_ros(bag, run, duration):
-    """The bag has every sample of every topic, and they are those of the loop without ROS."""
+def in_process(run, directory, progress=None):
+    """As `nodes.run_nodes`, with the nodes in this process."""
+    joints = arm_file.load(run.arm).joint_names
+    start, begun = TRAJECTORY_START_NS, time.perf_counter()
+    with InProcess() as bench:
+        nodes.start_nodes(bench, run)
+        message = lockstep.trajectory_message(joints, profiles.paper_profile(), 101, start)
+        samples = bench.record(message, nodes.DURATION)
+    recorder.write_bag(directory / "bag", samples, run.arm)
+    count = len(samples["arm_state"])
+    timing = lockstep.Timing(time.perf_counter() - begun, 1e-3 * count, count)
+    return recorder.to_record(samples, start, run.arm), timing
+
+
+def follows_the_loop_without_ros(bag, run, duration, over_dds=False):
+    """The bag has every sample of every topic, and they are those of the loop without ROS.
+
+    What rclpy serialises may end in padding, which rosbags does not take; what comes over DDS has none.
+    """
     from rosbags.highlevel import AnyReader
 
     samples = {}
@@ -35,7 +57,7 @@ def follows_the_loop_without_ros(bag, run, duration):
         for connection, stamp, raw in reader.messages():
             topic = connection.topic.lstrip("/")
             assert recorder.raw_stamp_ns(raw) == stamp
-            if not samples.get(topic):
+            if over_dds and topic not in samples:
                 message = reader.deserialize(raw, connection.msgtype)
                 assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
             samples.setdefault(topic, {})[stamp] = raw
@@ -50,25 +72,28 @@ def follows_the_loop_without_ros(bag, run, duration):
         np.testing.assert_allclose(of_nodes, of_one, rtol=0.0, atol=1e-9, err_msg=name)
 
 
-@pytest.mark.parametrize("run", ALONE, ids=lambda run: run.name)
-def test_nodes_give_every_sample_of_the_loop_without_ros(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("run", "how"),
+    [(ALONE[-1], nodes.run_nodes), *((run, in_process) for run in ALONE)],
+    ids=lambda found: getattr(found, "name", None) or found.__name__,
+)
+def test_nodes_give_every_sample_of_the_loop_without_ros(run, how, tmp_path, monkeypatch):
     monkeypatch.setattr(nodes, "DURATION", SHORT)
     monkeypatch.setattr(case_study, "DURATION", SHORT)
-    nodes.run_nodes(run, tmp_path)
-    follows_the_loop_without_ros(tmp_path / "bag", run, SHORT)
+    how(run, tmp_path)
+    follows_the_loop_without_ros(tmp_path / "bag", run, SHORT, how is nodes.run_nodes)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Results of the demo, and what it printed; of its seven runs four, two of them over DDS.
+    """Results of the demo, and what it printed; of its seven runs four, two of them with the nodes.
 
     `test_lockstep` measures the relay.
     """
     out, printed = tmp_path_factory.mktemp("case_study"), io.StringIO()
-    over_dds = demo._with_nodes
 
     def with_nodes(run, directory, progress):
-        return over_dds(run, directory, progress) if run in WITH_NODES else demo._timed(run)
+        return in_process(run, directory) if run in WITH_NODES else demo._timed(run)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr(demo, "RUNS", (*WITH_NODES, *(r for r in ALONE if r.model == "P3_m11")))

@@ -6,9 +6,11 @@ import re
 import signal
 import subprocess
 import sys
+from collections import ChainMap
 
 import pytest
 from harness import Bench
+from in_process import InProcess
 from test_lockstep import without_identity
 
 from flexarm_control.motions import profiles
@@ -17,30 +19,26 @@ from flexarm_tools.recording import recorder
 from flexarm_tools.running import lockstep
 from flexarm_tools.running.processes import Processes, own_domain
 
-SEPARATE = {"observer": ("observer",), "controller": ("controller",)}
-TOGETHER = {"observer_controller": ("observer", "controller")}
+GIVEN = {"arm": "R", "lockstep": True, "state_timeout": 60.0, "observer.type": "kalman"}
 
 
-def record(directory, nodes):
-    """Samples of the default control on R over 0.3 s of the paper's motion, in lockstep, and the exit codes."""
+def test_one_process_gives_every_sample_of_three_nodes_to_the_last_bit(tmp_path):
+    """The default control on R over 0.3 s of the paper's motion, in lockstep; `test_lockstep` has three processes."""
     start = closed_loop.TRAJECTORY_START_NS
-    with own_domain() as domain, Processes(domain, directory) as processes:
-        for name, of in ({"simulator": ("simulator",)} | nodes).items():
-            given = {"arm": "R", "lockstep": True, "state_timeout": 60.0, "observer.type": "kalman"}
-            for node in of:
-                given |= recorder.keep_for_recording(node)
-            processes.start_node(name, given)
+    message = lockstep.trajectory_message(("joint1",), profiles.paper_profile(), 101, start)
+    with InProcess() as bench:
+        bench.start_loop(**GIVEN)
+        three = without_identity(bench.record(message, 0.3))
+    with own_domain() as domain, Processes(domain, tmp_path) as processes:
+        for name, of in (
+            ("simulator", ("simulator",)),
+            ("observer_controller", ("observer", "controller")),
+        ):
+            keep = (recorder.keep_for_recording(node) for node in of)
+            processes.start_node(name, dict(ChainMap(GIVEN, *keep)))
         with lockstep.LockstepRun(processes) as line:
-            message = lockstep.trajectory_message(("joint1",), profiles.paper_profile(), 101, start)
-            samples = line.run(message, 0.3)[0]
-        return samples, processes.stop()
-
-
-def test_one_process_gives_every_sample_of_three_to_the_last_bit(tmp_path):
-    three, _ = record(tmp_path / "three", SEPARATE)
-    two, codes = record(tmp_path / "two", TOGETHER)
-    assert codes == {"simulator": 0, "observer_controller": 0}
-    three, two = without_identity(three), without_identity(two)
+            two = without_identity(line.run(message, 0.3)[0])
+        assert processes.stop() == {"simulator": 0, "observer_controller": 0}
     assert len(three["joint_torque"]) == 401
     assert len({sample["torque"] for sample in three["joint_torque"]}) > 200  # it moves
     for topic, messages in three.items():
