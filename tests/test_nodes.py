@@ -61,8 +61,15 @@ def start_in_mid_run(bench):
     Arm(bench).wait_until(1_100_000_000)
 
 
-@pytest.mark.parametrize("number", (signal.SIGINT, signal.SIGTERM), ids=("SIGINT", "SIGTERM"))
-@pytest.mark.parametrize("start", (start_unconfigured, start_active_alone, start_in_mid_run))
+@pytest.mark.parametrize(
+    ("start", "number"),
+    (
+        (start_unconfigured, signal.SIGINT),
+        (start_active_alone, signal.SIGTERM),
+        (start_in_mid_run, signal.SIGINT),
+        (start_in_mid_run, signal.SIGTERM),
+    ),
+)
 def test_a_signal_ends_every_node_with_code_0_and_leaves_nothing_behind(tmp_path, start, number):
     before = set(SHM.iterdir())
     with Bench(tmp_path) as bench:
@@ -199,7 +206,12 @@ def test_the_other_nodes_go_on_when_one_refuses_to_start(bench):
 # Life cycle ------------------------------------------------------------------------------------
 
 
-def test_without_autostart_the_lifecycle_services_start_stop_and_restart_every_node(bench):
+def test_without_autostart_the_lifecycle_services_start_stop_and_restart_every_node():
+    with InProcess() as bench:
+        check_life_cycle(bench)
+
+
+def check_life_cycle(bench):
     for name in NODES:
         own = {**LOCKSTEP, "pause_at": -1.0} if name == "simulator" else {}
         bench.start(name, {"arm": "R", "fast.type": "none", "autostart": False, **own})
