@@ -55,7 +55,7 @@ class Regulator:
 
 
 def regulator(model, q, parameters):
-    """Solve (20) in joint configuration q; not for the control path.
+    """Solve (20) in joint configuration q; not for the control path. Without modes the arrays are empty.
 
     Parameters
     ----------
@@ -64,11 +64,6 @@ def regulator(model, q, parameters):
         [rad]
     parameters : mapping
         Checked values of `WEIGHTS`.
-
-    Returns
-    -------
-    Regulator
-        Without modes (a rigid arm) its arrays are empty.
 
     Raises
     ------

@@ -24,6 +24,7 @@ import re
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from flexarm_dynamics.errors import TrajectoryError
@@ -45,7 +46,7 @@ _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 def read(
     path, joint_names, position_low=None, position_high=None, velocity_max=None
 ) -> JointTrajectoryData:
-    """Read a trajectory from a file.
+    """Read a trajectory from a file; with stamp 0: it starts when it is offered.
 
     Parameters
     ----------
@@ -55,11 +56,6 @@ def read(
         The arm's n joints; a CSV file's columns are numbered in this order.
     position_low, position_high, velocity_max : (n,) array_like, optional
         Limits, as for `validate` [rad], [rad], [rad/s].
-
-    Returns
-    -------
-    JointTrajectoryData
-        With stamp 0: it starts when it is offered.
 
     Raises
     ------
@@ -113,9 +109,8 @@ def write(path, trajectory):
 def _reader(path):
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
-        raise TrajectoryError(
-            "has the wrong suffix", field="path", value=str(path), limit=", ".join(SUFFIXES)
-        )
+        problem, limit = "has the wrong suffix", ", ".join(SUFFIXES)
+        raise TrajectoryError(problem, field="path", value=str(path), limit=limit)
     return _from_csv if suffix == ".csv" else _from_yaml
 
 
@@ -175,9 +170,8 @@ def _csv_columns(header, joint_names, line):
         if word not in known:
             raise TrajectoryError("is no known column", field=where, value=word, hint=hint)
         if header.count(word) > 1:
-            raise TrajectoryError(
-                f"is the name of {header.count(word)} columns", field=where, value=word
-            )
+            problem = f"is the name of {header.count(word)} columns"
+            raise TrajectoryError(problem, field=where, value=word)
     for field in ("velocities", "accelerations"):
         if not set(header).intersection(fields[field]):
             fields[field] = []
@@ -207,14 +201,12 @@ def _csv_time(value, line):
 
 
 def _csv_text(trajectory):
-    n = len(trajectory.joint_names)
-    fields = [f for f in _PREFIXES if getattr(trajectory, f) is not None]
-    header = ["t"] + [f"{_PREFIXES[f]}{i + 1}" for f in fields for i in range(n)]
-    rows = [",".join(header)]
-    for k, time in enumerate(trajectory.times_ns.tolist()):
-        values = [v for f in fields for v in getattr(trajectory, f)[k].tolist()]
-        rows.append(",".join([_decimal(time), *map(repr, values)]))
-    return "\n".join(rows) + "\n"
+    n, fields = len(trajectory.joint_names), trajectory.fields
+    prefixes = tuple(_PREFIXES.values())[: len(fields)]
+    rows = [["t", *(f"{prefix}{i + 1}" for prefix in prefixes for i in range(n))]]
+    for time, values in zip(trajectory.times_ns.tolist(), np.hstack(fields).tolist(), strict=True):
+        rows.append([_decimal(time), *map(repr, values)])
+    return "".join(",".join(row) + "\n" for row in rows)
 
 
 def _decimal(time_ns):
@@ -290,11 +282,10 @@ def _yaml_values(values, field):
 
 
 def _yaml_text(trajectory):
-    fields = [f for f in _PREFIXES if getattr(trajectory, f) is not None]
     points = []
-    for k, time in enumerate(trajectory.times_ns.tolist()):
+    for time, *values in zip(trajectory.times_ns.tolist(), *trajectory.fields, strict=True):
         sec, nanosec = divmod(time, SECOND)
-        point = {f: getattr(trajectory, f)[k].tolist() for f in fields}
+        point = {name: row.tolist() for name, row in zip(_PREFIXES, values, strict=False)}
         points.append(point | {"time_from_start": {"sec": sec, "nanosec": nanosec}})
     message = {"joint_names": list(trajectory.joint_names), "points": points}
     return yaml.dump(message, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=1000)

@@ -69,7 +69,7 @@ def load(text, model, start=None) -> JointTrajectoryData:
 
 
 def from_spec(text, model, start=None) -> JointTrajectoryData:
-    """Return the trajectory of a motion written in one line.
+    """Return the trajectory of a motion written in one line, with stamp 0 and within the arm's limits.
 
     Parameters
     ----------
@@ -78,11 +78,6 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
     model : ArmModel
     start : (n,) array_like, optional
         Joint angles at the start, unless the text sets ``from`` [rad]; zero if not given.
-
-    Returns
-    -------
-    JointTrajectoryData
-        With stamp 0, within the arm's limits.
 
     Raises
     ------
@@ -118,9 +113,8 @@ def parse(text):
         key, equals, value = (word.strip() for word in item.partition("="))
         key = key.replace("_", "-")
         if not equals or not value:
-            raise TrajectoryError(
-                "is no setting", field=family, value=item, hint="write name=value"
-            )
+            hint = "write name=value"
+            raise TrajectoryError("is no setting", field=family, value=item, hint=hint)
         if key in settings:
             raise TrajectoryError("is given twice", field=family, value=key)
         settings[key] = value
@@ -137,12 +131,10 @@ def _check(family, settings):
             limit=", ".join(FAMILIES),
             hint=f"or give a file that ends in {', '.join(files.SUFFIXES)}",
         )
-    known = (*FAMILIES[family], *_COMMON)
+    known, problem = (*FAMILIES[family], *_COMMON), "is no setting of this family"
     for key in settings:
         if key not in known:
-            raise TrajectoryError(
-                "is no setting of this family", field=family, value=key, limit=", ".join(known)
-            )
+            raise TrajectoryError(problem, field=family, value=key, limit=", ".join(known))
     for key in REQUIRED.get(family, ()):
         if key not in settings:
             hint = f"give {key}=x;y;z in the base frame [m]"
@@ -228,11 +220,8 @@ def _shaper(settings, model, end):
     """Return the shaper that the settings ask for, for the modes where the motion ends, or None."""
     if "shaper" not in settings:
         if "shape-modes" in settings:
-            raise TrajectoryError(
-                "is given without shaper",
-                field="shape-modes",
-                hint=f"give shaper={' or shaper='.join(shapers.SHAPERS)} too",
-            )
+            hint = f"give shaper={' or shaper='.join(shapers.SHAPERS)} too"
+            raise TrajectoryError("is given without shaper", field="shape-modes", hint=hint)
         return None
     modes = _number(int, settings, "shape-modes", min(SHAPE_MODES, model.n_modes))
     return shapers.for_arm(model, end, settings["shaper"], modes)
