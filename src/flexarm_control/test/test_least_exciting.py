@@ -71,7 +71,7 @@ def test_the_full_model_is_left_as_quiet_as_the_linear_theory_says(arm_r, motion
 def test_no_feasible_neighbour_is_better(arm_r):
     """Convexity: along any way that keeps the limits the objective of the last programme does not fall."""
     base = profiles.quintic([0.0], [QUARTER], 2.0)
-    problem = _Problem(arm_r, base, np.array([3.5]), np.array([np.inf]), None)
+    problem = _Problem(arm_r, base, np.array([3.5]), np.array([np.inf]))
     x, _ = problem.solve()
     r, A = problem.linearised(x, 2.0)
     E, f = problem._objective(r[:, 1:], A[:, 1:])

@@ -68,7 +68,9 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     torque, steady = np.empty_like(q), np.empty((points, model.n_modes))
     for k in range(points):
         torque[k], steady[k] = reduced(model, q[k], qd[k], qdd[k])
-    response = FastResponse(model, times[1] - times[0], *path_of(q, qd, configuration))
+    if configuration is not None:
+        q, qd = np.asarray(configuration, float)[None], np.zeros((1, model.n_joints))
+    response = FastResponse(model, times[1] - times[0], q, qd)
     deviation = response.deviation(steady)
     return Excitation(times, torque, steady, deviation, response.energy(deviation))
 
@@ -81,13 +83,6 @@ def reduced(model, q, qd, qdd):
     a, B = slow_subsystem(terms)
     torque = np.linalg.solve(B, qdd - a)
     return torque, quasi_steady_state(terms, torque)
-
-
-def path_of(q, qd, configuration=None):
-    """Joint angles and rates (k, n) where (11) is taken: the motion's, or one configuration at rest."""
-    if configuration is None:
-        return q, qd
-    return np.asarray(configuration, float)[None], np.zeros((1, q.shape[1]))
 
 
 class FastResponse:

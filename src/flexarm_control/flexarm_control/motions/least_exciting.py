@@ -61,7 +61,7 @@ class LeastExciting:
 
 
 def least_exciting(
-    model, start, end, duration, torque_limit=None, velocity_limit=None, configuration=None
+    model, start, end, duration, torque_limit=None, velocity_limit=None
 ) -> LeastExciting:
     """Return the motion that excites the modes least.
 
@@ -75,8 +75,6 @@ def least_exciting(
     torque_limit, velocity_limit : (n,) array_like, optional
         Of the slow torque [N m] and of the speeds [rad/s]; the arm file's limits if not given. Leave some
         torque for the fast control.
-    configuration : (n,) array_like, optional
-        Where (11) is taken [rad]; along the motion if not given.
 
     Raises
     ------
@@ -85,7 +83,7 @@ def least_exciting(
     DesignError
         If the programme does not settle.
     ShapeError
-        For limits or a configuration of another length.
+        For limits of another length.
     """
     base = quintic(start, end, duration)
     if base.start.shape != (model.n_joints,):
@@ -94,17 +92,13 @@ def least_exciting(
     speed = _limit("velocity_limit", velocity_limit, model.arm.velocity_limits)
     if not np.any(base.angle):
         raise TrajectoryError("is the start: there is nothing to move", field="end")
-    problem = _Problem(model, base, torque, speed, configuration)
+    problem = _Problem(model, base, torque, speed)
     problem.check_feasible()
     x, rounds = problem.solve()
     profile = problem.profile(x)
     points = 2 * PER_INTERVAL * INTERVALS + 1
-    return LeastExciting(
-        profile,
-        excitation.along(model, profile, configuration, points),
-        excitation.along(model, base, configuration, points),
-        rounds,
-    )
+    excited, of_quintic = (excitation.along(model, p, points=points) for p in (profile, base))
+    return LeastExciting(profile, excited, of_quintic, rounds)
 
 
 def _limit(name, given, default):
@@ -150,10 +144,9 @@ class _Basis:
 class _Problem:
     """The programme of one motion; `x` are the free coefficients of sigma."""
 
-    def __init__(self, model, base, torque_limit, speed_limit, configuration):
+    def __init__(self, model, base, torque_limit, speed_limit):
         self.model, self.base = model, base
         self.torque_limit, self.speed_limit = torque_limit, speed_limit
-        self.configuration = configuration
         self.basis = _Basis()
         self.first = self.basis.fit(base.shape[0](self.basis.s))
 
@@ -329,15 +322,14 @@ class _Problem:
         return DesignError(
             f"does not settle ({why}): the torque changes too much along it",
             field="least-exciting motion",
-            hint="give a longer duration, a higher torque limit, or one configuration",
+            hint="give a longer duration or a higher torque limit",
         )
 
     def _response(self, x):
         """The fast subsystem along the motion of x."""
         profile, times = self.profile(x), self.base.duration * self.basis.s
-        q, qd = profile.position(times), profile.velocity(times)
-        where = excitation.path_of(q, qd, self.configuration)
-        return excitation.FastResponse(self.model, times[1], *where)
+        q, qd, _ = profile.states(times)
+        return excitation.FastResponse(self.model, times[1], q, qd)
 
     def _excess(self, x):
         """Peak torque divided by its limit, by the full reduced model, also between the grid's times."""

@@ -55,7 +55,7 @@ class TipPath(Motion):
         return self._curvature(s) * rate**2 + self._slope(s) * self._law.acceleration(t)
 
 
-def line(model, start, end, law, bent=True) -> TipPath:
+def line(model, start, end, law) -> TipPath:
     """Return the motion of the tip along a straight line.
 
     Parameters
@@ -67,8 +67,6 @@ def line(model, start, end, law, bent=True) -> TipPath:
         Where it ends, in the base frame [m].
     law : Motion
         Of one joint, from 0 to 1: the fraction of the path.
-    bent : bool
-        Whether to compensate the deflections by weight.
 
     Raises
     ------
@@ -76,27 +74,23 @@ def line(model, start, end, law, bent=True) -> TipPath:
         If the path can't be followed to its end; with the fraction that can, and how near the tip comes.
     """
     end, start = checked(model, end, start)
-    kinematics = TipKinematics(model, bent)
+    kinematics = TipKinematics(model)
     begin = kinematics.tip(start)
     way = end - begin
     if np.linalg.norm(way) < 1e-9:
-        raise TrajectoryError(
-            "m is where the tip is already",
-            field="tip",
-            value=end.tolist(),
-            hint="give another point",
-        )
+        problem, hint = "m is where the tip is already", "give another point"
+        raise TrajectoryError(problem, field="tip", value=end.tolist(), hint=hint)
     return _follow(kinematics, start, lambda s: begin + np.multiply.outer(_scalar(s), way), law)
 
 
-def arc(model, start, via, end, law, bent=True) -> TipPath:
+def arc(model, start, via, end, law) -> TipPath:
     """Return the motion of the tip along the circle from where it is, through `via`, to `end`.
 
     Parameters
     ----------
     via, end : (3,) array_like
         Two more points of the circle, in the base frame [m].
-    model, start, law, bent
+    model, start, law
         As for `line`.
 
     Raises
@@ -106,7 +100,7 @@ def arc(model, start, via, end, law, bent=True) -> TipPath:
     """
     via, _ = checked(model, via, start)
     end, start = checked(model, end, start)
-    kinematics = TipKinematics(model, bent)
+    kinematics = TipKinematics(model)
     curve = circle(kinematics.tip(start), via, end)
     return _follow(kinematics, start, curve, law)
 
