@@ -29,3 +29,16 @@ def pytest_collection_modifyitems(config, items):
             "this pytest-xdist ignores groups under this pytest: see requirements"
         )
     return result
+
+
+@pytest.fixture
+def flexarm(capsys):
+    """Runs a command in this process: exit code, standard output, standard error."""
+    from flexarm_bringup import cli
+
+    def run(*words):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([str(word) for word in words])
+        return stop.value.code, *capsys.readouterr()
+
+    return run

@@ -17,11 +17,16 @@ COMMANDS = sorted(next(a for a in cli.parser()._actions if getattr(a, "choices",
 WITHOUT_JSON = {"run", "view"}
 
 
-def text_of(words, capsys, code=0):
-    with pytest.raises(SystemExit) as end:
-        cli.main(words)
-    assert end.value.code == code
-    return capsys.readouterr().out
+@pytest.fixture
+def printed(flexarm):
+    """Runs a command that must succeed: its standard output."""
+
+    def run(*words):
+        code, out, err = flexarm(*words)
+        assert code == 0, err
+        return out
+
+    return run
 
 
 @pytest.fixture(params=COMMANDS)
@@ -29,8 +34,8 @@ def command(request):
     return request.param
 
 
-def test_help_ends_with_examples_and_exit_codes(command, capsys):
-    text = text_of([command, "--help"], capsys)
+def test_help_ends_with_examples_and_exit_codes(command, printed):
+    text = printed(command, "--help")
     tail = text[text.rindex("example") :]
     assert "exit code: 0 done, 1 an error" in " ".join(tail.split())
     examples = [line.split("flexarm ", 1)[1] for line in tail.splitlines() if "flexarm " in line]
@@ -40,12 +45,12 @@ def test_help_ends_with_examples_and_exit_codes(command, capsys):
         assert options.command == command
 
 
-def test_commands_that_end_can_say_it_as_json(command, capsys):
-    assert ("--json" in text_of([command, "--help"], capsys)) == (command not in WITHOUT_JSON)
+def test_commands_that_end_can_say_it_as_json(command, printed):
+    assert ("--json" in printed(command, "--help")) == (command not in WITHOUT_JSON)
 
 
-def test_every_command_is_listed_with_a_line_of_its_own(capsys):
-    text = text_of(["--help"], capsys)
+def test_every_command_is_listed_with_a_line_of_its_own(printed):
+    text = printed("--help")
     for name in COMMANDS:
         assert any(line.split()[:1] == [name] for line in text.splitlines())
 
@@ -61,15 +66,14 @@ def test_every_command_is_listed_with_a_line_of_its_own(capsys):
         (["frequencies", "R"], "arm"),
     ],
 )
-def test_json_is_all_that_standard_output_gets(words, key, tmp_path, capsys):
+def test_json_is_all_that_standard_output_gets(words, key, tmp_path, printed):
     words = [word.format(tmp=tmp_path) for word in words]
-    printed = json.loads(text_of([*words, "--json"], capsys))
-    assert key in printed
+    assert key in json.loads(printed(*words, "--json"))
 
 
-def test_a_dry_run_says_the_same_in_both_ways(capsys):
+def test_a_dry_run_says_the_same_in_both_ways(printed):
     words = ["publish", "quintic", "--to", "0.1", "--duration", "0.2", "--dry-run"]
-    people, machines = text_of(words, capsys), json.loads(text_of([*words, "--json"], capsys))
+    people, machines = printed(*words), json.loads(printed(*words, "--json"))
     (joint,) = machines["joints"]
     assert f"slow torque {joint['peak_slow_torque_Nm']:.4g} N m" in people
     assert f"{machines['vibration_energy_J']['left_at_the_end']:.3g} J left" in people

@@ -7,22 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
 from flexarm_studies.loop.metrics import SimulatedRecord
-
-
-@pytest.fixture
-def flexarm(capsys):
-    """Runs a command in this process: exit code, standard output, standard error."""
-
-    def run(*words):
-        with pytest.raises(SystemExit) as stop:
-            cli.main([str(word) for word in words])
-        return stop.value.code, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexarm_bringup import cli
 from flexarm_control.motions import profiles, shapers
 from flexarm_control.trajectory import files
 from flexarm_dynamics.arm import arm_file
@@ -16,12 +15,6 @@ from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 from flexarm_dynamics.models import model
 from flexarm_studies.progress import Progress
 from flexarm_tools import publish_trajectory
-
-
-def exit_code(words):
-    with pytest.raises(SystemExit) as end:
-        cli.main(words)
-    return end.value.code
 
 
 def options(*words):
@@ -52,30 +45,29 @@ def profile(*words, reference=(0.0,)):
         ["run", "flexarm_sim"],
     ],
 )
-def test_wrong_usage_exits_2_and_says_how(words, capsys):
-    assert exit_code(words) == 2
-    assert "usage: flexarm" in capsys.readouterr().err
+def test_wrong_usage_exits_2_and_says_how(words, flexarm):
+    code, _, err = flexarm(*words)
+    assert code == 2 and "usage: flexarm" in err
 
 
-def test_an_error_is_one_line_and_exits_1(monkeypatch, capsys):
+def test_an_error_is_one_line_and_exits_1(monkeypatch, capsys, flexarm):
     def refuse(options, ros_args=None):
         raise TrajectoryError("no such motion")
 
     monkeypatch.setattr(publish_trajectory, "publish", refuse)
-    assert exit_code(["publish", "paper"]) == 1
-    assert capsys.readouterr().err == "flexarm publish: no such motion\n"
+    assert flexarm("publish", "paper") == (1, "", "flexarm publish: no such motion\n")
     with pytest.raises(SystemExit) as end:
         publish_trajectory.main(["paper"])
     assert end.value.code == 1
     assert capsys.readouterr().err == "publish_trajectory: no such motion\n"
 
 
-def test_an_interrupt_exits_130(monkeypatch):
+def test_an_interrupt_exits_130(monkeypatch, flexarm):
     def interrupt(options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(publish_trajectory, "publish", interrupt)
-    assert exit_code(["publish", "paper"]) == 130
+    assert flexarm("publish", "paper")[0] == 130
 
 
 def test_ros_arguments_are_passed_on_apart(monkeypatch):
@@ -180,12 +172,10 @@ def test_options_become_the_settings_of_their_families(words, field):
     assert error.value.field == field
 
 
-def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, capsys):
+def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, flexarm):
     path = tmp_path / "motion.yaml"
-    words = ["publish", "smooth", "--to", "-0.5", "--out", str(path), "--dry-run"]
-    assert exit_code(words) == 0
-    out = capsys.readouterr().out
-    assert "smooth: 2 s" in out and "401 points" in out
+    code, out, _ = flexarm("publish", "smooth", "--to", "-0.5", "--out", path, "--dry-run")
+    assert code == 0 and "smooth: 2 s" in out and "401 points" in out
     assert "joint1: 0 to -0.5 rad, at most 0.5469 rad/s" in out  # 35/16 of the mean
     assert "J left at the end" in out
     read = files.read(path, ["joint1"])
@@ -194,14 +184,14 @@ def test_a_motion_is_written_to_a_file_and_described_without_ros(tmp_path, capsy
     assert_allclose(read.accelerations, expected.accelerations, rtol=1e-15)
 
 
-def test_a_torque_that_will_be_clipped_is_reported(capsys):
-    assert exit_code(["publish", "paper", "--duration", "1", "--dry-run"]) == 0
-    assert "of 13.5582: it will be clipped" in capsys.readouterr().out
+def test_a_torque_that_will_be_clipped_is_reported(flexarm):
+    code, out, _ = flexarm("publish", "paper", "--duration", "1", "--dry-run")
+    assert code == 0 and "of 13.5582: it will be clipped" in out
 
 
-def test_a_file_of_another_kind_is_refused(capsys):
-    assert exit_code(["publish", "paper", "--out", "motion.txt"]) == 1
-    assert "'motion.txt' has the wrong suffix (.csv" in capsys.readouterr().err
+def test_a_file_of_another_kind_is_refused(flexarm):
+    code, _, err = flexarm("publish", "paper", "--out", "motion.txt")
+    assert code == 1 and "'motion.txt' has the wrong suffix (.csv" in err
 
 
 # --------------------------------------------------------------------------- progress

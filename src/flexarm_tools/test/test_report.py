@@ -36,13 +36,6 @@ from flexarm_tools.report.run import HOLDING, TRACKING
 PERIOD = 5_000_000  # of the bags that are made up here [ns]
 
 
-def flexarm(*words, code=0):
-    """Run a command, which must end with this exit code."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([str(word) for word in words])
-    assert end.value.code == code
-
-
 def scenario_of(file="paper_slow", arm="R", **more):
     return scenario.Scenario(arm, scenario.parameters(file), **more)
 
@@ -275,8 +268,9 @@ def checked(text):
 def reported(recorded, tmp_path_factory):
     """The page of both runs, and what the command prints."""
     out = tmp_path_factory.mktemp("page") / "both.html"
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        flexarm("report", *(path for path, _, _ in recorded.values()), "--out", out, "--json")
+    paths = [str(path) for path, _, _ in recorded.values()]
+    with contextlib.redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit, match="0"):
+        cli.main(["report", *paths, "--out", str(out), "--json"])
     return out, json.loads(printed.getvalue())
 
 
@@ -396,10 +390,10 @@ def read(path, **options):
     return command.read([path], **options)[0]
 
 
-def test_an_arm_state_alone_makes_a_report(tmp_path, capsys):
+def test_an_arm_state_alone_makes_a_report(tmp_path, flexarm):
     path = _made_up(tmp_path / "alone", 400)
-    flexarm("report", path, "--out", tmp_path / "alone.html")
-    assert "alone.html" in capsys.readouterr().out
+    code, out, _ = flexarm("report", path, "--out", tmp_path / "alone.html")
+    assert code == 0 and "alone.html" in out
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     checked(text)
     assert "controller/state is not in the bag" in text
@@ -779,9 +773,9 @@ def test_what_can_not_be_recorded_is_refused(tmp_path, monkeypatch, changes, rea
     assert not list(tmp_path.iterdir())
 
 
-def test_simulate_takes_a_bag_only_with_a_controller(capsys):
-    flexarm("simulate", "R", "--bag", "x", code=1)
-    assert "only with --controller" in capsys.readouterr().err
+def test_simulate_takes_a_bag_only_with_a_controller(flexarm):
+    code, _, err = flexarm("simulate", "R", "--bag", "x")
+    assert code == 1 and "only with --controller" in err
 
 
 def test_an_arm_that_was_read_has_no_name_in_its_bag(tmp_path):

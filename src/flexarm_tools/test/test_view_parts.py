@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from flexarm_bringup import cli
 from flexarm_control.nodes.controller import parameter_groups
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
@@ -145,11 +144,9 @@ def test_options_that_do_not_go_together_are_refused(words, why):
         command.check(options(*words))
 
 
-def test_the_urdf_command_writes_a_file(tmp_path, capsys):
+def test_the_urdf_command_writes_a_file(tmp_path, flexarm):
     path = tmp_path / "arm.urdf"
-    with pytest.raises(SystemExit) as left:
-        cli.main(["urdf", "two_link", "--pieces", "3", "--out", str(path)])
-    assert left.value.code == 0
+    code, out, _ = flexarm("urdf", "two_link", "--pieces", "3", "--out", path)
     # Two joints of the arm, and four small ones for each link.
-    assert "10 joints" in capsys.readouterr().out
+    assert code == 0 and "10 joints" in out
     assert path.read_text().count('type="continuous"') == 2
