@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of this package, and their entry points, as ``ros2 run flexarm_control observer``."""
+"""Nodes of this package, and their entry points."""
 
 from functools import partial
 
 from flexarm_ros.start import start
 
+# ``ros2 run flexarm_control observer``, and so on.
 start_observer = partial(start, "flexarm_control.nodes.observer")
 start_controller = partial(start, "flexarm_control.nodes.controller")
 start_observer_controller = partial(start, "flexarm_control.nodes.observer_controller")
