@@ -56,10 +56,9 @@ def chosen(options):
     rates = [500.0] if options.quick else rates
     cases = [c for c in CASES if c.arm in arms and (c.arm != "R" or c.rate in rates)]
     if not cases:
-        raise FlexarmError(
-            f"latency: nothing to measure of arms {options.arms} at {options.rates} Hz; there are"
-            f" {'; '.join(c.name for c in CASES)}"
-        )
+        known = "; ".join(c.name for c in CASES)
+        given = f"{options.arms} at {options.rates} Hz"
+        raise FlexarmError("is not measured", field="--arms, --rates", value=given, limit=known)
     return cases
 
 
@@ -132,7 +131,9 @@ def latency(options):
     cases, load = chosen(options), os.getloadavg()[0] / (os.cpu_count() or 1)
     again = [case for case in cases if case.rate == 500.0]
     if options.redesign and not again:
-        raise FlexarmError("latency --redesign is measured at 500 Hz: have it among the --rates")
+        raise FlexarmError(
+            "is measured at 500 Hz", field="--redesign", hint="have it among the --rates"
+        )
     tables.append(_table_of(everything, cases, options, "beside a relay", _beside_the_relay))
     if options.redesign:
         tables.append(_table_of(everything, again, options, "while designing", _while_designing))
@@ -142,6 +143,7 @@ def latency(options):
     if busy:
         print(f"The machine was too busy for a table that is to be kept: {busy}.")
     if options.write and busy and not options.force:
-        raise FlexarmError(f"{options.write} is not written: the machine was too busy; see --force")
+        problem = "is not written: the machine was too busy"
+        raise FlexarmError(problem, field=options.write, hint="see --force")
     if options.write:
         write_between(options.write, BEGIN, END, "\n\n".join(tables))

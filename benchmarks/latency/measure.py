@@ -9,6 +9,7 @@ to the callback of the torque that answers it. Relay and loops take turns in sho
 slows the machine slows all of them, and the result is the ratio of each round's medians.
 """
 
+import contextlib
 import json
 import statistics
 import time
@@ -203,15 +204,8 @@ class Chain:
         return found
 
 
-def measure(
-    case,
-    rounds,
-    chains=tuple(CHAINS),
-    relay_spin="executor",
-    moving=True,
-    fraction=lambda done: None,
-):
-    """Windows of a case, in turns.
+def measure(case, rounds, chains, relay_spin, moving, fraction):
+    """Windows of a case, in turns: chain to ``{"windows": [what the simulator found …], "mathematics": {part: s}}``.
 
     Parameters
     ----------
@@ -225,14 +219,7 @@ def measure(
         Whether the arm moves.
     fraction : callable
         Called with the fraction that is done, 0 to 1.
-
-    Returns
-    -------
-    dict
-        Chain to ``{"windows": [what the simulator found …], "mathematics": {part: s}}``.
     """
-    import contextlib
-
     out = {}
     with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         made = [Chain(stack, name, case, Path(folder), relay_spin) for name in chains]
@@ -275,7 +262,7 @@ def summary(case, found):
     for name, chain in found.items():
         for window in chain["windows"]:
             if not window["latencies"]:
-                raise FlexarmError(f"{case.name}: no torque came back in a window of {name}")
+                raise FlexarmError(f"no torque came back in a window of {name}", field=case.name)
     bare = percentiles(found["relay"]["windows"])
     rows = []
     for name, chain in found.items():

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies import markdown
 
 from .measure import Chain, medians, percentiles
@@ -110,29 +111,11 @@ class Setter:
             self.answers.append(answer.answer.result)
 
 
-def measure(case, rounds, fraction=lambda done: None):
-    """Windows of a case, in turns.
+def measure(case, rounds, fraction):
+    """Windows of a case of an arm of `REDESIGNS`, in turns: what was done to what the simulator found in each window.
 
-    Parameters
-    ----------
-    case : Case
-        Of an arm of `REDESIGNS`.
-    rounds : int
-    fraction : callable
-        Called with the fraction that is done, 0 to 1.
-
-    Returns
-    -------
-    dict
-        What was done to what the simulator found in each window.
-
-    Raises
-    ------
-    FlexarmError
-        When the controller refuses a value or a design.
+    `fraction` is called with the fraction that is done, 0 to 1. A value or a design that is refused is an error.
     """
-    from flexarm_dynamics.errors import FlexarmError
-
     kinds = (NOTHING, ALPHA, GRID)
     found = {kind: [] for kind in kinds}
     with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
@@ -149,10 +132,10 @@ def measure(case, rounds, fraction=lambda done: None):
         chain.processes.stop()
         refused = [x for x in chain.processes.log("controller").splitlines() if "refused" in x]
     if refused:
-        raise FlexarmError(f"{case.name}: a design was refused: {refused[0]}")
+        raise FlexarmError(f"a design was refused: {refused[0]}", field=case.name)
     for answer in setter.answers:
         if not answer.successful:
-            raise FlexarmError(f"{case.name}: the controller refused: {answer.reason}")
+            raise FlexarmError(f"the controller refused: {answer.reason}", field=case.name)
     return found
 
 

@@ -117,10 +117,10 @@ REFUSED = {
     "identify": {
         "nothing.csv one_link": "no such file or bag",
         "one_link": "either a bag or CSV file",
-        "one_sample.csv one_link": "1 samples; at least 20",
+        "one_sample.csv one_link": "1 samples are no motion (at least 20",
         "no_position.csv one_link": "no column joint1_position (wanted: t, joint1_position",
         "text.csv one_link": "text.csv:2: joint1_position: 'x' is not a number",
-        "no_torque.csv one_link": "joint_torque is unknown",
+        "no_torque.csv one_link": "joint_torque: is unknown (NaN) in every sample",
     },
 }
 LINES = {

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 
+from ..commands.options import at_least
 from ..loop import scenario as scenarios
 from ..loop.metrics import residual_window
 from ..progress import Progress
@@ -60,11 +61,8 @@ def add_arguments(parser):
 
 def analyze(options):
     """Run the sub-command."""
-    for name, least in (("configurations", 1), ("seed", 0)):
-        if (value := getattr(options, name)) < least:
-            raise FlexarmError(
-                "is too small", field=f"--{name}", value=value, limit=f"{least} or more"
-            )
+    at_least("--configurations", options.configurations, 1)
+    at_least("--seed", options.seed, 0)
     if options.monte_carlo is None and (options.workers or options.scheduler):
         raise FlexarmError("only with --monte-carlo", field="--workers, --scheduler")
     values = scenarios.parameters(options.controller, options.set or ())

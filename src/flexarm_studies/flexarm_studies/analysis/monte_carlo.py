@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError, ParameterError
+from flexarm_dynamics.errors import FlexarmError
 
+from ..commands.options import at_least
 from ..loop import scenario as scenarios
 from ..workers import processes
 
@@ -66,8 +67,7 @@ class Specification:
 
 def specification(scenario, seed=0):
     """The specification of runs about a `scenario`; a negative seed and a missing arm file are refused."""
-    if seed < 0:
-        raise ParameterError("is too small", field="--seed", value=seed, limit="0 or more")
+    at_least("--seed", seed, 0)
     arms = {a for a in (scenario.arm, scenario.plant_arm) if a}
     files = {a: hashlib.sha256(arm_file.find(a).read_bytes()).hexdigest() for a in sorted(arms)}
     return Specification(scenario.as_dict(), seed, files=files)
@@ -126,9 +126,8 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
     FlexarmError
         For a file of another specification, and where Dask is not installed or its scheduler can't be reached.
     """
-    for name, value in (("--monte-carlo", count), ("--workers", workers)):
-        if value is not None and value < 1:
-            raise ParameterError("is too small", field=name, value=value, limit="1 or more")
+    at_least("--monte-carlo", count, 1)
+    at_least("--workers", workers, 1)
     keep = None if directory is None else Store(Path(directory) / FILE, spec)
     results = {} if keep is None else {n: r for n, r in keep.results.items() if n < count}
     missing = [n for n in range(count) if n not in results]

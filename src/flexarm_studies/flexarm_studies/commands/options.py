@@ -91,6 +91,13 @@ def in_range(option, value, low, high):
     return value
 
 
+def at_least(option, value, least):
+    """Refuse a value below the least one; None is a value that was not given."""
+    if value is not None and value < least:
+        limit = f"{least} or more"
+        raise FlexarmError("is too small", field=option, value=value, limit=limit)
+
+
 def check_file(path, option="--plot"):
     """Return the path of a figure after making its folder, or refuse it."""
     path, suffixes = Path(path), (".png", ".svg", ".pdf")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 
+from ..commands.options import at_least
 from ..progress import Progress
 from ..workers import processes
 from . import cases, combinations, report
@@ -95,7 +96,7 @@ def merged(runs):
             whole = by_arm.setdefault(case["arm"], case | {"contenders": {}, "combinations": []})
             for name in ("motion", "rate_Hz", "window_s", "budget"):
                 if whole[name] != case[name] or runs[0]["seed"] != run_["seed"]:
-                    raise FlexarmError(f"{case['arm']}: the runs differ in {name} or seed")
+                    raise FlexarmError(f"the runs differ in {name} or seed", field=case["arm"])
             whole["contenders"] |= case["contenders"]
             whole["combinations"] += case["combinations"]
     order = [s.arm for s in cases.CASES]
@@ -108,11 +109,7 @@ def merged(runs):
 def chosen(options):
     """The requested cases, and names of controllers."""
     for name, least in (("budget", 1), ("workers", 1), ("seed", 0)):
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise FlexarmError(
-                "is too small", field=f"--{name}", value=value, limit=f"{least} or more"
-            )
+        at_least(f"--{name}", getattr(options, name), least)
     names = list(CONTROLLERS)
     if options.contenders == "none":
         names = []
@@ -140,9 +137,8 @@ def _joined(words):
                 del rest[:count]
                 break
         else:
-            raise FlexarmError(
-                "is unknown", field="--contenders", value=rest[0], limit="; ".join(CONTROLLERS)
-            )
+            known = "; ".join(CONTROLLERS)
+            raise FlexarmError("is unknown", field="--contenders", value=rest[0], limit=known)
     return names
 
 

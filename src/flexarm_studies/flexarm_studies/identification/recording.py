@@ -15,6 +15,8 @@ from .. import tables
 
 #: Stamps may be off their grid by this fraction of the period [-].
 JITTER = 0.2
+#: A shorter recording is none of a motion.
+MIN_SAMPLES = 20
 #: `JointTorque.ENABLED`.
 ENABLED = 1
 #: Samples after the first enabled torque (and before the last) that are left out: a safe action may still act.
@@ -81,33 +83,33 @@ def uniform(arm, time, position, torque, strain, usable=None):
     time, notes = np.asarray(time, float), []
     known = np.isfinite(torque).all(axis=1)
     usable = known if usable is None else known & usable
-    if time.size >= 20 and not known.any():
-        raise FlexarmError(
-            "joint_torque is unknown (NaN) in every sample: the driver must report the torque that it applies"
-        )
+    if time.size >= MIN_SAMPLES and not known.any():
+        hint = "the driver must report the torque that it applies"
+        raise FlexarmError("is unknown (NaN) in every sample", field="joint_torque", hint=hint)
     steps = np.diff(time)
-    if time.size < 20 or not (steps > 0.0).all():
-        raise FlexarmError(f"{time.size} samples; at least 20, with ascending stamps, are needed")
+    if time.size < MIN_SAMPLES or not (steps > 0.0).all():
+        limit = f"at least {MIN_SAMPLES}, with ascending stamps"
+        raise FlexarmError("samples are no motion", value=time.size, limit=limit)
     period = float(np.median(steps))
     # Sample k is joined to k - 1 when the torque in between is known and lasted one period.
     joined = (np.abs(steps - period) <= JITTER * period) & usable[1:]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], joined.astype(int), [0]])))
     if not edges.size:
-        raise FlexarmError("no two samples in a row whose torque is known")
+        raise FlexarmError("is unknown in one of every two samples in a row", field="joint_torque")
     starts, ends = edges[::2], edges[1::2]
     best = int(np.argmax(ends - starts))
     keep = slice(int(starts[best]), int(ends[best]) + 1)
-    left = time.size - (keep.stop - keep.start)
-    if keep.stop - keep.start < 20:
-        raise FlexarmError(
-            f"the longest stretch without a gap has {keep.stop - keep.start} samples; at least 20 are needed"
-        )
+    kept = keep.stop - keep.start
+    left = time.size - kept
+    if kept < MIN_SAMPLES:
+        problem = "samples are in the longest stretch without a gap"
+        raise FlexarmError(problem, value=kept, limit=f"at least {MIN_SAMPLES}")
     if left > 2 * MARGIN + 2:
         notes.append(f"{left} of {time.size} samples left out: gaps, or torque not known")
     position = np.asarray(position, float)[keep]
     if not np.isfinite(position).all():
-        raise FlexarmError("joint_position is not finite in some sample")
-    period = float((time[keep][-1] - time[keep][0]) / (keep.stop - keep.start - 1))
+        raise FlexarmError("is not finite in some sample", field="joint_position")
+    period = float((time[keep][-1] - time[keep][0]) / (kept - 1))
     strain = np.asarray(strain, float).reshape(time.size, len(arm.gauges))[keep]
     torque = np.nan_to_num(np.asarray(torque, float)[keep])
     return Recording(period, position, torque, strain, tuple(notes))
@@ -144,7 +146,7 @@ def from_tables(states, torques, arm):
     arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once.
     """
     if states is None or not states.stamp.size:
-        raise FlexarmError("no arm_state in the recording")
+        raise FlexarmError("is not in the recording", field="arm_state")
     sessions, counts = np.unique(states.session, return_counts=True)
     session = sessions[counts.argmax()]
     rows = np.flatnonzero(states.session == session)[::-1]
