@@ -107,7 +107,6 @@ class ArmController:
         rate = np.array(settings["torque_rate_limit"])
         rate = np.where(rate > 0.0, rate, np.inf)
         self._limit, self._least, self._rate_limit = limit, -limit, rate
-        self._settings = dict(settings)
         self._rate_limited = bool(np.isfinite(rate).any())
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
@@ -280,7 +279,7 @@ class ArmController:
     def warm_up(self):
         """Run three samples and a trajectory on a second controller, so that compiled code is loaded."""
         model = self.model
-        other = ArmController(model, self.law, self._settings)
+        other = ArmController(model, self.law, self.supervisor.settings)
         sample = ArmSample(model.n_joints, model.n_modes)
         sample.rate = np.zeros(model.n_modes)
         still = np.zeros(model.n_joints)

@@ -133,7 +133,6 @@ class Supervisor:
         bounds = np.cumsum([0, *(len(names) for _, names, _ in watched)])
         self._parts = [slice(a, b) for a, b in pairwise(bounds)]
         self._ratio, self._value = np.zeros((2, len(self._names)))
-        self._low, self._high = model.arm.position_limits.T
         self._rows = gauge_rows(model, model.arm.gauges)
         self.forget()
         self.configure(settings, torque_limit)
@@ -170,16 +169,11 @@ class Supervisor:
         )
         self.settings = dict(settings)
         # Range, braking deceleration and margin of each joint, plain: numbers one by one are faster than short arrays.
-        self._ranges = tuple(
-            zip(
-                self._low.tolist(),
-                self._high.tolist(),
-                np.maximum(able, np.finfo(float).tiny).tolist(),
-                (0.99 * FAULT_RATIO * limit[self._parts[2]]).tolist(),
-                strict=True,
-            )
-        )
-        self._watches_places = limit[self._parts[2]][0] < np.inf
+        low, high = arm.position_limits.T
+        margin = limit[self._parts[2]]
+        able = np.maximum(able, np.finfo(float).tiny)
+        self._ranges = np.stack([low, high, able, 0.99 * FAULT_RATIO * margin], axis=1).tolist()
+        self._watches_places = margin[0] < np.inf
         self._limit, self._inverse = limit, 1.0 / limit
         self._watches_strain = bool(np.isfinite(limit[self._parts[4]]).any())
         self.deceleration = np.where(wanted > 0.0, wanted, finite)
