@@ -52,14 +52,12 @@ def frame(line, joints, gauges):
     word, numbers = unseal(line) or ("", [])
     if word != "S" or len(numbers) != 2 + 2 * joints + gauges:
         return None
-    if (
-        min(numbers[:2]) < 0 or max(map(abs, numbers)) > MAX_COUNT
-    ):  # a damaged line has the right checksum in one of 256 cases
+    # One damaged line in 256 has the right checksum.
+    if min(numbers[:2]) < 0 or max(map(abs, numbers)) > MAX_COUNT:
         return None
-    values = numbers[2:]
-    return Frame(
-        *numbers[:2], values[:joints], values[joints : joints + gauges], values[joints + gauges :]
-    )
+    number, microseconds, *values = numbers
+    encoder, bridge, drive = values[:joints], values[joints:-joints], values[-joints:]
+    return Frame(number, microseconds, encoder, bridge, drive)
 
 
 class Lines:

@@ -47,6 +47,7 @@ FIELDS = {
     },
     "observer/state": {"gauge_health": "gauge_names", "converged": None},
 }
+#: Topic to the type of its messages.
 KINDS = {
     "arm_state": "flexarm_msgs/msg/ArmState",
     "arm_state_estimate": "flexarm_msgs/msg/ArmState",

@@ -7,21 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
+from flexarm_msgs import msg
 from flexarm_studies.loop.metrics import Record
 
 from ..running.processes import ProcessError
 from . import bag
 from .types import ARM_NAME, ARM_TEXT, typestore
 
-TOPICS = {
-    "arm_state": ArmState,
-    "arm_state_estimate": ArmState,
-    "joint_torque": JointTorque,
-    "controller/state": CompositeState,
-    "observer/state": ObserverState,
-}
-
+#: Topic to the class of its messages.
+TOPICS = {topic: getattr(msg, kind.rsplit("/", 1)[1]) for topic, kind in bag.KINDS.items()}
 #: Topics that each node publishes.
 PUBLISHERS = {
     "simulator": ("arm_state",),

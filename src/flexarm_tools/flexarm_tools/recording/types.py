@@ -15,13 +15,8 @@ def typestore():
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
-    types = {}
     for name in ("ArmState", "JointTorque", "CompositeState", "ObserverState"):
-        types.update(get_types_from_msg(_definition(name), f"flexarm_msgs/msg/{name}"))
-    store.register(types)
+        # From where colcon has installed them.
+        text = installed("share", "flexarm_msgs", "msg", f"{name}.msg").read_text()
+        store.register(get_types_from_msg(text, f"flexarm_msgs/msg/{name}"))
     return store
-
-
-def _definition(name):
-    """Text of a message definition, from where colcon installed it."""
-    return installed("share", "flexarm_msgs", "msg", f"{name}.msg").read_text()
