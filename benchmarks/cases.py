@@ -35,22 +35,9 @@ def reference(case):
 
 
 def chain(p, links=None, modes=2, foreshortening=False):
-    """The project's model of a case's arm.
+    """The project's model of a case's arm, a `Chain`; `p` is the case's entry of ``parameters.json``.
 
-    Parameters
-    ----------
-    p : dict
-        The case's entry of ``parameters.json``.
-    links : int, optional
-        Another number of links: the last one is repeated, or left out.
-    modes : int
-        Per link.
-    foreshortening : bool
-        As in an arm file.
-
-    Returns
-    -------
-    flexarm_dynamics.models.chain.Chain
+    With another number of `links` the last one is repeated, or left out; each has so many `modes`.
     """
     hubs = [p["Jh"]] if "Jh" in p else [p["Jh1"], p["Jh2"]]
     count = len(hubs) if links is None else links

@@ -55,18 +55,8 @@ def all_codes(case, effort):
     The time is that of `Peer.integrate`: torques and integration, no kinematics. Codes that miss
     the case's target are not timed.
 
-    Parameters
-    ----------
-    case : str
-        Name of the case.
-    effort : Effort
-
-    Returns
-    -------
-    dict
-        ``target`` [m] and ``codes``: name to kind, settings, errors, and, where the target is kept,
-        ms per simulated second (best and all turns) and its ratio to this project's (median over
-        the turns, each beside its own).
+    Returns ``target`` [m] and ``codes``: name to kind, settings, errors, and, where the target is kept, ms per
+    simulated second (best and all turns) and its ratio to this project's (median over the turns, each beside its own).
     """
     parameters, found, tasks = cases.parameters(case), {}, {}
     for module, name, kind in CODES:
@@ -93,21 +83,10 @@ def all_codes(case, effort):
 
 
 def same_step(case, effort, steps=4000):
-    """The compiled loops alone, RK4 with the same steps, torques ready.
+    """The compiled loops alone, RK4 with the same steps, so many `steps` in one call, torques ready.
 
-    Parameters
-    ----------
-    case : str
-        Name of the case.
-    effort : Effort
-    steps : int
-        In one call.
-
-    Returns
-    -------
-    list of dict
-        For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second]
-        and their ``ratio``, by the best turns.
+    For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second] and their ``ratio``, by
+    the best turns.
     """
     from .peers import hand_loops
     from .peers.numpy_equations import equations, links

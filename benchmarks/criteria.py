@@ -14,18 +14,10 @@ def _fastest_peer(result):
 
 
 def check(summary):
-    """Criteria with their figures.
+    """Criteria with their figures, for a `summary` as `__main__` writes it.
 
-    Parameters
-    ----------
-    summary : dict
-        What was measured, as `__main__` writes it.
-
-    Returns
-    -------
-    list of dict
-        ``text``, ``value``, ``limit``, ``least`` (True: the value must not be below the limit) and
-        ``met``, None where there is nothing to measure.
+    Each has ``text``, ``value``, ``limit``, ``least`` (True: the value must not be below the limit) and ``met``, None
+    where there is nothing to measure.
     """
     found = []
 

@@ -24,21 +24,10 @@ BEST = {
 
 
 def linear_torque(torque, intervals, length):
-    """The linear torques that do most nearly what a case's torque does over each interval.
+    """The linear torques that do most nearly what a case's `torque` does over each of some intervals.
 
-    Parameters
-    ----------
-    torque : peers.Torque
-        Of the case.
-    intervals : int
-        How many.
-    length : float
-        Of each [s].
-
-    Returns
-    -------
-    starts, ends : ndarray, shape (intervals, joints)
-        Torque at both ends of each interval [N m]; its mean is that of Simpson's rule.
+    Torque at the starts and the ends of the `intervals`, each (intervals, joints) [N m], which are of equal `length`
+    [s]; its mean is that of Simpson's rule.
     """
     stages = torque.stages(intervals, length)
     start, middle, end = stages[:, 0], stages[:, 1], stages[:, 2]
@@ -51,8 +40,6 @@ class Flexarm(Peer):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     step : float
         Step [s]; divides 10 ms.
     method : str

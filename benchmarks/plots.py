@@ -18,20 +18,7 @@ TITLES = {
 
 
 def draw(summary, directory):
-    """Write all figures.
-
-    Parameters
-    ----------
-    summary : dict
-        What was measured, as `__main__` writes it.
-    directory : path-like
-        Where; made if it is not there.
-
-    Returns
-    -------
-    list of Path
-        The PNG files.
-    """
+    """Write all figures of a `summary`, as `__main__` writes it, to a directory; the PNG files."""
     made = []
     with plt.rc_context(STYLE | {"axes.axisbelow": True, "lines.linewidth": 1.5}):
         for name, figure in (

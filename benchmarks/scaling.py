@@ -32,21 +32,10 @@ CASE = "two_link_torque_x0p1"
 
 
 def costs(arms, effort, steps=200):
-    """Cost of one evaluation of the accelerations, in loops and in generated code.
+    """Cost of one evaluation of the accelerations, in loops and in generated code, in calls of so many RK4 `steps`.
 
-    Parameters
-    ----------
-    arms : sequence of tuple of int
-        Links and modes per link of each arm.
-    effort : compare.Effort
-    steps : int
-        RK4 steps in one call of the compiled loop.
-
-    Returns
-    -------
-    list of dict
-        ``links``, ``modes``, and ``loops`` and ``generated`` [us per evaluation], the latter None
-        where the project generates no code, by the best turns; ``turns`` of both.
+    `arms` are pairs of links and modes per link. For each ``links``, ``modes``, and ``loops`` and ``generated``
+    [us per evaluation], the latter None where the project generates no code, by the best turns; ``turns`` of both.
     """
     chains = {arm: cases.chain(cases.parameters(CASE), *arm) for arm in arms}
     tasks = {}
@@ -97,18 +86,9 @@ def throughput(step=1e-3, runs=240):
     Other programs take cores away for whole seconds. So the best turn of each counts, and beside
     the batches threads that share nothing show how many cores there were to be had.
 
-    Parameters
-    ----------
-    step : float
-        Of RK4 [s].
-    runs : int
-        Trajectories of a batch, from random states.
-
-    Returns
-    -------
-    dict
-        ``runs``, and ``cores``: list of dict with ``cores``, ``throughput`` [s/s] and ``turns``, its
-        ``speedup`` over one core, and ``available``, the same of threads that share nothing.
+    A batch has so many `runs` from random states, with a `step` of RK4 [s]. Returns ``runs``, and ``cores``: a list
+    with ``cores``, ``throughput`` [s/s] and ``turns``, its ``speedup`` over one core, and ``available``, the same of
+    threads that share nothing.
     """
     parameters = cases.parameters(CASE)
     chain = cases.chain(parameters)

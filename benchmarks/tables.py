@@ -20,17 +20,7 @@ def _number(value):
 
 
 def text(summary):
-    """All tables.
-
-    Parameters
-    ----------
-    summary : dict
-        What was measured, as `__main__` writes it.
-
-    Returns
-    -------
-    str
-    """
+    """All tables of what was measured: a `summary` as `__main__` writes it."""
     lines = ["Times are those of the best turn, ratios the median of turns next to each other."]
     for case, result in summary["cases"].items():
         lines += _case(case, result)

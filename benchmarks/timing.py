@@ -8,21 +8,9 @@ import numpy as np
 
 
 def round_robin(tasks, rounds, turn):
-    """Measure tasks in turns.
+    """Measure tasks, by their names, in turns: time per call in each of so many `rounds` [s].
 
-    Parameters
-    ----------
-    tasks : dict of str to callable
-        What to measure.
-    rounds : int
-        Turns of each task.
-    turn : float
-        Shortest turn: a task is called as often as that takes [s].
-
-    Returns
-    -------
-    dict of str to ndarray, shape (rounds,)
-        Time per call in each turn [s].
+    In a turn a task is called as often as takes at least `turn` [s].
     """
     calls = {}
     for name, task in tasks.items():

@@ -67,11 +67,6 @@ def test_errors_are_the_largest_distance_of_the_tips_and_the_largest_angle():
     assert errors(off, true) == {"tip": pytest.approx(5e-3), "theta1": pytest.approx(0.2)}
 
 
-def test_errors_read_a_file():
-    case = "one_link_pulse"
-    assert errors(cases.reference(case), cases.DATA / f"{case}.csv") == {"tip": 0.0, "theta1": 0.0}
-
-
 def test_linear_torque_keeps_the_mean_and_jumps_at_a_pulses_edge():
     torque = Torque("one_link_pulse", {"T": 2.0})
     starts, ends = own.linear_torque(torque, 100, 1e-2)

@@ -39,63 +39,26 @@ class Peer:
         self.torque = Torque(case, parameters)
 
     def integrate(self, duration):
-        """Simulate from rest: torques and integration, the part whose time is compared.
+        """Simulate from rest for a `duration` [s]: torques and integration, the part whose time is compared.
 
-        Parameters
-        ----------
-        duration : float
-            How long [s].
-
-        Returns
-        -------
-        object
-            The code's own result, for `report`.
+        Returns the code's own result, for `report`.
         """
         raise NotImplementedError
 
     def report(self, result):
-        """Kinematics of what `integrate` returned.
+        """Kinematics of what `integrate` returned, `RATE` a second, start and end included, each (n,).
 
-        Parameters
-        ----------
-        result : object
-            From `integrate`.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n,)
-            theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m], `RATE` a
-            second, start and end included.
+        By name: theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m].
         """
         raise NotImplementedError
 
     def run(self, duration):
-        """Simulate from rest and report.
-
-        Parameters
-        ----------
-        duration : float
-            How long [s].
-
-        Returns
-        -------
-        t : ndarray, shape (n,)
-            Times [s].
-        columns : dict of str to ndarray, shape (n,)
-            As `report` gives them.
-        """
+        """Simulate from rest for a `duration` [s]: the times (n,) [s], and what `report` gives for them."""
         return times(duration), self.report(self.integrate(duration))
 
 
 class Torque:
-    """Joint torques of a case as functions of time.
-
-    Parameters
-    ----------
-    case : str
-        Name of the case.
-    parameters : dict
-        Its entry of ``parameters.json``.
+    """Joint torques of a case as functions of time; case and parameters are those of `Peer`.
 
     Attributes
     ----------
@@ -115,8 +78,7 @@ class Torque:
             self.count, self.edges, self.level = 1, (0.5, 1.0), (height, -height, 0.0)
             self.sines = []
         else:
-            self.count, self.edges, self.level = 2, (), ()
-            self.sines = []
+            self.count, self.edges, self.level, self.sines = 2, (), (), []
             for key in ("tau1", "tau2"):
                 match = _SINE.fullmatch(parameters[key])
                 if match is None:
@@ -167,23 +129,10 @@ def times(duration):
 
 
 def errors(columns, reference):
-    """Largest deviations from a truth file.
+    """Largest deviations of the `columns` of `Peer.run` from a reference at `RATE`, which may be longer.
 
-    Parameters
-    ----------
-    columns : dict of str to ndarray
-        What `Peer.run` returned; may end before the reference.
-    reference : path-like or mapping of str to ndarray
-        Truth at `RATE`, as CSV with a header or already read.
-
-    Returns
-    -------
-    dict of str to float
-        ``tip``: largest distance of tip from tip [m]; ``theta1``: largest deviation [rad].
+    ``tip``: largest distance of tip from tip [m]; ``theta1``: largest deviation [rad].
     """
-    if not hasattr(reference, "keys"):
-        table = np.genfromtxt(reference, delimiter=",", names=True)
-        reference = {name: table[name] for name in table.dtype.names}
     n = len(columns["theta1"])
 
     def off(key):

@@ -31,8 +31,6 @@ class ControlResponse(_Numpy):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     input_step : float
         Interval of the points between which python-control interpolates the torque [s]; divides
         10 ms.

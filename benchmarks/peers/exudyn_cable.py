@@ -49,8 +49,6 @@ class ExudynCable(Peer):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     step : float
         Step [s]; divides 10 ms. On a pulse's edge the torque is the mean of both levels.
     elements : int

@@ -255,8 +255,6 @@ class HandLoops(Peer):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     step : float
         Step [s]; divides 10 ms.
     tip_mass, tip_inertia : float, optional

@@ -53,21 +53,9 @@ _OPTION = """
 
 
 def hinges(count, layout):
-    """Places and flexibilities of a link's hinges.
+    """Places and flexibilities of a link's hinges in a `layout`, ``uniform`` or ``gauss``.
 
-    Parameters
-    ----------
-    count : int
-        Number of hinges.
-    layout : str
-        ``uniform`` or ``gauss``.
-
-    Returns
-    -------
-    places : ndarray, shape (count,)
-        Position along the link, of 0 to 1 [-].
-    weights : ndarray, shape (count,)
-        Flexibility over that of the whole link, L/EI [-].
+    Positions along the link, of 0 to 1 [-], and flexibilities over that of the whole link, L/EI [-], each (count,).
     """
     if layout == "uniform":
         places = (np.arange(count) + 0.5) / count
@@ -78,19 +66,12 @@ def hinges(count, layout):
     raise ValueError(f"layout {layout!r}: uniform or gauss")
 
 
-def _body(rods, points, spin):
-    """Mass, centre and inertia about it of a segment.
+def _body(rod, points, spin):
+    """Mass, centre and inertia about it of a segment: a rod (mass, length) that starts at its frame.
 
-    Parameters
-    ----------
-    rods : tuple of float
-        Mass and length of the segment, which starts at its frame.
-    points : list of tuple of float
-        Masses and positions of point masses.
-    spin : float
-        Inertia without mass.
+    `points` are masses and positions of point masses on it; `spin` is an inertia without mass.
     """
-    mass, length = rods
+    mass, length = rod
     total = mass + sum(m for m, _ in points)
     centre = (0.5 * mass * length + sum(m * x for m, x in points)) / total
     inertia = mass * (length**2 / 12.0 + (0.5 * length - centre) ** 2)
@@ -99,25 +80,10 @@ def _body(rods, points, spin):
 
 
 def chain(parameters, segments, layout, step, integrator):
-    """Model of a case.
+    """Model of a case as MJCF, with so many `segments`, hinges per link, in a `layout` of `hinges`.
 
-    Parameters
-    ----------
-    parameters : dict
-        Entry of ``parameters.json``.
-    segments : int
-        Hinges per link.
-    layout : str
-        As for `hinges`.
-    step : float
-        Step [s].
-    integrator : str
-        ``RK4`` or ``Euler`` (semi-implicit).
-
-    Returns
-    -------
-    str
-        MJCF. Joints in order: base, link 1's hinges, elbow, link 2's hinges.
+    `integrator` is ``RK4`` or ``Euler`` (semi-implicit), `step` in s. Joints in order: base, link 1's hinges, elbow,
+    link 2's hinges.
     """
     p = parameters
     length, rho, stiffness = p["L"], p["rhoA"], p["EI"]
@@ -160,8 +126,6 @@ class MujocoChain(Peer):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     step : float
         Step [s]; divides 10 ms. The torque of each step is that of its middle.
     segments : int

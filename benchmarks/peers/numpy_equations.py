@@ -268,8 +268,6 @@ class _Numpy(Peer):
 
     Parameters
     ----------
-    case, parameters
-        As for `Peer`.
     tip_mass, tip_inertia : float, optional
         As for `links`.
     **settings
