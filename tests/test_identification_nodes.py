@@ -8,7 +8,7 @@ from rclpy.node import Node
 
 from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
-from flexarm_msgs.msg import JointTorque
+from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros import qos
 from flexarm_tools.recording.recorder import keep_for_recording
 from flexarm_tools.running.processes import arguments, executable
@@ -89,14 +89,17 @@ def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys)
 
 def test_nothing_moves_before_the_recorder_is_connected(bench):
     arm = {"arm": "one_link", "rate": RATE}
-    bench.start("simulator", {**arm, "lockstep": True, "pause_at": -1.0})
-    torques = bench.tap(JointTorque, "joint_torque")
+    lockstep = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
+    bench.start("simulator", {**arm, **lockstep})
+    torques, states = bench.tap(JointTorque, "joint_torque"), bench.tap(ArmState, "arm_state")
     own = {"amplitude": 0.5, "duration": 0.2, "recorder": "late_recorder", "readers": 2}
     bench.processes.start(
         "excite", [executable("flexarm_control", "excite"), *arguments({"arm": "one_link", **own})]
     )
-    silence = "no joint_torque answers state 0"
-    bench.wait_for("the simulator to wait", lambda: silence in bench.log("simulator"))
+    readers = bench.node.get_subscriptions_info_by_topic
+    bench.wait_for("excite to read the states", lambda: len(readers("/arm_state")) == 2)
+    seen = len(states.messages)
+    bench.wait_for("more states", lambda: len(states.messages) > seen + 50)
     assert not torques.messages
     late = Node("late_recorder", context=bench.node.context)
     try:
