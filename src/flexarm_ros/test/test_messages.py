@@ -109,15 +109,11 @@ def test_names_in_another_order_are_put_in_the_arms_and_the_next_message_in_its_
         gauge_names=["gauge2", "gauge1", "gauge4", "gauge3"],
         mode_names=["mode2", "mode1"],
     )
+    joints_alone = good(joint_names=["joint2", "joint3", "joint1"])
     for message, position, strain, amplitude in (
         (turned, [2.0, 3.0, 1.0], [0.2, 0.1, 0.4, 0.3], [0.6, 0.5]),
         (good(), [1.0, 2.0, 3.0], [0.1, 0.2, 0.3, 0.4], [0.5, 0.6]),
-        (
-            good(joint_names=["joint2", "joint3", "joint1"]),
-            [3.0, 1.0, 2.0],
-            [0.1, 0.2, 0.3, 0.4],
-            [0.5, 0.6],
-        ),
+        (joints_alone, [3.0, 1.0, 2.0], [0.1, 0.2, 0.3, 0.4], [0.5, 0.6]),
         (turned, [2.0, 3.0, 1.0], [0.2, 0.1, 0.4, 0.3], [0.6, 0.5]),
     ):
         sample = read(message, reader)

@@ -118,15 +118,28 @@ def verdicts(findings):
     return {c: f.verdict.value for c, f in findings.items()}
 
 
+def changed(*fields, by):
+    """A change of some fields of samples by a function."""
+    return lambda s: replace(s, **{field: by(getattr(s, field)) for field in fields})
+
+
+def frozen(strain):
+    return np.full_like(strain, strain[0, 0])
+
+
+def without(*fields, then):
+    """A change of samples that lack some fields."""
+    return lambda s: then(replace(s, **dict.fromkeys(fields)))
+
+
 # Good drivers ------------------------------------------------------------------------------------------
 
 
 def test_the_simulator_passes_every_check_and_reads_what_its_model_does(bench):
     found = bench.findings()
     assert set(verdicts(found).values()) == {"PASS"}, verdicts(found)
-    assert found["strain response"].text == (
-        "gauges bend as the model does: root 1.00, middle 1.00"
-    )
+    text = "gauges bend as the model does: root 1.00, middle 1.00"
+    assert found["strain response"].text == text
     assert "moves 1 times as far as its model" in found["response"].text
 
 
@@ -184,12 +197,10 @@ def test_an_arm_under_its_weight_is_pushed_from_rest():
 
 
 def test_velocity_need_not_be_published_nor_torque_known(bench):
-    found = bench.findings(
-        lambda s: replace(s, velocity=None, torque=np.full_like(s.torque, np.nan))
-    )
-    assert verdicts(found)["velocity"] == "PASS"
-    assert verdicts(found)["torque reported"] == "WARN"
-    assert verdicts(found)["response"] == "PASS"  # replayed with the torque that was sent
+    unknown = changed("torque", by=lambda torque: torque + np.nan)
+    found = verdicts(bench.findings(without("velocity", then=unknown)))
+    assert (found["velocity"], found["torque reported"]) == ("PASS", "WARN")
+    assert found["response"] == "PASS"  # replayed with the torque that was sent
 
 
 def test_a_pause_of_the_reader_makes_no_driver_fail(bench):
@@ -206,20 +217,6 @@ def test_a_pause_of_the_reader_makes_no_driver_fail(bench):
 
 
 # What goes wrong -------------------------------------------------------------------------------------
-
-
-def changed(*fields, by):
-    """A change of some fields of samples by a function."""
-    return lambda s: replace(s, **{field: by(getattr(s, field)) for field in fields})
-
-
-def frozen(strain):
-    return np.full_like(strain, strain[0, 0])
-
-
-def without(*fields, then):
-    """A change of samples that lack some fields."""
-    return lambda s: then(replace(s, **dict.fromkeys(fields)))
 
 
 EXCHANGED = "mode link1_y_mode1 moves as link1_y_mode2 should: they are exchanged"
@@ -301,34 +298,18 @@ def test_torque_ignored(bench, reports):
         (changed("velocity", by=np.negative), "velocity", "one of the two has the wrong sign"),
         (changed("strain", by=lambda e: 1e6 * e), "strain response", "check its scale"),
         (changed("strain", by=np.negative), "strain response", "what its model does: wrong sign"),
-        (
-            changed("strain", by=lambda e: e[:, ::-1]),
-            "gauge order",
-            "gauge root moves as middle should",
-        ),
-        (
-            changed("strain", by=lambda e: e + np.nan),
-            "finite",
-            "strain of root is not finite in 200 of",
-        ),
+        (changed("strain", by=lambda e: e[:, ::-1]), "gauge order", "root moves as middle should"),
+        (changed("strain", by=lambda e: e + np.nan), "finite", "root is not finite in 200 of"),
         (changed("position", by=lambda q: q + 90.0), "position", "are these degrees or counts?"),
         (changed("torque", by=np.negative), "torque reported", "reported with the wrong sign"),
-        (
-            changed("torque", by=lambda u: 0.5 * u),
-            "torque reported",
-            "reports 0.50 of the torque sent",
-        ),
+        (changed("torque", by=lambda u: 0.5 * u), "torque reported", "reports 0.50 of the torque"),
         (changed("sequence", by=lambda k: 0 * k), "sequence", "stands still"),
         (changed("sequence", by=lambda k: 5 * k), "sequence", "in steps of 5"),
         (changed("session", by=lambda k: k + np.arange(k.size)), "session", "sessions in one run"),
         (changed("stamp", by=lambda t: t + 10**8), "stamps", "in the future"),
         (changed("stamp", by=lambda t: 0 * t), "stamps", "100% of the stamps do not rise"),
         (changed("stamp", by=lambda t: t // 1000), "stamps", "0.001 s per second"),
-        (
-            changed("stamp", by=lambda t: t - (t - t[0]) // 5),
-            "rate",
-            "250.0 samples per second, expected are 200",
-        ),
+        (changed("stamp", by=lambda t: t - (t - t[0]) // 5), "rate", "250.0 samples per second"),
     ],
 )
 def test_other_faults_are_named(bench, change, check, text):
@@ -406,9 +387,8 @@ def test_how_long_a_torque_goes_on_is_measured(bench, held, verdict):
 
 
 def test_a_watchdog_is_not_judged_where_no_torque_was_applied(bench):
-    finding = moving.check_stop(
-        bench.rest, int(bench.rest.sequence[40]), np.array([1.0]), 0, Tolerances()
-    )
+    last = int(bench.rest.sequence[40])
+    finding = moving.check_stop(bench.rest, last, np.array([1.0]), 0, Tolerances())
     assert finding.verdict == Verdict.SKIPPED
 
 
@@ -454,11 +434,7 @@ def message(**changes):
     ("changes", "name", "text"),
     [
         ({"joint_names": ["j1"]}, "names", "joint_names are ['j1'], arm R has ['joint1']"),
-        (
-            {"gauge_names": ["root"], "strain": [0.0]},
-            "names",
-            "gauge_names are ['root'], arm R has",
-        ),
+        ({"gauge_names": ["root"], "strain": [0.0]}, "names", "['root'], arm R has"),
         ({"strain": [0.0]}, "lengths", "strain has 1 values for 2 gauge_names"),
         ({"joint_position": []}, "lengths", "joint_position has 0 values for 1 joint_names"),
         ({"strain": []}, "lengths", "strain has 0 values for 2 gauge_names"),
