@@ -73,33 +73,26 @@ class ExtendedKalman(Kalman):
     )  # fmt: skip
 
     def _prepare(self):
-        model, values, n = self.model, self.parameters, self._n
+        model, values = self.model, self.parameters
         self._friction = model.friction_table().copy()
-        names, joints = [], model.joint_names
-        start, deviation, drift, high = [], [], [], []
+        # Name, first value, deviation, drift and largest value of each; and where those of a kind are.
+        rows, self._at = [], {}
 
-        def add(labels, kind, first, largest):
-            names.extend(labels)
-            start.extend(first)
-            deviation.extend([values[f"{kind}_deviation"]] * len(labels))
-            drift.extend([values[f"{kind}_drift"]] * len(labels))
-            high.extend([largest] * len(labels))
-
-        self._heavier = None
-        if values["estimate_payload"]:
-            self._heavier = _twice_loaded(model)
-            add(["payload scale [-]"], "payload", [1.0], MAX_SCALE)
-        self._viscous_at, self._coulomb_at = slice(0, 0), slice(0, 0)
-        for column, kind, unit in ((0, "viscous", "N m s/rad"), (1, "coulomb", "N m")):
+        def add(kind, names, first, largest):
             if values[f"estimate_{kind}"]:
-                at = slice(len(names), len(names) + n)
-                setattr(self, f"_{kind}_at", at)
-                labels = [f"{kind} friction of {j} [{unit}]" for j in joints]
-                add(labels, kind, self._friction[:, column], MAX_FRICTION)
-        self.names, self._first = tuple(names), np.array(start)
-        self._deviation, self._drift = np.array(deviation), np.array(drift)
-        self._high = np.array(high)
-        size = 2 * self._p + len(names)
+                self._at[kind] = slice(len(rows), len(rows) + len(names))
+                more = values[f"{kind}_deviation"], values[f"{kind}_drift"], largest
+                rows.extend((name, value, *more) for name, value in zip(names, first, strict=True))
+
+        add("payload", ["payload scale [-]"], [1.0], MAX_SCALE)
+        self._heavier = _twice_loaded(model) if rows else None
+        for column, (kind, unit) in enumerate((("viscous", "N m s/rad"), ("coulomb", "N m"))):
+            names = [f"{kind} friction of {j} [{unit}]" for j in model.joint_names]
+            add(kind, names, self._friction[:, column], MAX_FRICTION)
+        self.names = tuple(name for name, *_ in rows)
+        numbers = np.array([row[1:] for row in rows], float).reshape(-1, 4)
+        self._first, self._deviation, self._drift, self._high = numbers.T
+        size = 2 * self._p + len(rows)
         self.state, self.covariance = np.zeros(size), np.zeros((size, size))
         self._design, self._age = None, 0.0
         self._report()
@@ -142,8 +135,8 @@ class ExtendedKalman(Kalman):
         N, speed = 2 * p, x[p : p + n]
         theta = x[N:]
         viscous, coulomb, smoothing = self._friction.T
-        viscous = theta[self._viscous_at] if self._viscous_at.stop else viscous
-        coulomb = theta[self._coulomb_at] if self._coulomb_at.stop else coulomb
+        viscous = theta[self._at["viscous"]] if "viscous" in self._at else viscous
+        coulomb = theta[self._at["coulomb"]] if "coulomb" in self._at else coulomb
         friction = viscous * speed + coulomb * np.tanh(speed / smoothing)
         net = torque + model.friction(speed) - friction  # the model takes its own off again
         out = np.zeros(x.size)
