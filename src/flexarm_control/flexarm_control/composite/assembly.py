@@ -21,21 +21,11 @@ from .design import FAST, MANIFOLD, PARAMETERS, SLOW, design, typed
 
 
 class Slot(NamedTuple):
-    """A place in the control that one component of a group fills.
+    """A place in the control that one component of a group fills."""
 
-    Attributes
-    ----------
-    group : str
-        Entry-point group.
-    type : Parameter
-        The choice, with its default.
-    common : tuple of Parameter
-        Parameters that belong to no single component of the group.
-    """
-
-    group: str
-    type: Parameter
-    common: tuple = ()
+    group: str  # of entry points
+    type: Parameter  # the choice, with its default
+    common: tuple = ()  # parameters that belong to no single component of the group
 
 
 #: By the prefix of their parameters.

@@ -57,9 +57,8 @@ class Designs:
             self._design = values
         except CancelledError:
             return
-        except (
-            Exception
-        ) as error:  # a user's law may raise anything, and a thread drops what it raises
+        except Exception as error:
+            # A user's law may raise anything, and a thread drops what it raises.
             if self._designer.closed:
                 return
             kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "

@@ -34,23 +34,13 @@ KEPT = 256
 
 @dataclass(frozen=True)
 class Step:
-    """A linearised step.
+    """A linearised step; matrices of shape (N, N)."""
 
-    Attributes
-    ----------
-    length : float
-        [s]
-    A, Phi, Gamma : ndarray, shape (N, N)
-        Linearisation, transition :math:`e^{Ah}`, and its integral.
-    Q : ndarray, shape (N, N) or None
-        Covariance that the noise adds.
-    """
-
-    length: float
-    A: np.ndarray
-    Phi: np.ndarray
-    Gamma: np.ndarray
-    Q: np.ndarray | None
+    length: float  # h [s]
+    A: np.ndarray  # linearisation
+    Phi: np.ndarray  # transition, e^(Ah)
+    Gamma: np.ndarray  # its integral
+    Q: np.ndarray | None  # covariance that the noise adds
 
 
 def mass_matrix(model, q, delta):
