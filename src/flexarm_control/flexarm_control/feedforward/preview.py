@@ -62,7 +62,6 @@ class Plan:
     motion: CubicHermiteSpline  # (q, delta, qd, delta_d)
     torque: np.ndarray  # at the grid's times, (k, n) [N m]
     step: float  # of the grid [s]
-    shift: float  # largest, of a joint from the reference [rad]
 
     def torque_at(self, elapsed):
         """Torque (n,) at a time since the start [s]."""
@@ -150,13 +149,8 @@ class _Planner:
         q, free, torque = self.motion, *_finite(*self._bend())
         state = np.concatenate([q[::2, 0], free[:, 0], q[::2, 1], free[:, 1]], axis=1)
         rates = np.concatenate([q[::2, 1], free[:, 1], q[::2, 2], free[:, 2]], axis=1)
-        return Plan(
-            duration=self.duration,
-            motion=CubicHermiteSpline(self.times[::2], state, rates),
-            torque=torque,
-            step=self.h,
-            shift=float(np.abs(q[:, 0] - self.reference[:, 0]).max()),
-        )
+        motion = CubicHermiteSpline(self.times[::2], state, rates)
+        return Plan(self.duration, motion, torque, self.h)
 
     def _bend(self):
         """Bending (steps + 1, 3, m) and joint torque (steps + 1, n) of the motion, products of deflections included."""
@@ -164,9 +158,8 @@ class _Planner:
 
         def acceleration(k, x, v):
             a, u = self._bending(*self.motion[k], x, v)
-            if (
-                k % 2 == 0
-            ):  # a whole step; its own first stage replaces the last stage of the step before
+            # At a whole step; its own first stage replaces the last stage of the step before.
+            if k % 2 == 0:
                 torque[k // 2] = u
             return a
 

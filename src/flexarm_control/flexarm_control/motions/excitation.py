@@ -31,9 +31,7 @@ class Excitation:
 
     times: np.ndarray  # from 0 to the motion's end, (k,) [s]
     torque: np.ndarray  # slow torque, (k, n) [N m]
-    quasi_steady: np.ndarray  # amplitudes of (9), (k, m) [m, rad]
-    deviation: np.ndarray  # z_f, amplitudes and rates about the quasi-steady state, (k, 2m)
-    energy: np.ndarray  # of the deviation, (k,) [J]
+    energy: np.ndarray  # of the deviation z_f, (k,) [J]
 
     @property
     def residual(self):
@@ -71,8 +69,7 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     if configuration is not None:
         q, qd = np.asarray(configuration, float)[None], np.zeros((1, model.n_joints))
     response = FastResponse(model, times[1] - times[0], q, qd)
-    deviation = response.deviation(steady)
-    return Excitation(times, torque, steady, deviation, response.energy(deviation))
+    return Excitation(times, torque, response.energy(response.deviation(steady)))
 
 
 def reduced(model, q, qd, qdd):
