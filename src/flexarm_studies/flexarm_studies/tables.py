@@ -18,26 +18,9 @@ class TableError(FlexarmError):
 
 
 def read(path, prefix, names):
-    """Rows of a CSV file with the columns ``t``, ``<prefix>1``, ``<prefix>2`` ...
+    """Times (k,), not descending [s], and values (k, n) of a CSV file with the columns ``t``, ``<prefix>1`` ...
 
-    Parameters
-    ----------
-    path : str
-    prefix : str
-        ``tau`` or ``q``.
-    names : sequence of str
-        The joints, one column each.
-
-    Returns
-    -------
-    times : ndarray, shape (k,)
-        Not descending [s].
-    values : ndarray, shape (k, n)
-
-    Raises
-    ------
-    TableError
-        Naming file, line and column, the value, and what is wanted.
+    The `prefix` is ``tau`` or ``q``; the `names` are those of the joints, one column each.
     """
     wanted = ["t"] + [f"{prefix}{i + 1}" for i in range(len(names))]
     lines, header, rows = _rows(path, wanted)
@@ -63,24 +46,10 @@ def read(path, prefix, names):
 
 
 def read_columns(path, wanted, optional=()):
-    """Columns of a CSV file by their names, in any order; others in the file are ignored.
+    """The `wanted` columns of a CSV file in any order, shape (k, len(wanted)); others in the file are ignored.
 
-    Parameters
-    ----------
-    path : str or Path
-    wanted : sequence of str
-    optional : sequence of str
-        Those of `wanted` that may be missing.
-
-    Returns
-    -------
-    ndarray, shape (k, len(wanted))
-        NaN in the columns that are missing.
-
-    Raises
-    ------
-    TableError
-        For a file that is no table, a missing column, and text that is no number, naming line and column.
+    Those of them that are `optional` may be missing: NaN. A file that is no table, a missing column, and text that is
+    no number, with its line and column, are refused.
     """
     lines, header, rows = _rows(path, wanted)
     missing = [n for n in wanted if n not in header and n not in optional]

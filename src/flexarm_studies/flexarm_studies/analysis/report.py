@@ -13,13 +13,7 @@ def _row(label, value):
 
 
 def lines(found):
-    """Lines of the whole report.
-
-    Parameters
-    ----------
-    found : dict
-        As `command.study` returns it.
-    """
+    """Lines of the whole report on what `command.study` has `found`."""
     scenario = found["scenario"]
     kinds = ", ".join(
         f"{k} {type_of(k, scenario['controller'])}"

@@ -19,23 +19,9 @@ MOTION = 4.0
 
 
 def draw(directory, title, slow, composite, model):
-    """Write all figures of one arm as PNG and SVG.
+    """Write all figures of one arm as PNG and SVG to a `directory`; the PNG files.
 
-    Parameters
-    ----------
-    directory : Path
-        Made if it is not there.
-    title : str
-        Which arm and gain, in every title.
-    slow, composite : Record
-        The run without and with fast control.
-    model : OneLinkEquations
-        For the tip.
-
-    Returns
-    -------
-    list of Path
-        The PNG files.
+    `slow` and `composite` are the records without and with fast control; every `title` names arm and gain.
     """
     slow, composite = slow.thinned(PLOTTED_EVERY), composite.thinned(PLOTTED_EVERY)
     made = []

@@ -29,10 +29,9 @@ def linear_table(summaries):
                 f"{label.format(i + 1):34}{digits.format(printed):>12}"
                 f"{p3[key][i]:12.4f}{r[key][i]:12.4f}"
             )
+    names = ("mode 1 [lbf]", "mode 2 [lbf]", "rate 1 [lbf s]", "rate 2 [lbf s]")
     for i, printed in enumerate(PRINT["k_f"]):
-        name = f"k_f, {('mode 1', 'mode 2', 'rate 1', 'rate 2')[i]} " + (
-            "[lbf]" if i < 2 else "[lbf s]"
-        )
+        name = f"k_f, {names[i]}"
         lines.append(f"{name:34}{printed:12.2f}{abs(p3['k_f'][i]):12.3f}{abs(r['k_f'][i]):12.3f}")
     lines.append("(k_f: magnitudes; for R all of u_f = -k z_f are negative with tip shapes (+, -))")
     return lines

@@ -10,15 +10,7 @@ MAX_MODES = 4
 
 
 def draw(arm_model, q, path):
-    """Draw the arm at rest and its lowest modes with joints locked; return the path.
-
-    Parameters
-    ----------
-    arm_model : ArmModel
-    q : ndarray, shape (n,)
-    path : str
-        PNG, SVG or PDF.
-    """
+    """Draw the arm of `arm_model` at rest, and its lowest modes with joints locked, as PNG, SVG or PDF; the path."""
     from ..plotting import plt, save
 
     path = check_file(path)

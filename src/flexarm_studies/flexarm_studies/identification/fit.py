@@ -117,10 +117,6 @@ def identify(arm, recording, hold=(), limit=0.5):
     limit : float
         A quantity is undetermined if its half-width exceeds this fraction of its value [-].
 
-    Returns
-    -------
-    Identified
-
     Raises
     ------
     FlexarmError

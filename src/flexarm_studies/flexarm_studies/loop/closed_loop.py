@@ -101,12 +101,8 @@ class ClosedLoop:
 
     def _set_delay(self, delay):
         if not 0.0 <= delay <= self.MAX_DELAY:
-            raise FlexarmError(
-                "s is no usable delay",
-                field="delay",
-                value=delay,
-                limit=f"from 0 to {self.MAX_DELAY:g} s",
-            )
+            limit = f"from 0 to {self.MAX_DELAY:g} s"
+            raise FlexarmError("s is no usable delay", field="delay", value=delay, limit=limit)
         whole, rest = divmod(round(delay * 1e9), self.simulator.period_ns)
         self._share = rest / self.simulator.period_ns
         # Torques on their way, the oldest first; until the first arrives, safe actions.

@@ -123,17 +123,7 @@ def residual_window(rest, settle=SETTLE):
     A rest too short for that is judged from the motion's end: the number then contains the slow settling, and its
     window says so.
 
-    Parameters
-    ----------
-    rest : float
-        How long the arm rested after the motion [s].
-    settle : float
-        When the window starts, where the rest is long enough [s].
-
-    Returns
-    -------
-    tuple of float
-        Start and end, counted from the motion's end [s].
+    Returns start and end, counted from the motion's end [s]; `settle` is the start where the rest is long enough [s].
     """
     end = min(rest, MAX_REST)
     return (settle if end >= settle + MIN_WINDOW - 1e-9 else 0.0), end
@@ -149,30 +139,16 @@ def residual_vibration(bending, at_rest=None):
     at_rest : array_like, optional
         Its value at rest [m]. A simulation knows it: the static deflection of the plant. If not given it is the
         mean over the window: on a real arm static errors of gauges and model would else count as vibration.
-
-    Returns
-    -------
-    float
     """
     away = bending - (bending.mean(axis=0) if at_rest is None else at_rest)
     return float(np.sqrt(np.sum(away**2) / len(away)))
 
 
 def case_study_metrics(record, model, settle=3.0, until=8.0):
-    """The metrics in the case study's reference table, in its units.
+    """The metrics of a `record` in the case study's reference table, in its units; keys as in ``summary.json``.
 
-    Parameters
-    ----------
-    record : Record
-    model : ArmModel
-        Of one link.
-    settle, until : float
-        `residual_window` of the motion of 2 s, counted from the trajectory's start [s].
-
-    Returns
-    -------
-    dict
-        Keys as in ``summary.json``. Peaks are over 0 to `until`.
+    `settle` and `until` are the `residual_window` of the motion of 2 s, counted from the trajectory's start [s]. Peaks
+    are over 0 to `until`.
     """
     inside = (record.time >= 0.0) & (record.time <= until + 1e-9)
     late = inside & (record.time >= settle - 1e-9)
@@ -345,19 +321,9 @@ def _settling_time(time, distance, end, tolerance):
 
 
 def linear_metrics(model, law, q):
-    """Frequencies, gains and poles of a composite design, at rest in configuration q.
+    """Frequencies, gains and poles of a composite `law` for an arm of one link at rest in configuration q.
 
-    Parameters
-    ----------
-    model : ArmModel
-        Of one link.
-    law : CompositeControl
-    q : ndarray, shape (n,)
-
-    Returns
-    -------
-    dict
-        Keys as in ``summary.json``; k_f in the paper's units and with its sign, u_f = -k_f z_f.
+    Keys as in ``summary.json``; k_f in the paper's units and with its sign, u_f = -k_f z_f.
     """
     terms = model.terms(q, np.zeros(model.n_joints))
     A2, B2 = sp.fast_subsystem(terms)

@@ -31,16 +31,9 @@ LEAD = 0.1
 
 
 class Network:
-    """Loses and delays samples.
+    """Loses and delays samples; the same seed loses the same ones.
 
-    Parameters
-    ----------
-    loss : float
-        Probability that a sample is lost [-].
-    delay, jitter : float
-        Every sample is late by `delay`, and by a time uniform from 0 to `jitter` [s].
-    seed : int
-        The same seed loses the same samples.
+    A sample is lost with the probability `loss` [-]; it is late by `delay` and a time uniform from 0 to `jitter` [s].
     """
 
     #: A longer delay than this is a wrong number [s].
@@ -51,12 +44,8 @@ class Network:
             raise FlexarmError("is no probability", field="loss", value=loss, limit="from 0 to 1")
         for name, value in (("delay", delay), ("jitter", jitter)):
             if not 0.0 <= value <= self.MAX_TIME:
-                raise FlexarmError(
-                    f"s is no usable {name}",
-                    field=name,
-                    value=value,
-                    limit=f"from 0 to {self.MAX_TIME:g} s",
-                )
+                limit = f"from 0 to {self.MAX_TIME:g} s"
+                raise FlexarmError(f"s is no usable {name}", field=name, value=value, limit=limit)
         self.loss, self.delay, self.jitter = loss, delay, jitter
         # A stream of its own beside those of the sensors' noise.
         self._random = np.random.default_rng([seed, 2])
@@ -87,15 +76,7 @@ class Network:
 
 
 class NetworkedLoop(ClosedLoop):
-    """A `ClosedLoop` with a `Network` between simulator and observer.
-
-    Parameters
-    ----------
-    *args
-        Those of `ClosedLoop`.
-    network : Network
-    **others
-        Those of `ClosedLoop`, without `delay`.
+    """A `ClosedLoop`, without a `delay` of its own, with a `network` between simulator and observer.
 
     Attributes
     ----------

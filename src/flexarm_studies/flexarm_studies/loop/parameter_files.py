@@ -30,21 +30,9 @@ def find(name):
 
 
 def load(name):
-    """Parameters of each node from a ROS parameter file.
+    """Parameters of each node from a ROS parameter file, `name` being a path or a shipped name; wildcards are applied.
 
-    Parameters
-    ----------
-    name : str or Path
-
-    Returns
-    -------
-    dict
-        Node name to flat parameters (``{"controller": {"slow.kp": [6.25], …}, …}``), wildcards applied.
-
-    Raises
-    ------
-    ParameterError
-        For a file that can't be read, or is none of parameters.
+    Node name to flat parameters: ``{"controller": {"slow.kp": [6.25], …}, …}``.
     """
     path = find(name)
     try:
