@@ -54,9 +54,7 @@ class LeastExciting:
 
     profile: Profile
     excitation: excitation.Excitation  # and torque, by the full reduced model
-    quintic: (
-        excitation.Excitation
-    )  # of the quintic of the same duration, which may exceed the limits
+    quintic: excitation.Excitation  # of the quintic in that time, which may exceed the limits
     rounds: int  # convex programmes solved
 
 

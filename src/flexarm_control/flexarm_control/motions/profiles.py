@@ -59,9 +59,7 @@ class Profile(Motion):
     start: np.ndarray
     angle: np.ndarray
     duration: float
-    shape: tuple[
-        Callable, Callable, Callable
-    ]  # sigma, sigma' and sigma'' of s in [0, 1], elementwise [-]
+    shape: tuple[Callable, Callable, Callable]  # sigma and its two derivatives by s in [0, 1] [-]
 
     def derivative(self, order, t):
         # Rest to rest: beyond either end sigma stays, and its derivatives are 0 as at the end.

@@ -91,10 +91,9 @@ class ShapedProfile(Motion):
 
     def derivative(self, order, t):
         t = np.asarray(t, float)
-        copies = zip(self._shaper.amplitudes, self._shaper.times, strict=True)
-        return sum(
-            amplitude * self._profile.derivative(order, t - delay) for amplitude, delay in copies
-        )
+        shaper, derivative = self._shaper, self._profile.derivative
+        copies = zip(shaper.amplitudes, shaper.times, strict=True)
+        return sum(amplitude * derivative(order, t - delay) for amplitude, delay in copies)
 
 
 def zv(omega, zeta) -> Shaper:

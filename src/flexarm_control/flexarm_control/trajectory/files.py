@@ -273,9 +273,8 @@ def _yaml_values(values, field):
         try:
             if isinstance(value, bool):
                 raise TypeError
-            out.append(
-                float(value)
-            )  # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number
+            # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
+            out.append(float(value))
         except NOT_NUMBERS:
             raise TrajectoryError("is not a number", field=f"{field}[{i}]", value=value) from None
     return out
