@@ -255,15 +255,6 @@ def test_the_node_that_excites_keeps_its_torques_for_the_recorder(tmp_path, name
     assert (values["readers"], values["recorder"]) == (2, excite.RECORDER)
 
 
-def test_excite_asks_before_it_moves_the_arm(tmp_path):
-    options = cli.parser().parse_args(["excite", "one_link", "--out", str(tmp_path / "bag")])
-    with pytest.raises(FlexarmError, match="stand clear, and give --allow-motion"):
-        options.function(options)
-    options.allow_motion, options.out = True, str(tmp_path)
-    with pytest.raises(FlexarmError, match="exists already"):
-        options.function(options)
-
-
 def test_only_the_stretch_under_enabled_torque_counts(given):
     """Safe action before and after, a lost sample in the middle, samples sent twice, another session's state."""
 

@@ -9,51 +9,39 @@ from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.models import model
 from flexarm_studies.loop import parameter_files
 
-
-@pytest.fixture
-def load(tmp_path):
-    """Loads YAML text as a controller file."""
-
-    def load(text):
-        path = tmp_path / "some.yaml"
-        path.write_text(text)
-        return parameter_files.load(path)
-
-    return load
+R = {"arm": "R"}
+BOTH = (
+    "{0}: {{ros__parameters: {{arm: first, rate: 1.0}}}}\n{1}: {{ros__parameters: {{arm: last}}}}"
+)
+LAST = {"arm": "last", "rate": 1.0}
+NESTED = {"slow.gain": "m11", "slow.a.b": 1}
+NAMES = ("controller", "/controller", "/left/controller", "/**/controller")
 
 
-def test_a_section_with_wildcards_is_every_nodes(load):
-    found = load("/**:\n  ros__parameters: {arm: R, slow: {kp: [6.25]}}\n")
-    assert set(found) == {"controller", "observer", "simulator"}
-    for values in found.values():
-        assert values == {"arm": "R", "slow.kp": [6.25]}
-
-
-@pytest.mark.parametrize("key", ["controller", "/controller", "/left/controller", "/**/controller"])
-def test_a_named_section_is_that_nodes_alone_in_any_namespace(load, key):
-    found = load(f"{key}:\n  ros__parameters: {{arm: R}}\n")
-    assert found == {"controller": {"arm": "R"}, "observer": {}, "simulator": {}}
-
-
-def test_a_later_section_wins_as_in_ros(load):
-    both = "{0}:\n  ros__parameters: {{arm: first, rate: 1.0}}\n{1}:\n  ros__parameters: {{arm: last}}\n"
-    for keys in (("/**", "controller"), ("controller", "/**")):
-        assert load(both.format(*keys))["controller"] == {"arm": "last", "rate": 1.0}
-
-
-def test_sections_of_other_nodes_are_nobodys(load):
-    assert load("camera:\n  ros__parameters: {arm: R}\n")["controller"] == {}
-
-
-def test_nested_and_dotted_names_are_the_same(load):
-    nested = load("/**:\n  ros__parameters:\n    slow:\n      gain: m11\n      a: {b: 1}\n")
-    dotted = load("/**:\n  ros__parameters: {slow.gain: m11, slow.a.b: 1}\n")
-    assert nested == dotted
-    assert nested["controller"] == {"slow.gain": "m11", "slow.a.b": 1}
-
-
-def test_an_empty_file_sets_nothing(load):
-    assert load("# nothing\n")["controller"] == {}
+@pytest.mark.parametrize(
+    ("text", "controller", "observer"),
+    [
+        (
+            "/**: {ros__parameters: {arm: R, slow: {kp: [6.25]}}}",
+            R | {"slow.kp": [6.25]},
+            R | {"slow.kp": [6.25]},
+        ),
+        *((f"{name}: {{ros__parameters: {{arm: R}}}}", R, {}) for name in NAMES),
+        (BOTH.format("/**", "controller"), LAST, {"arm": "first", "rate": 1.0}),
+        (BOTH.format("controller", "/**"), LAST, {"arm": "last"}),
+        ("camera: {ros__parameters: {arm: R}}", {}, {}),
+        ("/**: {ros__parameters: {slow: {gain: m11, a: {b: 1}}}}", NESTED, NESTED),
+        ("/**: {ros__parameters: {slow.gain: m11, slow.a.b: 1}}", NESTED, NESTED),
+        ("# nothing", {}, {}),
+    ],
+)
+def test_a_node_gets_the_sections_with_its_name_and_with_wildcards_the_later_one_wins(
+    tmp_path, text, controller, observer
+):
+    path = tmp_path / "some.yaml"
+    path.write_text(text)
+    found = parameter_files.load(path)
+    assert found == {"controller": controller, "observer": observer, "simulator": observer}
 
 
 def test_under_takes_a_prefix_and_no_namesake():

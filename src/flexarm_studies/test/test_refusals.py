@@ -114,6 +114,10 @@ REFUSED = {
         "--budget 0": "--budget: 0 is too small (1 or more)",
         "--workers 0": "--workers: 0 is too small (1 or more)",
     },
+    "excite one_link": {
+        "--out bag": "stand clear, and give --allow-motion",
+        "--allow-motion --out .": "exists already",
+    },
     "identify": {
         "nothing.csv one_link": "no such file or bag",
         "one_link": "either a bag or CSV file",
