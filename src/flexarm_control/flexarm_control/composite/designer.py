@@ -10,7 +10,7 @@ from .design_process import AwayError, DesignProcess
 
 
 def ready(model):
-    """Nothing: to import this module, and to build the model, is what the first design would wait for."""
+    """Does nothing: calling it starts the process, which imports this module and builds the model."""
 
 
 def prepare(model, feedforward, trajectory, start):

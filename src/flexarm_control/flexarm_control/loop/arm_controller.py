@@ -291,7 +291,7 @@ class ArmController:
                 other.offer(validate(names, names, 0, [point]))
         self.law.reset()
 
-    # What a user or a process does beside -------------------------------------------------------
+    # Stops, recovery and switches ---------------------------------------------------------------
 
     def brake(self, reason):
         """Bring the reference to rest smoothly, and hold it there; trajectories are given up.

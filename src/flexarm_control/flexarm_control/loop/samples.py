@@ -76,15 +76,15 @@ WRAP = 2**32
 
 
 class SampleOrder:
-    """Tells new samples from all others; by number and stamp, never by a clock.
+    """Compares each sample with the last one, by number and stamp, never by a clock.
 
-    NEW; REPEAT: the last one again; RESTART: of a session not seen before; STALE: an older one of this session;
-    JUMP: a later number with a stamp that is not later: the source's clock went back; FOREIGN: of a session that
-    was left for the present one, so that two sources send.
+    NEW: the next; REPEAT: the last one again; RESTART: of a session not seen before; STALE: an older one of this
+    session; JUMP: a later number with a stamp that is not later, as the source's clock went back; FOREIGN: of a
+    session that was left for the present one, so that two sources send.
     """
 
     NEW, REPEAT, RESTART, STALE, JUMP, FOREIGN = range(6)
-    #: A session that was left, or numbers from before, are the present ones after so many samples without others.
+    #: After this many such samples without others, a session that was left, or an earlier number, is followed again.
     ALONE = 200
 
     def __init__(self):
