@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 
-from ..commands.options import at_least
+from ..commands.options import add_settings, at_least
 from ..loop import scenario as scenarios
 from ..loop.metrics import residual_window
 from ..progress import Progress
@@ -33,13 +33,7 @@ def add_arguments(parser):
         metavar="FILE|SPEC",
         help="the motion it is for, as `flexarm simulate` takes it (paper)",
     )
-    add(
-        "--set",
-        nargs="+",
-        action="extend",
-        metavar="NAME=VALUE",
-        help="parameters beyond the file's: slow.kp=4 fast.alpha=4",
-    )
+    add_settings(add)
     add("--rate", type=float, help="samples per second [Hz] (as in the file, or 1000)")
     add(
         "--configurations", type=int, default=200, metavar="N", help="number in the workspace (200)"

@@ -16,7 +16,6 @@ Up to `MAX_SETS` sets are all compared. Otherwise the best gauge is added one af
 exchanged until that no longer helps.
 """
 
-import json
 from itertools import combinations
 from math import comb
 
@@ -29,7 +28,7 @@ from flexarm_dynamics.arm.strain_map import StrainMap, confused, gauge_rows, rea
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
-from .options import add_arm_arguments, check_file
+from .options import add_arm_arguments, check_file, show
 
 CRITERIA = ("A", "D", "condition")
 #: Candidate positions per link: every twentieth of its length, ends included.
@@ -84,7 +83,7 @@ def gauges(options):
         result["plot"] = draw(result, options.plot)
     for place in result["places"]:
         del place["curvature"]
-    print(json.dumps(result) if options.json else "\n".join(text(result)))
+    show(options, result, text(result))
     return result
 
 

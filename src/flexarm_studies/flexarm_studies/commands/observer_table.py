@@ -8,7 +8,6 @@ percent of the rms of the estimated state. With a delay, the estimate is compare
 once with prediction and once without.
 """
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from flexarm_sim.sensors import Sensors
 
 from .. import markdown
 from ..progress import Progress
-from .options import add_arm_arguments, in_range, numbers
+from .options import add_arm_arguments, in_range, numbers, show
 
 #: Observers that receive the true rates have no error.
 LEFT_OUT = ("true_rates",)
@@ -69,10 +68,7 @@ def observers(options):
         options.seed,
         Progress(),
     )
-    if options.json:
-        print(json.dumps(rows, indent=1))
-        return
-    print("\n".join(markdown.table(COLUMNS, ([row[c] for c in COLUMNS] for row in rows))))
+    show(options, rows, markdown.table(COLUMNS, (row.values() for row in rows)), indent=1)
 
 
 def table(arm, rates, noises, delays, names=None, duration=2.0, seed=0, progress=None):

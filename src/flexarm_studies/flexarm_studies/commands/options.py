@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options of several commands: the arm and its model, joint angles, lists of numbers, files to write."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +11,10 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError, ModelError
 
 
-def add_arm_arguments(parser, json="print JSON"):
+def add_arm_arguments(parser, as_json="print JSON"):
     """Add the arm, and ``--json`` with this help."""
     parser.add_argument("arm", metavar="ARM", help="arm file: a shipped name or a path")
-    parser.add_argument("--json", action="store_true", help=json)
+    parser.add_argument("--json", action="store_true", help=as_json)
 
 
 def add_model_arguments(parser):
@@ -31,6 +32,22 @@ def add_model_arguments(parser):
         action="store_true",
         help="exact curvature and angle of the tip for large deflections; includes --foreshortening",
     )
+
+
+def add_settings(add):
+    """Add ``--set`` by a parser's or a group's `add_argument`."""
+    add(
+        "--set",
+        nargs="+",
+        action="extend",
+        metavar="NAME=VALUE",
+        help="parameters beyond the file's: slow.kp=9 fast.type=none",
+    )
+
+
+def show(options, result, lines, **form):
+    """Print a `result` as JSON, with the `form` of `json.dumps`, where that is asked for; otherwise these `lines`."""
+    print(json.dumps(result, **form) if options.json else "\n".join(lines))
 
 
 def load_arm(options):

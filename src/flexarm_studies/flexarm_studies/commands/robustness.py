@@ -14,7 +14,6 @@ without loss and delay,
 Errors are relative to the reference at that time, not to the older one that the answer to a late sample used.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from .. import markdown
 from ..loop import scenario as scenarios
 from ..loop.metrics import tracking_metrics
 from ..progress import Progress
-from .options import add_arm_arguments, in_range, numbers
+from .options import add_arm_arguments, in_range, numbers, show
 
 #: Bounds of a stable run; see the module. `ALLOWED` in rad, `SETTLED` as a fraction of the reach.
 TRACKING, ALLOWED, BENDING, SETTLED = 2.0, 0.05, 1.5, 0.005
@@ -92,10 +91,7 @@ def robustness(options):
             found = sweep(scenario, what, values, options.seeds, progress.fraction)
             rows += [{"controller": Path(name).stem, **row} for row in found]
     progress.done()
-    if options.json:
-        print(json.dumps(rows, indent=1))
-    else:
-        print("\n".join([*table(rows), "", *breaks(rows)]))
+    show(options, rows, [*table(rows), "", *breaks(rows)], indent=1)
     if options.figure:
         draw(rows, options.figure, f"{options.arm}, {options.trajectory}, {options.rate:g} Hz")
 

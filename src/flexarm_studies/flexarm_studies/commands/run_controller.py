@@ -14,7 +14,7 @@ from flexarm_dynamics.errors import FlexarmError
 from .. import tables
 from ..loop import scenario as scenarios
 from ..loop.metrics import tip_path
-from .options import angles
+from .options import add_settings, angles
 
 #: Options of the closed loop: fields of `Scenario`.
 FIELDS = (
@@ -41,13 +41,7 @@ def add_arguments(parser):
         metavar="FILE|SPEC",
         help="a file (.csv, .yaml), or a motion in a line: paper, quintic:to=0.8;0.8,duration=4",
     )
-    add(
-        "--set",
-        nargs="+",
-        action="extend",
-        metavar="NAME=VALUE",
-        help="parameters beyond the file's: slow.kp=9 fast.type=none",
-    )
+    add_settings(add)
     add(
         "--payload-scale",
         type=float,
