@@ -168,8 +168,9 @@ def _columns(points):
             limit=MAX_POINTS,
             hint="send fewer, farther apart",
         )
+    kinds, size = tuple | list, len(_FIELDS)
     for index, point in enumerate(points):
-        if not isinstance(point, tuple | list) or len(point) != len(_FIELDS):
+        if not isinstance(point, kinds) or len(point) != size:
             hint = f"give ({', '.join(_FIELDS)})"
             raise TrajectoryError("is no point", field=f"points[{index}]", value=point, hint=hint)
     return [[point[i] for point in points] for i in range(len(_FIELDS))]
