@@ -234,9 +234,9 @@ class Csv(FileReader):
 
     name, weight, suffix = "recording CSV", 1.0, ".csv"
 
-    def __init__(self, arm="two_link"):
+    def __init__(self):
         super().__init__()
-        self.arm = arm_file.load(arm)
+        self.arm = arm_file.load("two_link")
         self.head = recording.columns(self.arm)
         rng = np.random.default_rng(1)
         table = rng.uniform(-1.0, 1.0, (25, len(self.head)))
@@ -296,8 +296,8 @@ class Messages(Reader):
 
     name, weight, ROWS = "recording messages", 0.5, 24
 
-    def __init__(self, arm="two_link"):
-        self.arm = arm_file.load(arm)
+    def __init__(self):
+        self.arm = arm_file.load("two_link")
 
     def make(self, rng):
         states = spoilt_run(rng, self.arm, self.ROWS)
@@ -326,8 +326,8 @@ class Driver(Reader):
 
     name, weight, error, ROWS = "check_driver", 0.5, (), 12
 
-    def __init__(self, arm="two_link"):
-        self.arm = arm_file.load(arm)
+    def __init__(self):
+        self.arm = arm_file.load("two_link")
 
     def make(self, rng):
         return spoilt_run(rng, self.arm, self.ROWS)

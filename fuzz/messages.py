@@ -112,8 +112,8 @@ class States(Reader):
         *(field for fields in STATE_FIELDS.values() for field in fields),
     )
 
-    def __init__(self, arm="two_link"):
-        self.arm = arm_file.load(arm)
+    def __init__(self):
+        self.arm = arm_file.load("two_link")
         self.names = arm_names(self.arm)
         self.reader = StateReader(self.arm)
         self.sample = ArmSample(*(len(v) for v in self.names.values()))
@@ -159,8 +159,8 @@ class Torques(Reader):
     name, weight, error = "torque message", 18.0, MessageError
     words = ("joint_names", "torque", "mode")
 
-    def __init__(self, arm="two_link"):
-        self.arm = arm_file.load(arm)
+    def __init__(self):
+        self.arm = arm_file.load("two_link")
         self.reader = TorqueReader(self.arm)
 
     def make(self, rng):
@@ -189,8 +189,8 @@ class Gate(Reader):
     name, weight, batch = "torque gate", 6.0, 20
     TIMEOUT = 0.05
 
-    def __init__(self, arm="two_link"):
-        self.arm = arm_file.load(arm)
+    def __init__(self):
+        self.arm = arm_file.load("two_link")
         self.limit = np.array([j.limits.torque for j in self.arm.joints])
 
     def run(self, rng):

@@ -34,6 +34,8 @@ FRACTIONS = {
     "joint_torque": 0.2,
     "joint_trajectory": 0.15,
 }
+#: Timeout of each wait [s].
+PATIENCE = 180.0
 #: After so many messages that get no answer, a service call checks that the node is alive.
 AT_ONCE = 5
 #: Number of times that a state without an answer is sent again.
@@ -43,11 +45,11 @@ MAX_TRIES = 20
 class Nodes:
     """Three nodes, and a program beside them that sends what it should not."""
 
-    def __init__(self, bench, seed, arm="R"):
+    def __init__(self, bench, seed):
         self.bench, self.random = bench, Random(f"{seed} nodes")
-        self.description = arm_file.load(arm)
+        self.description = arm_file.load("R")
         bench.start_loop(
-            arm=arm,
+            arm="R",
             simulator={"lockstep": True, "pause_at": -1.0},
             controller={"state_timeout": 3600.0},
         )
@@ -256,21 +258,11 @@ def _sendable(value):
     return type(value) in (bool, float, str)
 
 
-def fuzz(count, seed, say, patience=180.0):
-    """Give running nodes so many messages; a `Tally` of each kind.
-
-    Parameters
-    ----------
-    count : int
-    seed : int
-    say : callable
-        Called with each `Tally` when it is complete.
-    patience : float
-        Longest wait for any one thing [s].
-    """
+def fuzz(count, seed, say):
+    """Give running nodes so many messages (`count`); a `Tally` of each kind, with which `say` is called as well."""
     tallies = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, harness.Bench(folder) as bench:
-        bench.patience = max(bench.patience, patience)
+        bench.patience = max(bench.patience, PATIENCE)
         nodes = Nodes(bench, seed)
 
         def part(name, fraction, action):

@@ -63,11 +63,11 @@ def floating(rng, near=1.0):
     return near * rng.uniform(-3.0, 3.0) * 10.0 ** rng.randint(-3, 3)
 
 
-def unsigned(rng, bits=32):
-    """An unsigned integer of a message."""
+def unsigned(rng):
+    """A uint32 of a message."""
     if rng.random() < 0.5:
-        return rng.choice(INTS) % 2**bits
-    return rng.getrandbits(bits)
+        return rng.choice(INTS) % 2**32
+    return rng.getrandbits(32)
 
 
 def text(rng, known=()):
@@ -183,7 +183,7 @@ def places(tree, path=()):
     return found
 
 
-def altered(rng, tree, near=1.0, known=()):
+def altered(rng, tree, known=()):
     """Change a few places of a tree of lists and mappings, in place: other values, none, twice, other keys."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         there = places(tree)
@@ -197,7 +197,7 @@ def altered(rng, tree, near=1.0, known=()):
         if kind < 3:
             value = holder[key]
             close = isinstance(value, float) and rng.random() < 0.5
-            holder[key] = value * rng.uniform(-2.0, 3.0) if close else anything(rng, near, known)
+            holder[key] = value * rng.uniform(-2.0, 3.0) if close else anything(rng, known=known)
         elif kind == 3:
             del holder[key]
         elif kind == 4 and isinstance(holder, list):
@@ -207,5 +207,5 @@ def altered(rng, tree, near=1.0, known=()):
                 key
             )
         elif isinstance(holder, dict):
-            holder[text(rng, known)] = anything(rng, near, known)
+            holder[text(rng, known)] = anything(rng, known=known)
     return tree

@@ -242,8 +242,8 @@ class Written(Reader):
         "quintic:to=0.3,shaper=zvd,points=7",
     )
 
-    def __init__(self, arm="two_link"):
-        self.model = model.build(arm_file.load(arm))
+    def __init__(self):
+        self.model = model.build(arm_file.load("two_link"))
 
     def make(self, rng):
         family, _, rest = rng.choice(self.GOOD).partition(":")

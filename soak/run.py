@@ -140,9 +140,9 @@ class Soak:
             del tap.messages[:-1]
         return True
 
-    def wait(self, what, condition, patience=None):
+    def wait(self, what, condition):
         """Check messages until a condition holds."""
-        return self.bench.wait_for(what, lambda: self.drain() and condition(), patience)
+        return self.bench.wait_for(what, lambda: self.drain() and condition())
 
     def running(self):
         """Whether the controller sends torque."""

@@ -72,13 +72,10 @@ class Latency:
     ----------
     name : str
         Of the values, such as "latency": "latency p50 [ms]", "latency p99 [ms]", "latency max [ms]".
-    capacity : int
-        See `Percentiles`.
     """
 
-    def __init__(self, name="latency", capacity=4096):
-        self._name = name
-        self._times = Percentiles(capacity)
+    def __init__(self, name="latency"):
+        self._name, self._times = name, Percentiles()
         #: Note one time [s].
         self.add = self._times.add
 

@@ -222,8 +222,9 @@ def tip_rows(model):
     return np.array(rows).reshape(len(rows), model.n_modes), names
 
 
-def _parts(run, size=200_000):
+def _parts(run):
     """Slices that cover all samples, so that no table of all of them has to be in memory."""
+    size = 200_000
     return [slice(a, a + size) for a in range(0, run.time.size, size)]
 
 
@@ -346,8 +347,8 @@ def highest(run, cases):
     return float(min(nyquist, 2.0 * max(known)) if known else min(nyquist, 100.0))
 
 
-def peaks(spectrum_, top=np.inf, count=4):
-    """Up to `count` frequencies below `top` that stand out in the sum of all signals, the strongest first [Hz]."""
+def peaks(spectrum_, top=np.inf):
+    """Up to four frequencies below `top` that stand out in the sum of all signals, the strongest first [Hz]."""
     from scipy.signal import find_peaks
 
     power = (spectrum_.density[spectrum_.frequency <= top] ** 2).sum(axis=1)
@@ -356,7 +357,7 @@ def peaks(spectrum_, top=np.inf, count=4):
     at = find_peaks(
         np.log10(power + 1e-300), prominence=np.log10(OUTSTANDING), distance=4 * PADDED
     )[0]
-    order = np.argsort(power[at])[::-1][:count]
+    order = np.argsort(power[at])[::-1][:4]
     return [float(spectrum_.frequency[i]) for i in at[order]]
 
 

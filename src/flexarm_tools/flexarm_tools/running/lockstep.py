@@ -68,21 +68,14 @@ class LockstepRun(Session):
     ----------
     processes : Processes
         With simulator (``lockstep``), observer and controller started.
-    patience : float
-        Timeout of a single wait [s].
     """
 
     #: Between two looks at the recording [s].
     POLL_PERIOD = 0.005
 
-    def __init__(self, processes, patience=60.0):
-        super().__init__(
-            "case_study",
-            domain=processes.domain,
-            processes=processes,
-            patience=patience,
-            period=0.02,
-        )
+    def __init__(self, processes):
+        domain = processes.domain
+        super().__init__("case_study", domain=domain, processes=processes, period=0.02)
         self.processes, self.recorder = processes, Recorder(self)
 
     def controller_state(self):

@@ -142,10 +142,9 @@ class Processes:
         self.running[name] = process
         return process
 
-    def start_node(self, name, parameters=None, file=None, remaps=()):
-        """Start one of `NODES` by its installed executable."""
-        command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
-        return self.start(name, command)
+    def start_node(self, name, parameters=None, file=None):
+        """Start one of `NODES` by its installed executable, with `parameters` beyond those of a `file`."""
+        return self.start(name, [executable(NODES[name], name), *arguments(parameters, file)])
 
     def start_module(self, name, module, *words):
         """Start a module of this environment."""
@@ -155,11 +154,10 @@ class Processes:
         """What a process has printed so far."""
         return (self.logs / f"{name}.log").read_text(errors="replace")
 
-    def tails(self, lines=8):
+    def tails(self):
         """The last lines of each log."""
-        return "\n".join(
-            f"--- {path.stem}\n{_tail(path, lines)}" for path in sorted(self.logs.glob("*.log"))
-        )
+        logs = sorted(self.logs.glob("*.log"))
+        return "\n".join(f"--- {path.stem}\n{_tail(path, 8)}" for path in logs)
 
     def expect_end(self, name):
         """From now on `check` accepts that this process ends; return the process."""
