@@ -49,6 +49,14 @@ def test_tracks_like_a_rigid_arm_and_does_not_ring(feedforward, error, residual)
     assert found["peak_torque_lbf_ft"]["total"] <= 3.2
 
 
+@pytest.mark.parametrize("scale", [2.0 / 3.0, 4.0 / 3.0])
+def test_with_a_payload_a_third_off(scale):
+    """The README's worst case beside its nominal figures."""
+    found = case("model", None, {"payload_scale": scale})
+    assert found["peak_joint_error_deg"] <= 0.7
+    assert found["residual_tip_rms_ft"] <= 5e-5
+
+
 def test_with_an_encoder_and_an_observer():
     """4096 counts, joint velocities from them, modal rates from the gauges."""
     arm = arm_file.load("R")
