@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial.legendre import leggauss
 from scipy.integrate import solve_ivp
-from scipy.linalg import eigh
+from scipy.linalg import block_diag, eigh
 from scipy.optimize import brentq
 
 from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
@@ -442,8 +442,9 @@ class Reference:
         return energy.c[0, -1], energy.c[1, :-1], energy.c[1, -1]
 
     def damping(self):
-        """Modal damping of each link with its base held, from its modes' own mass and stiffness."""
-        return self.model.linearisation(np.zeros(self.n), np.zeros(self.n))[1][self.n :]
+        """Modal damping of all links, from the model's data."""
+        data = self.model.data
+        return block_diag(*(D[:k, :k] for D, k in zip(data.damping, data.count, strict=True)))
 
 
 def coordinates(state):

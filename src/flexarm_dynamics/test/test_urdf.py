@@ -63,15 +63,19 @@ def forward(text, values):
     return {e.get("name"): frame(e.get("name")) for e in root.iter("link")}
 
 
+def posed(chain, q, delta):
+    """Frames of all links of an arm's URDF at a pose."""
+    values = dict(zip(chain.joint_names, chain.joint_values(q, delta), strict=True))
+    return forward(chain.urdf(), values)
+
+
 def tip_errors(arm_model, pieces, poses):
     """Distances of the URDF's tip from the model's, one for each pose (q, delta) [m]."""
-    chain = urdf.PieceChain(arm_model, pieces)
-    text, errors = chain.urdf(), []
-    for q, delta in poses:
-        values = dict(zip(chain.joint_names, chain.joint_values(q, delta), strict=True))
-        tip = forward(text, values)[f"{arm_model.arm.links[-1].name}_tip"][1]
-        errors.append(np.linalg.norm(tip - arm_model.tip_position(q, delta)))
-    return errors
+    chain, tip = urdf.PieceChain(arm_model, pieces), f"{arm_model.arm.links[-1].name}_tip"
+    return [
+        np.linalg.norm(posed(chain, q, delta)[tip][1] - arm_model.tip_position(q, delta))
+        for q, delta in poses
+    ]
 
 
 def of_constant_length(name):
@@ -95,8 +99,7 @@ def test_sections_are_where_the_model_says(shipped, name):
         x = places[len(places) // 2]
         point = chain_of(m).point(link.name, x, q, delta)
         np.testing.assert_allclose(p[len(places) // 2], point, atol=1e-12)
-        np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape),
-                                   atol=1e-12)  # fmt: skip
+        np.testing.assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0.0, atol=1e-12)
 
 
 def test_sections_of_a_linear_picture_grow_with_what_they_are_multiplied_by():
@@ -151,9 +154,7 @@ def test_the_urdf_of_the_straight_arm_is_straight(shipped, name):
 def test_the_urdf_turns_its_tip_as_the_model_does():
     m = of_constant_length("long_reach")
     q, delta = pose(m)
-    chain = urdf.PieceChain(m, 8)
-    values = dict(zip(chain.joint_names, chain.joint_values(q, delta), strict=True))
-    R, _ = forward(chain.urdf(), values)["wrist_tip"]
+    R, _ = posed(urdf.PieceChain(m, 8), q, delta)["wrist_tip"]
     np.testing.assert_allclose(R, m.frames(q, delta)[0][-1], atol=1e-9)
 
 
@@ -166,9 +167,8 @@ def test_a_link_that_bends_and_does_not_twist_points_rightly_with_two_joints_a_j
     m = model.build(replace(arm, links=tuple(links), gauges=(), observed_modes=()))
     q, delta = pose(m)
     chain = urdf.PieceChain(m, 6)
-    values = dict(zip(chain.joint_names, chain.joint_values(q, delta), strict=True))
-    assert len(values) == 4 + 2 * 2 * 7
-    R, _ = forward(chain.urdf(), values)["upper_tip"]
+    assert len(chain.joint_names) == 4 + 2 * 2 * 7
+    R, _ = posed(chain, q, delta)["upper_tip"]
     wanted = Sections(m, 1).frames(q, delta)[1][0][-1]
     np.testing.assert_allclose(R[:, 0], wanted[:, 0], atol=1e-9)
 

@@ -26,7 +26,7 @@ from . import integrators
 
 #: A joint has stopped when its speed is this fraction of that at the start of the step.
 STOPPED = 1e-11
-#: A rest of a step shorter than this fraction of it is not integrated.
+#: The remainder of a step is dropped when it is a smaller fraction of the step than this.
 SLIVER = 1e-12
 #: While every brake holds, this is checked at this interval [s].
 CHECK_INTERVAL = 1e-3

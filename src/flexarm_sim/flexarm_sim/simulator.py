@@ -145,18 +145,14 @@ class Simulator:
         """Advance by one period under several torques in turn; `parts` are pairs (torque or None, fraction)."""
         self.torque[:] = 0.0
         for torque, fraction in parts:
-            self._advance(torque, fraction)
+            if torque is None:
+                self.plant.advance_safely(fraction)
+            else:
+                self.plant.advance(torque, fraction)
+                self.torque += fraction * np.asarray(torque)
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         self._measure()
-
-    def _advance(self, torque, fraction):
-        """Advance by a fraction of a period under one torque, and add it to the mean."""
-        if torque is None:
-            self.plant.advance_safely(fraction)
-        else:
-            self.plant.advance(torque, fraction)
-            self.torque += fraction * np.asarray(torque)
 
     def _measure(self):
         plant = self.plant

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Where the sections of an arm's links are, bent and twisted: for pictures, and for rigid pieces in their place.
 
-A section at x of a link has the frame that the link's tip would have if the link ended there; it is the chain model's
-(`chain`), whatever the arm's own model: the models of one link have the same shapes. What does not change with the
-motion is prepared once, so that an evaluation takes some 20 us a section.
+A section at x of a link has the frame that the link's tip would have if the link ended there. It always comes from the
+chain model (`chain`), since the models of one link have the same mode shapes. What does not change with the motion is
+prepared once; an evaluation then takes some 20 us a section.
 """
 
 from dataclasses import replace

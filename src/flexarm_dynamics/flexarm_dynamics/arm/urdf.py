@@ -13,8 +13,8 @@ Where two pieces meet there is one revolute joint for each way in which the link
 y, about y for bending along z, about x for twist, in this order. Angles are of what is left of the turn from the
 chain as it is to the section as it should be, so that nothing adds up along the link.
 
-It is for showing (RViz, robot_state_publisher, Foxglove). The small joints have no springs: a simulation of this URDF
-is none of the arm. Rotors behind gears and the first motor, which stands, are left out.
+It is for display (RViz, robot_state_publisher, Foxglove). The small joints have no springs, so that a simulation of
+this URDF does not behave as the arm does. Rotors behind gears and the first motor, which does not move, are left out.
 """
 
 import xml.etree.ElementTree as ET

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Equations of motion of a serial chain of flexible links, recursively, in O(number of links).
 
-The same functions run in three ways: as they stand (for reading and debugging), compiled by numba
-(`kernels.compiled`), and on symbols, which turns them into straight-line code for one arm's structure
-(`kernels.generated`). Hence scalar arithmetic on arrays that the caller provides, and no test of a value.
+The same functions run in three ways: as they are (for reading and debugging), compiled by numba (`kernels.load`), and
+on symbols, which gives straight-line code for one arm's structure (`kernels.generated`). So they calculate with
+scalars, write into arrays of the caller, and never branch on a value that depends on the state.
 
-Floating frames: link i's frame sits at its base, x along the undeformed axis. A point of the axis is at
+The frames are floating: link i's frame is at its base, with x along the undeformed axis. A point of the axis is at
 
 .. math:: r(x, \delta) = (x - s,\ \sum\phi_j\delta_j,\ \sum\phi_k\delta_k), \qquad
    s = \int_0^x f\,dx', \quad f = 0,\ \tfrac12 u,\ 1 - \sqrt{1 - u}, \quad u = y'^2 + z'^2,
 
-for the levels FIRST_ORDER, FORESHORTENING and FINITE_SLOPE. With the frame's angular velocity w, its angular
-acceleration and its origin's acceleration (al, a0), all in link coordinates, the principle of virtual power
-with the partial velocities (1, -r x, r_j = dr/d delta_j) gives each link's equations
+for the levels FIRST_ORDER, FORESHORTENING and FINITE_SLOPE. Let w be the frame's angular velocity, al its angular
+acceleration and a0 the acceleration of its origin, all in link coordinates. The principle of virtual power with the
+partial velocities (1, -r x, r_j = dr/d delta_j) then gives each link's equations
 
 .. math::
     n &= J\,al + c\times a_0 + l\,\ddot\delta + N, \\
@@ -20,11 +20,11 @@ with the partial velocities (1, -r x, r_j = dr/d delta_j) gives each link's equa
     Q_j &= l_j\cdot al + p_j\cdot a_0 + M_{jk}\ddot\delta_k + q_j,
 
 where c, J, p, l, M are the integrals of r, -r x r x, r_j, r x r_j, r_j r_k over the mass and (N, F, q) those of
-w x (w x r) + 2 w x r' + r_jk delta_j' delta_k'. The tip's frame is turned against the base's by three angles,
-R = Rz(a) Ry(-b) Rx(t): a = y', b = z', t = twist at first order.
+w x (w x r) + 2 w x r' + r_jk delta_j' delta_k'. Three angles turn the base's frame into the tip's,
+R = Rz(a) Ry(-b) Rx(t); at first order a = y', b = z', t = twist.
 
 Recursive assembly: Book (1984), Int. J. Robotics Research 3(3); articulated-body form: Featherstone (2008),
-Rigid Body Dynamics Algorithms, ch. 7, here with modal coordinates eliminated link by link.
+Rigid Body Dynamics Algorithms, ch. 7, extended by eliminating the modal coordinates link by link.
 """
 
 from collections import namedtuple
@@ -716,7 +716,7 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
 
 
 def add_rotor(d, w, i, qd, zn):
-    """Add to the moment zn what the rotor of joint i, whose torque is u, asks of its carrier."""
+    """Add to zn the moment that the rotor of joint i, driven by the torque u, exerts on its carrier."""
     spin = d.rotor[i] * (dot(d.axis[i], w.carrier[i]) + d.gear[i] * qd)
     cross(w.carrier[i], d.axis[i], w.t[5])
     for k in range(3):
@@ -841,7 +841,7 @@ def eliminate_modes(d, w, i, force, extra):
 
 
 def eliminate_joint(d, w, i, qd, force, extra, driven, qdd):
-    """Eliminate joint i from row i: its inertia as its carrier feels it, in link i's coordinates."""
+    """Eliminate joint i from row i; what is left is the inertia that its carrier feels, in link i's coordinates."""
     a, t = d.axis[i], w.t
     X, Y, Z, zn, zf = w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
     bias = t[0]
@@ -887,8 +887,8 @@ def forward_dynamics(
 ):
     """Accelerations under generalised forces (articulated-body recursion), after `prepare`.
 
-    Joints with `driven` are moved with the given qdd; of the others qdd is written. `joint_extra` (N,) and
-    `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix: the implicit integrator's.
+    Joints with `driven` move with the given qdd; for the others, qdd is written. `joint_extra` (N,) and
+    `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix; the implicit integrator uses them.
 
     `joint_force` is (N,) [N m], `modal_force` (N, K) [N, N m].
     """
@@ -1113,8 +1113,8 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
         (I - \gamma hA)k_1 = F(y_0), \quad (I - \gamma hA)k_2 = F(y_0 + hk_1) - 2k_1, \quad
         y = y_0 + \tfrac32hk_1 + \tfrac12hk_2 .
 
-    In the velocities this is one articulated-body recursion a stage, with gamma h D + (gamma h)^2 K added to
-    the modal mass. Torque is that of the middle of each step.
+    For the velocities, each stage is one articulated-body recursion with gamma h D + (gamma h)^2 K added to the modal
+    mass. The torque is that in the middle of each step.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ import numpy as np
 
 from . import chain, integrators, load, symbols
 
-#: Longer code than this compiles too long; the recursion in loops serves as well then.
+#: Longer code takes too long to compile; such arms use the recursion in loops.
 MAX_OPERATIONS = 6000
 
 DERIVATIVE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""

@@ -10,7 +10,7 @@ The equations of motion (2) of one link with m modes, every term of which is in 
                       D\dot\delta + (K_e - \dot q^2 G)\delta + f_2\end{bmatrix}
     = \begin{bmatrix}\tau\\0\end{bmatrix}.
 
-`M22` and `h` are constant, so that its inverse is a datum and an evaluation needs no factorisation.
+`M22` and `h` are constant: the inverse of `M22` is part of the data, and an evaluation factorises nothing.
 """
 
 import numpy as np
@@ -55,7 +55,7 @@ def derivative(state, torque, data, out):
         inertia -= h[i] * ah[i]
         out[2 + m + i] = r2
     qdd = (r1 - coupling) / inertia
-    # M22^-1 r2 in place of r2; small m, so that a copy on the stack of the loop is enough.
+    # M22^-1 r2 in place of r2, by way of a copy.
     for i in range(m):
         out[1 + i] = out[2 + m + i]
     for i in range(m):

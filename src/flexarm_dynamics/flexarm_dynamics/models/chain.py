@@ -6,8 +6,8 @@ sections in bending) and twists (with the sections' polar inertia) in the assume
 :math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. The mass matrix depends on the deflections; nothing of the
 Lagrangian is left out at the arm's `level`:
 
-- first order: displacements linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
-- `foreshortening`: the axis keeps its length to second order, and with that stiffens when it spins;
+- first order: displacements are linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
+- `foreshortening`: the axis keeps its length to second order, so that a spinning link is stiffer;
 - `finite_slope`: the axis keeps its length exactly, its curvature is y''/sqrt(1 - y'^2), the tip turns by
   arcsin y'.
 

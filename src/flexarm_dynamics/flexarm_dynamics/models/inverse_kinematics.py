@@ -2,15 +2,15 @@
 r"""Inverse kinematics: joint angles that put the tip at a point, of the straight or of the statically bent arm.
 
 The tip of an arm at rest is :math:`p(q, \delta_s(q))`, with :math:`\delta_s` the deflections under gravity
-(`ArmModel.static_deflection`), so that links that hang down are counted with. Newton's method with the least
-step that reaches the point, damped as Levenberg and Marquardt have it,
+(`ArmModel.static_deflection`), so that the sag of the links is taken into account. Newton's method takes the smallest
+step that reaches the point, damped after Levenberg and Marquardt,
 
 .. math:: \Delta q = J^T (J J^T + \lambda I)^{-1} (p_{wanted} - p), \qquad
     J = \frac{\partial p}{\partial q} - \frac{\partial p}{\partial\delta}
     \left(\frac{\partial F_2}{\partial\delta}\right)^{-1} \frac{\partial F_2}{\partial q},
 
-:math:`F_2` the forces on the modes at rest. The least step keeps an arm with more joints than it needs near where
-it starts. A joint at a limit of the arm file that would be left is held there.
+:math:`F_2` the forces on the modes at rest. The smallest step keeps an arm with more joints than it needs near where
+it starts. A joint that would leave its limits is held at the limit.
 """
 
 from dataclasses import dataclass
@@ -93,7 +93,7 @@ class TipKinematics:
         return terms.f2 + terms.K2 @ delta
 
     def search(self, target, start) -> Solution:
-        """Go from `start` as near to the target as the way leads; see `solve`."""
+        """Go from `start` towards the target until that brings the tip no nearer; see `solve`."""
         q, damping = np.clip(start, self.low, self.high), 1e-3
         tip = self.tip(q)
         error = target - tip

@@ -288,7 +288,7 @@ class Tableau:
 class Stepper:
     """A compiled fixed-step integrator of one arm; see `ArmModel.stepper`.
 
-    It releases the interpreter's lock while it runs; each thread wants a stepper of its own.
+    It releases the interpreter's lock while it runs; each thread needs a stepper of its own.
 
     Parameters
     ----------

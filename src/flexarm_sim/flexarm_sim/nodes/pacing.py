@@ -54,7 +54,7 @@ class RealTime:
         self.late = 0
 
     def alone(self):
-        """Silence that makes one controller of two, see `TorqueGate`; in simulated time [s]."""
+        """Silence of one controller after which the other is alone, see `TorqueGate`; in simulated time [s]."""
         return TorqueGate.ALONE
 
     def connect(self, torques):
@@ -108,7 +108,7 @@ class Lockstep:
         self._pause = round(at * 1e9 / node.sim.period_ns) if at >= 0.0 else None
 
     def alone(self):
-        """Silence that makes one controller of two, see `TorqueGate` [s]."""
+        """Silence of one controller after which the other is alone, see `TorqueGate` [s]."""
         return (ALONE_SAMPLES - 0.5) * self._node.period  # rounding does not decide
 
     def connect(self, torques):
