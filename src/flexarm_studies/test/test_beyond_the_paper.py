@@ -52,9 +52,10 @@ def test_tracks_like_a_rigid_arm_and_does_not_ring(feedforward, error, residual)
 @pytest.mark.parametrize("scale", [2.0 / 3.0, 4.0 / 3.0])
 def test_with_a_payload_a_third_off(scale):
     """The README's worst case beside its nominal figures."""
-    found = case("model", None, {"payload_scale": scale})
-    assert found["peak_joint_error_deg"] <= 0.7
-    assert found["residual_tip_rms_ft"] <= 5e-5
+    values = {"observer.type": "true_rates"}
+    _, found = run(Scenario("R", values, "paper", payload_scale=scale, window=6.0))
+    assert np.degrees(found["peak_joint_error_rad"][0]) <= 0.7
+    assert found["residual_tip_rms_mm"] / 304.8 <= 5e-5
 
 
 def test_with_an_encoder_and_an_observer():
