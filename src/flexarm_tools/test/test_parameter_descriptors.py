@@ -3,17 +3,12 @@
 
 import pytest
 
-from flexarm_control.motions.excitation_run import PARAMETERS as RUN
-from flexarm_control.nodes.excite import PARAMETERS as EXCITE
 from flexarm_ros.parameters import descriptor
 from flexarm_tools import parameter_tables
 
 NODES = {
-    **{
-        node: {prefix + p.name: p for prefix, group in groups.items() for p in group}
-        for node, groups in parameter_tables.groups().items()
-    },
-    "excite": {p.name: p for p in (*EXCITE, *RUN)},
+    node: {prefix + p.name: p for prefix, group in groups.items() for p in group}
+    for node, groups in parameter_tables.groups().items()
 }
 
 

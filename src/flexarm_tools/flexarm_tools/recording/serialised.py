@@ -20,8 +20,6 @@ from flexarm_dynamics.errors import MessageError
 
 from .types import typestore
 
-_SIZES = {"bool": 1, "uint8": 1, "int8": 1, "byte": 1, "char": 1, "uint16": 2, "int16": 2}
-_SIZES |= {"uint32": 4, "int32": 4, "float32": 4, "uint64": 8, "int64": 8, "float64": 8}
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2"}
 _CODES |= {"int16": "i2", "uint32": "u4", "int32": "i4", "float32": "f4", "uint64": "u8"}
 _CODES |= {"int64": "i8", "float64": "f8"}
@@ -138,13 +136,13 @@ class _Walker:
         return self.at - length, self.at
 
     def number(self, path, kind, count):
-        size = _SIZES[kind]
+        dtype = np.dtype(self.order + _CODES[kind])
         if count != 0:
-            self.align(size)
-        end = self.at + size * (1 if count is None else count)
+            self.align(dtype.itemsize)
+        end = self.at + dtype.itemsize * (1 if count is None else count)
         if end > len(self.raw):
             raise MessageError("goes beyond the message's end", field=path)
-        self.numbers[path] = (self.at, np.dtype(self.order + _CODES[kind]), count)
+        self.numbers[path] = (self.at, dtype, count)
         self.moving.append((self.at, end))
         self.at = end
 
