@@ -21,7 +21,7 @@ from flexarm_studies.identification.predictor import Predictor
 from flexarm_studies.identification.quantities import changed, quantities
 from flexarm_tools.identification import excite
 
-ARMS, RATE = 3, 100.0
+ARMS, RATE = 4, 100.0
 SHORT = {**coverage.SETTINGS, "duration": 3.0, "rest": 1.0}
 
 
