@@ -22,8 +22,8 @@ J = ["joint1"]
 #: Faults begin here, in simulated time since the session's start [s].
 BEGIN = 0.15
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "safety.md"
-#: Where the problem ends in a reason: what a colon explains, and a limit, are left out of the table.
-BEYOND_PROBLEM = re.compile(r": (?!-?(?:nan|inf|\d))| \(")
+#: Field and problem of a reason: what a colon explains, a limit and a hint are left out of the table.
+PROBLEM = re.compile(r"(?:[\w.]+: )?.+?(?=: (?!-?(?:nan|inf|\d))| \(|; |$)")
 MARKS = "<!-- fault matrix: begin -->", "<!-- fault matrix: end -->"
 STATES = {
     getattr(CompositeState, n): n
@@ -63,7 +63,7 @@ ROWS = {
     "joint position huge": Row(
         "joint_position huge", reason="joint_position of joint1: .*beyond what an arm measures"
     ),
-    "joint position missing": Row("joint_position drop", reason="joint_position is empty"),
+    "joint position missing": Row("joint_position drop", reason="joint_position: is empty"),
     "joint velocity NaN": Row("joint_velocity nan", reason="joint_velocity of joint1: nan"),
     "modal amplitude NaN": Row(
         "modal_amplitude.link1_y_mode1 nan", reason="modal_amplitude is not known"
@@ -192,7 +192,7 @@ def check_row(arm, name):
     reason = (
         ""
         if since is None
-        else re.sub(r"(?<!\w)-?\d[\d.e+]*", "#", BEYOND_PROBLEM.split(off.rejected_reason)[0])
+        else re.sub(r"(?<!\w)-?\d[\d.e+]*", "#", PROBLEM.match(off.rejected_reason)[0])
     )
     return f"| {name} | `{begins(row)}` | {does} | {reaction} | {reason} |"
 
