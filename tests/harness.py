@@ -158,9 +158,13 @@ class Bench(Nodes, Session):
     # End -------------------------------------------------------------------------------------
 
     def close(self):
-        """End all processes; remove what killed ones left behind."""
-        self.processes.stop()
+        """Leave the graph and end all processes; remove what killed ones left behind.
+
+        In this order: a process that has to be killed may hold a lock in shared memory, for which the middleware of
+        this one would wait for ever.
+        """
         super().close()
+        self.processes.stop()
         self._stack.close()
         for path in abandoned(self._killed):
             path.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ What the nodes do with their input does not depend on how it reaches them. A fam
 in order, without processes, threads or waiting; one case of each family is tested over DDS as well.
 """
 
+import gc
 import heapq
 import itertools
 from collections import deque
@@ -266,8 +267,15 @@ class InProcess(Nodes):
             if node.active:
                 node.stop()
             node.destroy_node()
+            del node
+        self.nodes.clear()
+        self.queue = None
+        gc.unfreeze()  # a node that starts freezes what there is
+        gc.collect()
+        # Nothing refers to the contexts any more: with them go the participants of the middleware and their threads.
         for context in self._contexts:
             rclpy.try_shutdown(context=context)
+            context.destroy()
         self._domain.__exit__(None, None, None)
 
     def __enter__(self):
