@@ -60,6 +60,15 @@ class Queue:
         for reader in readers:
             reader.take(raw if reader.raw else message)
 
+    def publisher(self, kind, topic):
+        """A publisher, as far as nodes and tools use one."""
+        return SimpleNamespace(
+            publish=lambda message: self.publish(kind, topic, message),
+            get_subscription_count=lambda: self.readers(topic),
+            wait_for_all_acked=lambda timeout: True,
+            topic_name=topic,
+        )
+
     def readers(self, topic):
         """Number of those that get a topic's messages."""
         return len(self._readers.get(topic, ())) + (topic in self.taps)
@@ -135,13 +144,7 @@ class _OnQueue:
     queue = None
 
     def _publisher(self, kind, topic, *_, **__):
-        topic, queue = self.resolve_topic_name(topic), self.queue
-        return SimpleNamespace(
-            publish=lambda message: queue.publish(kind, topic, message),
-            get_subscription_count=lambda: queue.readers(topic),
-            wait_for_all_acked=lambda timeout: True,
-            topic_name=topic,
-        )
+        return self.queue.publisher(kind, self.resolve_topic_name(topic))
 
     def make_subscription(self, kind, topic, callback, *_, raw=False, **__):
         topic = self.resolve_topic_name(topic)
@@ -194,9 +197,12 @@ class InProcess(Nodes):
 
     def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
         """Make a node and activate it, unless `autostart` is false."""
+        return self.start_with(arguments(parameters, file, remaps), name, key)
+
+    def start_with(self, args, name, key=None):
+        """Make a node of a command line's arguments."""
         context = rclpy.Context()
         self._contexts.append(context)
-        args = arguments(parameters, file, remaps)
         rclpy.init(context=context, args=args, domain_id=self.domain)
         kind = type(CLASSES[name].__name__, (_OnQueue, CLASSES[name]), {"queue": self.queue})
         with mock.patch("rclpy.node.get_default_context", lambda **_: context):
@@ -221,7 +227,7 @@ class InProcess(Nodes):
         """A publisher of a topic."""
         topic = f"/{topic.lstrip('/')}"
         assert self.queue.readers(topic) >= readers
-        return SimpleNamespace(publish=lambda message: self.queue.publish(kind, topic, message))
+        return self.queue.publisher(kind, topic)
 
     def call(self, kind, service, /, **request):
         """Call a service between two messages; its answer."""
@@ -231,13 +237,13 @@ class InProcess(Nodes):
                     return offered.callback(kind.Request(**request), kind.Response())
         raise AssertionError(f"no service {service}")
 
-    def wait_for(self, what, condition, patience=20.0):
+    def wait_for(self, what, condition, patience=20.0, hint=""):
         """Serve until a condition holds; its value."""
         end = self.queue.time + patience
         while not (value := condition()):
             if self.queue.time > end:
                 logs = "\n".join(node.get_logger().text for node in self.nodes.values())
-                raise WaitError(f"waited {patience:g} s in vain for {what}", hint=logs)
+                raise WaitError(f"waited {patience:g} s in vain for {what}", hint=hint + logs)
             self.queue.serve()
         return value
 

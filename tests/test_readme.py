@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 import yaml
 from builtin_interfaces.msg import Duration
+from harness import Arm
+from in_process import InProcess
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import get_parameter_value
@@ -209,20 +211,39 @@ def test_publish_command_reaches_the_controller_even_while_the_arm_moves(arm):
     publish(arm, command.replace("1.57", "0.3"))
 
 
-@pytest.mark.real_time
-def test_commands_of_the_two_link_arm_move_it(tmp_path):
+@contextlib.contextmanager
+def in_lockstep(commands, monkeypatch):
+    """The nodes of the guide's commands on a queue in this process; `publish` finds them, too."""
+    with InProcess() as bench:
+        for command in commands:
+            _, _, _, name, *rest = words_of(command)
+            rest = [w.replace("config/", f"{ROOT}/config/") for w in rest]
+            more = {
+                "controller": PATIENCE,
+                "simulator": ["-p", "lockstep:=true", "-p", "pause_at:=-1.0"],
+            }
+            bench.start_with([*rest, *more.get(name, [])], name)
+        found = contextlib.nullcontext(bench)
+        monkeypatch.setattr("flexarm_ros.session.Session", lambda *_, **__: found)
+        yield Arm(bench)
+
+
+def call(command):
+    """Run a command of the guide in this process."""
+    options = cli.parser().parse_args(words_of(command)[1:])
+    options.function(options)
+
+
+def test_commands_of_the_two_link_arm_move_it(monkeypatch):
     commands = [c for c in starting("./flexarm", "run") if "two_link" in c]
-    with started(commands, tmp_path) as line:
-        publish(line, starting("./flexarm", "publish")[2])
+    with in_lockstep(commands, monkeypatch) as arm:
+        call(starting("./flexarm", "publish")[2])
 
         def there():
-            state = reference(line)
-            return (
-                abs(state.reference_position[1] - 0.8) < 1e-9
-                and max(abs(e) for e in state.position_error) < 0.03
-            )
+            errors = [abs(e) for e in arm.state.position_error]
+            return abs(arm.state.reference_position[1] - 0.8) < 1e-9 and max(errors) < 0.03
 
-        line.wait_for("both joints to get there", there)
+        arm.bench.wait_for("both joints to get there", there)
 
 
 @pytest.mark.parametrize(
@@ -232,21 +253,21 @@ def test_commands_of_the_two_link_arm_move_it(tmp_path):
 def test_commands_without_ros_do_what_they_say(tmp_path, monkeypatch, capsys, command):
     words = words_of(command)[1:]
     monkeypatch.chdir(tmp_path)
-    options = cli.parser().parse_args(words)
-    options.function(options)
+    call(command)
     assert any(capsys.readouterr())
     for word in words:
         if word.startswith("results/"):
             assert (tmp_path / word).stat().st_size > 1000
 
 
-@pytest.mark.real_time
-def test_commands_of_your_own_arm_move_it(tmp_path):
+def test_commands_of_your_own_arm_move_it(monkeypatch):
     commands = [c for c in starting("./flexarm", "run") if "--params-file" not in c]
-    with started(commands, tmp_path) as line:
-        publish(line, starting("./flexarm", "publish")[1])
-        line.wait_for("the end", lambda: abs(reference(line).reference_position[0] - 1.0) < 1e-9)
-        line.wait_for("the joint", lambda: abs(reference(line).position_error[0]) < 0.02)
+    monkeypatch.chdir(ROOT)
+    with in_lockstep(commands, monkeypatch) as arm:
+        call(starting("./flexarm", "publish")[1])
+        end = lambda: abs(arm.state.reference_position[0] - 1.0) < 1e-9  # noqa: E731
+        arm.bench.wait_for("the end", end)
+        arm.bench.wait_for("the joint", lambda: abs(arm.state.position_error[0]) < 0.02)
 
 
 def test_own_law_example_is_found_by_name_and_runs(tmp_path):

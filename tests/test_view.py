@@ -59,7 +59,7 @@ class Screen:
 
     def __init__(self, bench, browser, url):
         self.bench = bench
-        self.page = browser.new_page(viewport={"width": 1100, "height": 700})
+        self.page = browser.new_page(viewport={"width": 800, "height": 600})
         self.page.set_default_timeout(PATIENCE)
         self.requests, self.errors = [], []
         self.page.on("request", lambda request: self.requests.append(request.url))
