@@ -150,7 +150,7 @@ REFUSALS = {
 
 
 #: One of each kind as a process of its own; all of them in this process.
-AS_PROCESS = ("no arm", "missing field", "below range", "no design")
+AS_PROCESS = ("missing field", "no design")
 CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
 
 
@@ -190,9 +190,8 @@ def test_a_process_that_cannot_start_ends_with_code_1(bench, case, tmp_path):
     names_its_error_once(case, bench.log(name))
 
 
-@pytest.mark.real_time
 def test_the_other_nodes_go_on_when_one_refuses_to_start(bench):
-    bench.start("simulator", {"arm": "R", "rate": 100.0})
+    bench.start("simulator", {"arm": "R", **LOCKSTEP})
     bench.start("observer", {"arm": "R"})
     arm = Arm(bench)
     bench.wait_for("estimates", lambda: arm.estimated.newest)
