@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.node import Node
 
 from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
+from flexarm_ros.session import Session
 from flexarm_sim.nodes.simulator import SimulatorNode
 from flexarm_tools.running.processes import own_domain
 
@@ -63,19 +63,32 @@ def test_the_policy_file_is_of_the_form_that_sros2_reads():
 @pytest.fixture(scope="module")
 def created():
     """What each node has created: {node: {kind: names}}, from the graph."""
-    with own_domain() as domain:
+    with own_domain() as domain, Session("bystander", domain=domain) as session:
         rclpy.init(domain_id=domain, args=["--ros-args", "-p", "arm:=R", "-p", "fast.type:=none"])
-        nodes, bystander = {}, Node("bystander")
+        nodes = {}
         try:
             for name, node_class in CLASSES.items():
                 nodes[name] = node_class()
                 assert nodes[name].trigger_configure() == TransitionCallbackReturn.SUCCESS
-            # Of one context: known at once.
-            yield {name: graph(bystander, name) for name in CLASSES}
+            session.wait_for(
+                "the graph", lambda: all(is_known(session.node, n) for n in nodes.values())
+            )
+            yield {name: graph(session.node, name) for name in CLASSES}
         finally:
-            for node in (*nodes.values(), bystander):
+            for node in nodes.values():
                 node.destroy_node()
             rclpy.try_shutdown()
+
+
+def is_known(bystander, node):
+    """Whether the graph has all that a node made itself."""
+    found = graph(bystander, node.get_name())
+    topics = {p.topic_name for p in node.publishers}, {s.topic_name for s in node.subscriptions}
+    return (
+        topics[0] <= set(found["publish"])
+        and topics[1] <= set(found["subscribe"])
+        and {s.service_name for s in node.services} <= set(found["reply"])
+    )
 
 
 def graph(node, name):
