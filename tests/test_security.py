@@ -82,6 +82,8 @@ def created():
 
 def is_known(bystander, node):
     """Whether the graph has all that a node made itself."""
+    if node.get_name() not in bystander.get_node_names():
+        return False
     found = graph(bystander, node.get_name())
     topics = {p.topic_name for p in node.publishers}, {s.topic_name for s in node.subscriptions}
     return (
