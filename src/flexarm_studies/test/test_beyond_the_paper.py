@@ -49,10 +49,11 @@ def test_tracks_like_a_rigid_arm_and_does_not_ring(feedforward, error, residual)
     assert found["peak_torque_lbf_ft"]["total"] <= 3.2
 
 
+@pytest.mark.parametrize("feedforward", ["model", "preview"])
 @pytest.mark.parametrize("scale", [2.0 / 3.0, 4.0 / 3.0])
-def test_with_a_payload_a_third_off(scale):
+def test_with_a_payload_a_third_off(scale, feedforward):
     """The README's worst case beside its nominal figures."""
-    values = {"observer.type": "true_rates"}
+    values = {"observer.type": "true_rates", "feedforward": feedforward}
     _, found = run(Scenario("R", values, "paper", payload_scale=scale, window=6.0))
     assert np.degrees(found["peak_joint_error_rad"][0]) <= 0.7
     assert found["residual_tip_rms_mm"] / 304.8 <= 5e-5
