@@ -127,9 +127,11 @@ class Supervisor:
             ("position of", joints, " rad"),
             ("deflection of", model.mode_names, ""),
             ("strain of", model.arm.gauge_names, ""),
-            ("time at the torque", ["limit"], " s"),
+            ("", ["time at the torque limit"], " s"),
         )
-        self._names = [(f"{what} {name}", unit) for what, names, unit in watched for name in names]
+        self._names = [
+            (f"{what} {name}".lstrip(), unit) for what, names, unit in watched for name in names
+        ]
         bounds = np.cumsum([0, *(len(names) for _, names, _ in watched)])
         self._parts = [slice(a, b) for a, b in pairwise(bounds)]
         self._ratio, self._value = np.zeros((2, len(self._names)))
