@@ -153,9 +153,12 @@ WITNESS = Path(__file__).with_name("host_witness.py")
 
 
 class Witness:
-    """A `host_witness` on a host; `received` has each topic's messages as (seconds, values)."""
+    """A `host_witness` on a host; `received` has each topic's messages as (seconds, values).
 
-    def __init__(self, hosts, host, settings, domain, log):
+    Each message sets the event `arrived`.
+    """
+
+    def __init__(self, hosts, host, settings, domain, log, arrived):
         with hosts.on(host), open(log, "wb") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, str(WITNESS)],
@@ -165,7 +168,7 @@ class Witness:
                 env={**environment(domain), **settings},
                 text=True,
             )
-        self.received = {}
+        self.received, self._arrived = {}, arrived
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -173,6 +176,7 @@ class Witness:
         for line in self._process.stdout:
             topic, at, values = json.loads(line)
             self.received.setdefault(topic, []).append((at, values))
+            self._arrived.set()
 
     def tell(self, *command):
         """Have it move the arm or recover the controller."""
@@ -239,10 +243,11 @@ class Loop:
         with contextlib.ExitStack() as stack:
             self._domain = stack.enter_context(own_domain())
             self.processes = stack.enter_context(Processes(self._domain, self.directory))
-            self.witness = {}
+            self.witness, self._arrived = {}, threading.Event()
             for host in ADDRESSES:
                 log = self.directory / f"witness_{host}.log"
-                witness = Witness(self.hosts, host, self._settings(host), self._domain, log)
+                settings = self._settings(host)
+                witness = Witness(self.hosts, host, settings, self._domain, log, self._arrived)
                 stack.callback(witness.close)
                 self.witness[host] = witness
             self.arm, self.desk = self.witness["arm"], self.witness["desk"]
@@ -273,7 +278,8 @@ class Loop:
                     for path in sorted(self.directory.glob("*.log"))
                 )
                 raise AssertionError(f"waited up to {self.PATIENCE:g} s in vain for {what}\n{logs}")
-            time.sleep(0.002)
+            self._arrived.wait(0.05)
+            self._arrived.clear()
         return value
 
     # What an operator does at the desk ---------------------------------------------------------
@@ -409,7 +415,11 @@ def main():
             loop.set_in_motion()
             cut = loop.cut_for(seconds)
             again = loop.wait_for("states at the desk", lambda cut=cut: cut.received_again_after)
-            time.sleep(0.5)
+            seen = loop.desk.count("controller/state")
+            loop.wait_for(
+                "half a second of states",
+                lambda seen=seen: loop.desk.count("controller/state") > seen + RATE / 2,
+            )
             safe = None if cut.unanswered is None else cut.unanswered / RATE
             times = (_ms(t) for t in (safe, cut.disabled_after, again))
             print(
