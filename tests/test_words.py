@@ -44,8 +44,7 @@ OUT = (
 
 #: What may stay, as it stands in a line, and why.
 ALLOWED = (
-    (r"--contenders", "an option of `flexarm compare`"),
-    (r"options\.contenders", "the value of that option"),
+    (r"--contenders", "the old name of an option of `flexarm compare`"),
     (r"\"(contenders|subjects)\"", "keys of docs/comparison.json, which users read"),
     (r"saturation_share", "a key of the report's JSON"),
     (r"drop share=", "the syntax of a fault, which users write"),
@@ -127,7 +126,7 @@ def test_the_search_finds(text, word):
     [
         "we recommend print(x)",
         "nodes share memory",
-        "flexarm compare --contenders none",
+        "flexarm compare --controllers none",
         "least_squares, the largest_value",
         "finite slope of the beam",
     ],

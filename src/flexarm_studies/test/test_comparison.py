@@ -372,7 +372,7 @@ def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
 
     monkeypatch.setattr(command, "_results", interrupted)
     out = tmp_path / "rows.json"
-    words = ["--arms", "R", "--contenders", "composite (shipped),joint PID", "--no-combinations"]
+    words = ["--arms", "R", "--controllers", "composite (shipped),joint PID", "--no-combinations"]
     with pytest.raises(KeyboardInterrupt):
         command.main([*words, "--json", str(out)])
     assert list(command.load(out)["subjects"][0]["contenders"]) == [controllers.PID]

@@ -110,7 +110,7 @@ REFUSED = {
     },
     "compare": {
         "--arms P9": "--arms: 'P9' is unknown (R, ",
-        "--contenders 'joint PID,other'": "--contenders: 'other' is unknown",
+        "--controllers 'joint PID,other'": "--controllers: 'other' is unknown",
         "--budget 0": "--budget: 0 is too small (1 or more)",
         "--workers 0": "--workers: 0 is too small (1 or more)",
     },

@@ -33,7 +33,7 @@ def add_arguments(parser):
     add = parser.add_argument
     arms = ",".join(s.arm for s in cases.CASES)
     add("--arms", default=arms, help=f"arms, separated by commas ({arms})")
-    add("--contenders", help="controllers, separated by commas; or none (all)")
+    add("--controllers", "--contenders", help="controllers, separated by commas; or none (all)")
     add("--budget", type=int, metavar="N", help="simulations per controller (depends on the arm)")
     add("--seed", type=int, default=0, help="seed of tuning and noise (0)")
     add("--workers", type=int, metavar="N", help="processes (one per core)")
@@ -111,10 +111,10 @@ def chosen(options):
     for name, least in (("budget", 1), ("workers", 1), ("seed", 0)):
         at_least(f"--{name}", getattr(options, name), least)
     names = list(CONTROLLERS)
-    if options.contenders == "none":
+    if options.controllers == "none":
         names = []
-    elif options.contenders:
-        names = _joined([name.strip() for name in options.contenders.split(",")])
+    elif options.controllers:
+        names = _joined([name.strip() for name in options.controllers.split(",")])
     wanted = cases.find([QUICK] if options.quick else options.arms.split(","))
     if options.quick:
         wanted = [replace(s, window=QUICK_WINDOW, depth="star") for s in wanted]
@@ -138,7 +138,7 @@ def _joined(words):
                 break
         else:
             known = "; ".join(CONTROLLERS)
-            raise FlexarmError("is unknown", field="--contenders", value=rest[0], limit=known)
+            raise FlexarmError("is unknown", field="--controllers", value=rest[0], limit=known)
     return names
 
 
