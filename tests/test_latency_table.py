@@ -3,6 +3,7 @@
 
 import argparse
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -143,3 +144,15 @@ def test_motions_of_the_cases_are_those_of_their_arms():
                 low, high = joint.limits.position
                 assert low <= angle <= high
         assert np.abs(np.subtract(case.end, case.begin)).max() > 0.5
+
+
+def test_relay_and_loop_answer_in_real_processes():
+    """As `flexarm latency` starts them, without its motion and its rounds; how fast is not asked."""
+    case = replace(CASE, window=0.2)
+    found = measure.measure(
+        case, 1, ("relay", "three processes"), "executor", False, lambda _: None
+    )
+    for chain in found.values():
+        assert len(chain["windows"][0]["latencies"]) > 10
+    assert found["three processes"]["windows"][0]["enabled"] > 10
+    assert found["three processes"]["mathematics"]["controller"] > 0.0

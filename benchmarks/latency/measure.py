@@ -2,10 +2,10 @@
 r"""``flexarm latency``: from measurement to torque, in real time, beside a bare relay of the same messages.
 
 A loop is the shipped nodes in the shipped control, on the moving arm: simulator, observer and controller as three
-processes, or observer and controller in one. The relay is three plain nodes that answer each message with a
-ready-made one of the same type, size and quality of service (`relay`); the same simulator, with the same plant, is at
-its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's publish
-to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that what
+processes, or observer and controller in one. The relay (`flexarm_tools.running.relay`) is three plain nodes that answer
+each message with a ready-made one of the same type, size and quality of service; the same simulator, with the same
+plant, is at its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's
+publish to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that what
 slows the machine slows all of them, and the result is the ratio of each round's medians.
 """
 
@@ -123,6 +123,7 @@ class Chain:
         self.wait_for = self.session.wait_for
 
     def _start(self, relay_spin):
+        from flexarm_tools.running import relay
         from flexarm_tools.running.processes import arguments
 
         case, start = self.case, self.processes.start_module
@@ -133,7 +134,7 @@ class Chain:
         start("simulator", timed, "simulator", *arguments(given, file))
         for role in CHAINS[self.name]:
             if self.name == "relay":
-                start(role, f"{__package__}.relay", role, case.arm, relay_spin)
+                start(role, relay.__name__, role, case.arm, relay_spin)
             else:
                 given = {"arm": case.arm, "rate": case.rate, **OPEN}
                 start(role, timed, role, *arguments(given, file))
