@@ -66,9 +66,11 @@ ROWS = {
     "joint position missing": Row("joint_position drop", reason="joint_position: is empty"),
     "joint velocity NaN": Row("joint_velocity nan", reason="joint_velocity of joint1: nan"),
     "modal amplitude NaN": Row(
-        "modal_amplitude.link1_y_mode1 nan", reason="modal_amplitude is not known"
+        "modal_amplitude.link1_y_mode1 nan", reason="modal_amplitude of link1_y_mode1: nan is not"
     ),
-    "modal amplitude huge": Row("modal_amplitude huge", reason="modal_amplitude is not known"),
+    "modal amplitude huge": Row(
+        "modal_amplitude huge", reason="modal_amplitude of .*: .* is beyond"
+    ),
     "wrong joint names": Row("names wrong", reason="joint_names"),
     "names in another order": Row("names reorder", end=HOLDING, lasting=""),
     "one value too few": Row("joint_position short", reason="joint_position"),

@@ -35,7 +35,8 @@ def sample(k=0, position=0.0, session=1, n=1, **fields):
     s.stamp_ns, s.session, s.sequence = fields.pop("stamp_ns", stamp(k)), session, k
     s.position[:], s.rate = position, np.zeros(2)
     for name, value in fields.items():
-        setattr(s, name, None if value is None else np.array(value, float))
+        plain = value is None or name in ("trust", "doubt", "controller_id")
+        setattr(s, name, value if plain else np.array(value, float))
     return s
 
 
@@ -290,6 +291,21 @@ def test_an_unusable_sample_is_a_fault_with_the_reason_and_forgets_the_trajector
         assert core.reason == ""
         assert_array_equal(core.reference.position, [0.06])
         assert_array_equal(core.torque, [0.0])
+
+
+def test_a_state_that_its_source_distrusts_is_a_fault_with_the_sources_reason(arm_r):
+    core = started(arm_r)
+    assert not core.step(sample(1, trust=ArmSample.DISTRUSTED, doubt="strain of root: stuck"))
+    assert (core.state, core.reason) == (State.FAULT, "strain of root: stuck")
+
+
+def test_a_state_to_stop_with_ends_the_motion_smoothly_with_the_sources_reason(arm_r):
+    core = started(arm_r)
+    core.offer(motion(end=0.001, duration=0.2))
+    assert core.step(sample(1)) and core.state == State.TRACKING
+    assert core.step(sample(2, trust=ArmSample.STOP, doubt="strain of root: lost"))
+    assert core.step(sample(3, trust=ArmSample.STOP, doubt="strain of root: lost"))
+    assert (core.state, core.reason) == (State.STOPPING, "strain of root: lost")
 
 
 def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready_once_recovered(arm_r):

@@ -93,12 +93,17 @@ class StateReader:
         Raises
         ------
         MessageError
-            For names or lengths that are not this arm's, or nanoseconds of a second and more.
+            For names or lengths that are not this arm's, nanoseconds of a second and more, or an unknown trust.
         """
         stamp = msg.header.stamp
         # The answer to a refused message carries its stamp: it must be one that a message can hold.
         sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
+        sample.controller_id, sample.doubt = msg.controller_id, msg.doubt
+        if msg.trust > ArmState.DISTRUSTED:
+            limit = "TRUSTED (0), STOP (1) or DISTRUSTED (2)"
+            raise MessageError("is no degree of trust", field="trust", value=msg.trust, limit=limit)
+        sample.trust = msg.trust
         if stamp.nanosec >= SECOND:
             raise MessageError(
                 "is no part of a second",
@@ -144,11 +149,15 @@ class StateWriter:
         msg.mode_names = list(arm.observed_modes)
         self._views = {}
 
-    def head(self, stamp, session, sequence):
-        """Write stamp [ns], session and sequence."""
+    def head(self, stamp, session, sequence, controller_id=0):
+        """Write stamp [ns], session, sequence, and whose torque acts."""
         msg = self.message
         set_stamp(msg.header.stamp, stamp)
-        msg.session, msg.sequence = session, sequence
+        msg.session, msg.sequence, msg.controller_id = session, sequence, controller_id
+
+    def trust(self, trust, doubt):
+        """Write whether the state may be trusted, `ArmState.TRUSTED` and so on, and which sensor is in doubt."""
+        self.message.trust, self.message.doubt = trust, doubt
 
     def write(self, field, values):
         """Write an array field; None leaves it empty: not known."""

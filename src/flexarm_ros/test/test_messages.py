@@ -424,6 +424,22 @@ def test_stamps_are_nanoseconds_to_the_last_one(ns):
     assert stamp_ns(over_the_wire(message).header.stamp) == ns
 
 
+def test_trust_and_whose_torque_acts_go_over_the_wire_and_an_unknown_trust_is_refused():
+    writer = StateWriter(ARM)
+    writer.write("joint_position", np.zeros(3))
+    writer.head(1, 2, 3, controller_id=4)
+    writer.trust(ArmSample.STOP, "strain of root: lost")
+    sample = read(over_the_wire(writer.message))
+    assert (sample.controller_id, sample.trust, sample.doubt) == (
+        4,
+        ArmSample.STOP,
+        "strain of root: lost",
+    )
+    writer.trust(3, "")
+    with pytest.raises(MessageError, match="trust: 3 is no degree of trust"):
+        read(writer.message)
+
+
 @pytest.mark.parametrize("sec", [-(2**31), 0, 2**31 - 1])
 @pytest.mark.parametrize("nanosec", [10**9, 2**32 - 1])
 def test_a_stamp_with_a_second_of_nanoseconds_is_refused_and_its_answer_can_be_sent(sec, nanosec):

@@ -17,7 +17,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import StrainMap
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
@@ -28,7 +28,7 @@ from flexarm_tools.recording import mcap
 from flexarm_tools.recording import record as recording
 from flexarm_tools.recording.loop_bag import LoopBag
 from flexarm_tools.recording.recorder import BagWriter, raw_stamp_ns
-from flexarm_tools.recording.serialised import Decoder
+from flexarm_tools.recording.serialised import Decoder, layout_of
 from flexarm_tools.report import analysis, animation, command, figures, page, timeline
 from flexarm_tools.report import run as run_module
 from flexarm_tools.report.run import HOLDING, TRACKING
@@ -642,6 +642,24 @@ def test_a_fault_is_shown_with_its_reason(tmp_path, recorded):
 
 
 # The parts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("padding", range(5))
+@pytest.mark.parametrize("rates", [[], [0.5, -0.5]])
+def test_a_recording_from_before_states_had_a_trust_is_read(rates, padding):
+    names = ["a", "b"] if rates else []
+    message = ArmState(sequence=7, joint_names=["j"], joint_position=[0.1], mode_names=names)
+    message.modal_amplitude = message.modal_rate = rates
+    raw = bytes(serialize_message(message))
+    kind = "flexarm_msgs/msg/ArmState"
+    end = layout_of(raw, kind).numbers["controller_id"][0]
+    old = raw[:end] + bytes(padding)
+    layout = layout_of(old, kind)
+    assert "trust" not in layout.numbers
+    block = np.frombuffer(old, np.uint8)[None]
+    np.testing.assert_array_equal(layout.column(block, "modal_rate")[0], rates)
+    with pytest.raises(MessageError):
+        layout_of(old[: end - 9], kind)
 
 
 def test_columns_are_what_the_middleware_reads():

@@ -228,6 +228,9 @@ class ArmController:
             return self.enabled
         if self.state == State.FAULT:
             return False
+        if sample.trust == ArmSample.DISTRUSTED:
+            self.distrust(sample.doubt or "the source distrusts this state")
+            return False
         if verdict == SampleOrder.REPEAT and sample.stamp_ns != self._order.stamp_ns:
             self.distrust(f"state {sample.sequence} came again with another stamp")
             return False
@@ -267,6 +270,8 @@ class ArmController:
             return False
         self.enabled = True
         supervisor.follow(reference)
+        if verdict is None and sample.trust == ArmSample.STOP:
+            verdict, why = State.STOPPING, sample.doubt or "the source asks for a stop"
         if verdict == State.STOPPING and (reference.active or reference.pending):
             self.brake(why)  # from the next sample on
         return self.enabled

@@ -25,10 +25,21 @@ class ArmSample:
         Modal amplitudes [m, rad] and rates [m/s, rad/s]; None where not known.
     velocity_known : bool
         False where the source gave no joint velocity.
+    controller_id : int
+        Of the controller whose torque acts from now on; 0: none, or not told.
+    trust : int
+        `TRUSTED`; `STOP`: to bring the arm to rest with; `DISTRUSTED`: not to be used.
+    doubt : str
+        Which sensor is in doubt, and why; empty if none is.
     """
+
+    #: As in ArmState.
+    TRUSTED, STOP, DISTRUSTED = range(3)
 
     __slots__ = (
         "amplitude",
+        "controller_id",
+        "doubt",
         "position",
         "rate",
         "sequence",
@@ -36,6 +47,7 @@ class ArmSample:
         "stamp_ns",
         "strain",
         "torque",
+        "trust",
         "velocity",
         "velocity_known",
     )
@@ -48,6 +60,7 @@ class ArmSample:
         self.amplitude = np.zeros(n_modes) if n_modes else None
         self.rate = None
         self.velocity_known = True
+        self.controller_id, self.trust, self.doubt = 0, self.TRUSTED, ""
 
     @property
     def key(self):

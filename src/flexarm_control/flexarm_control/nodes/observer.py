@@ -75,11 +75,12 @@ class ObserverNode(ArmNode):
         except MessageError as error:
             self._statistics.refused(error)
             self.report(f"arm_state {msg.sequence}: {error}")
-            self._forward_unknown(msg)
+            self._forward_distrusted(msg, str(error))
             return
         if known is None:  # older than the last one: useless for the controller
             return
-        writer.head(sample.stamp_ns, sample.session, sample.sequence)
+        writer.head(sample.stamp_ns, sample.session, sample.sequence, sample.controller_id)
+        writer.trust(sample.trust, sample.doubt)
         writer.write("joint_position", core.position)
         writer.write("joint_velocity", core.velocity)
         writer.write("joint_torque", sample.torque)
@@ -113,10 +114,11 @@ class ObserverNode(ArmNode):
         response.success, response.message = True, text
         return response
 
-    def _forward_unknown(self, msg):
-        """Pass a bad sample on without modal states, so that the controller disables at once."""
+    def _forward_distrusted(self, msg, doubt):
+        """Pass a bad sample on, without modal states and with the reason, so that the controller disables at once."""
         for field in ("gauge_names", "strain", "mode_names", "modal_amplitude", "modal_rate"):
             setattr(msg, field, [])
+        msg.trust, msg.doubt = ArmState.DISTRUSTED, doubt
         self._estimate_pub.publish(msg)
 
     def diagnose(self):

@@ -133,6 +133,7 @@ class ClosedLoop:
         e.velocity[:] = observer.velocity
         e.amplitude = observer.amplitude
         e.rate = observer.rate if converged else None
+        e.controller_id, e.trust, e.doubt = measured.controller_id, measured.trust, measured.doubt
         return e
 
     #: The observer has this long to converge [s].

@@ -23,6 +23,8 @@ from .types import typestore
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2"}
 _CODES |= {"int16": "i2", "uint32": "u4", "int32": "i4", "float32": "f4", "uint64": "u8"}
 _CODES |= {"int64": "i8", "float64": "f8"}
+#: First of the fields that were added at a message's end, which older recordings lack, and the least of their bytes.
+_ADDED = {"flexarm_msgs/msg/ArmState": ("controller_id", 12)}
 #: A message with more numbers in an array than this is broken.
 MAX_COUNT = 100_000
 #: Layouts that are remembered for messages of one length: names may be in several orders.
@@ -89,7 +91,10 @@ class _Walker:
         self.at, self.numbers, self.texts, self.names, self.moving = 4, {}, {}, {}, []
 
     def message(self, kind, prefix=""):
+        added, least = _ADDED.get(kind, (None, 0))
         for name, field in typestore().fielddefs[kind][1]:
+            if name == added and len(self.raw) - self.at < least:
+                return
             self.field(prefix + name, *field)
 
     def field(self, path, node, what):
