@@ -199,13 +199,15 @@ class Gate(Reader):
         sequence = rng.choice((0, 5, 2**32 - 5))
         sent = {}  # sequence -> when
         self.given = history = []
+        names = {}  # sequence -> the controller that the state names
         accepted = None  # when the state was sent whose torque was let through
         for _ in range(self.batch):
             now += rng.choice((0.0, 0.001, 0.01, 0.1, 2.0))
             if rng.random() < 0.7:
                 sequence = (sequence + rng.choice((1, 1, 1, 2))) % 2**32
                 sent[sequence] = now
-                gate.sent(sequence, now)
+            if sequence in sent:  # sometimes again
+                names[sequence] = gate.sent(sequence, now)
             msg = good_torque(rng, self.arm)
             msg.sequence = sequence
             if rng.random() < 0.7:
@@ -217,6 +219,7 @@ class Gate(Reader):
             refused += bool(reason)
             if not reason:
                 demand(msg.session == 7 and msg.mode == JointTorque.ENABLED, "let through")
+                demand(names[msg.sequence] == msg.controller_id != 0, "a stranger let through")
                 accepted = sent[msg.sequence]
             torque = gate.torque(now)
             demand(torque is not None or gate.reason, "the safe action for no reason")

@@ -443,6 +443,10 @@ class Drive:
         """Publish a torque, whatever it is."""
         self._publisher.publish(JointTorque(**{"controller_id": 1, **fields}))
 
+    def claim(self, **changes):
+        """Answer one state with DISABLED, so that the next one names this controller."""
+        return self.step(0.0, mode=JointTorque.DISABLED, **changes)
+
     def step(self, torque, /, **changes):
         """Answer the state; the next one."""
         fields = {

@@ -313,6 +313,7 @@ def in_motion_beside_its_twin(drive):
     """The simulator after a reset, the arm in motion; and its twin in this process."""
     drive.reset()
     drive.twin = Source.simulator("R")
+    claim(drive)
     for _ in range(10):
         step_both(drive, 3.0)
     assert abs(drive.state.joint_velocity[0]) > 1e-3
@@ -328,6 +329,13 @@ def simulated():
 @pytest.fixture
 def drive(simulated):
     return in_motion_beside_its_twin(simulated)
+
+
+def claim(drive, **changes):
+    """One period of both under the safe action: the next state names the controller."""
+    assert drive.claim(**changes).controller_id == changes.get("controller_id", 1)
+    drive.twin.advance(None)
+    same(drive)
 
 
 def step_both(drive, torque, **changes):
@@ -376,15 +384,17 @@ def check_bad_torque(drive, case):
     drive.step(1.0, **BAD_TORQUES[case])
     drive.twin.advance(None)
     same(drive)
+    assert drive.state.controller_id == (1 if case.startswith("disabled") else 0)
     if not case.startswith("disabled"):
         assert "the safe action is applied" in drive.bench.log("simulator")
+        claim(drive)
     step_both(drive, 1.0)
 
 
 @pytest.mark.parametrize(
     "shift",
-    ({"session": 1}, {"sequence": -1}, {"sequence": -5}, {"sequence": 1}),
-    ids=("wrong session", "stale by one", "stale by five", "from the future"),
+    ({"session": 1}, {"sequence": -2}, {"sequence": -5}, {"sequence": 1}),
+    ids=("wrong session", "stale by two", "stale by five", "from the future"),
 )
 def test_an_answer_to_another_state_is_ignored(drive, shift):
     state = drive.first()
@@ -422,7 +432,8 @@ def levels(bench, name, since):
 def test_two_controllers_are_an_error_on_diagnostics_that_ends_when_one_of_them_ends(drive):
     bench = drive.bench
     bench.diagnostics("simulator")
-    error = (DiagnosticStatus.ERROR, "several controllers publish joint_torque: stop all but one")
+    several = "several controllers (11, 12) publish joint_torque: stop all but one"
+    error = (DiagnosticStatus.ERROR, several)
 
     def step(controller_id, safe=False):
         drive.step(0.1, controller_id=controller_id)
@@ -439,13 +450,33 @@ def test_two_controllers_are_an_error_on_diagnostics_that_ends_when_one_of_them_
 
         return bench.wait_for("diagnostics", known)
 
+    step(11, safe=True)
     step(11)
-    assert error not in turn([12])  # the controller was restarted: another id, one controller
+    step(12, safe=True)  # the controller was restarted: another id, one controller
+    assert error not in turn([12])
     assert error in turn([11, 12], safe=True)
-    for _ in range(ALONE_SAMPLES - 1):  # since 12 followed 11 for the last time
+    assert (drive.state.controller_id, drive.state.trust) == (0, ArmState.DISTRUSTED)
+    assert drive.state.doubt == several
+    for _ in range(ALONE_SAMPLES):  # since 12 followed 11 for the last time; one more to be named
         step(12, safe=True)
+    assert (drive.state.controller_id, drive.state.trust) == (12, ArmState.TRUSTED)
     assert error not in turn([12])
     assert bench.log("simulator").count("several controllers (11, 12)") == 1
+
+
+def test_a_second_torque_for_one_state_under_the_same_id_is_a_race_that_neither_wins(drive):
+    state = drive.state
+    answer = {"session": state.session, "sequence": state.sequence, "mode": JointTorque.ENABLED}
+    drive.send(**answer, joint_names=J, torque=[1.0])
+    drive.send(**answer, joint_names=J, torque=[-1.0])
+    drive.bench.wait_for("the next state", lambda: drive.states.newest.sequence > state.sequence)
+    drive.state = drive.states.newest
+    drive.twin.advance(np.array([1.0]))  # in lockstep the first answer is a step
+    same(drive)
+    assert drive.state.controller_id == 1
+    drive.step(1.0)
+    drive.twin.advance(None)
+    same(drive)
 
 
 def test_the_safe_action_of_arm_r_brakes_more_than_no_torque_does(drive):

@@ -564,6 +564,8 @@ def test_the_published_amplitudes_are_the_true_ones_plus_the_spill_over_of_the_t
     seen = gauge_rows(plant, twin.arm.gauges)
     inverse = np.linalg.inv(gauge_rows(nominal, nominal.arm.gauges))
     spilled = 0.0
+    drive.claim()
+    twin.advance(None)
     for torque in torques(60):
         drive.step(torque)
         twin.advance(np.array([torque]))
@@ -624,7 +626,7 @@ def test_paused_in_lockstep_the_same_state_comes_again_and_torques_advance_nothi
     arm.pause(True)
     state = drive.first()
     publisher = three_modes.publisher(JointTorque, "joint_torque")
-    answer = {"mode": 1, "joint_names": ["joint1"], "torque": [1.0]}
+    answer = {"mode": 1, "controller_id": 1, "joint_names": ["joint1"], "torque": [1.0]}
     publisher.publish(JointTorque(session=state.session, sequence=state.sequence, **answer))
     drive.first()
     drive.first()

@@ -466,8 +466,8 @@ LIMITS = [
             ),
             (
                 "freshness: a state's age, not the message's",
-                "self._sent[message.sequence] + self.timeout",
-                "now + self.timeout",
+                "self._fresh_until = controller, sent + self.timeout",
+                "self._fresh_until = controller, now + self.timeout",
             ),
             (
                 "freshness: another session",
@@ -476,7 +476,7 @@ LIMITS = [
             ),
             (
                 "freshness: out of order",
-                "(message.sequence - self._answered) % 2**32 >= 2**31",
+                "(sequence - self._answered) % WRAP >= WRAP // 2",
                 "False",
             ),
             (
@@ -487,6 +487,26 @@ LIMITS = [
             (
                 "two controllers in turn",
                 "            if controller in self.ids:\n",
+                "            if False:\n",
+            ),
+            (
+                "freshness: a state that is published again",
+                "self._sent[sequence] = self._sent[sequence][0], named",
+                "self._sent[sequence] = now, named",
+            ),
+            (
+                "handshake: a state that names none",
+                "        if named != controller:\n",
+                "        if False:\n",
+            ),
+            (
+                "race: two torques for one state",
+                "            if (torque != self._answer).any():\n",
+                "            if False:\n",
+            ),
+            (
+                "race: a torque after DISABLED",
+                "            if not self._enabled:\n",
                 "            if False:\n",
             ),
         )

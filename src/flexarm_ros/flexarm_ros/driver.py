@@ -23,12 +23,10 @@ from flexarm_msgs.msg import ArmState, JointTorque
 from . import qos
 from .messages import SECOND, StateWriter, set_stamp
 from .node import ARM, ERROR, OK, WARN, ArmNode
-from .torque_gate import TorqueGate
+from .torque_gate import WRAP, TorqueGate
 
-#: A driver whose `read` returns nothing for this long reports an error [s].
+#: A driver whose `read` returns nothing for this long reports an error; the next sample begins a new session [s].
 SILENT = 0.5
-#: Sequence numbers and sessions on the topics are uint32.
-WRAP = 2**32
 
 TORQUE_TIMEOUT = parameter("torque_timeout", 0.05, "s", 0.001, 1.0, read_only=True).described(
     "A torque that answers a state older than this is too late; the safe action follows."
@@ -49,7 +47,8 @@ class Sample:
     number : int
         Counts the samples: a lost one leaves a gap, and a number that does not rise begins a new session.
     stamp_ns : int or None
-        Time of measurement on this machine's ROS clock [ns]; None: not known yet, the sample is not published.
+        Time of measurement on this machine's ROS clock [ns]; None: not known yet, the sample is not published, and
+        the next one with a time begins a new session.
     position : ndarray, shape (n,)
         [rad]
     velocity : ndarray, shape (n,), optional
@@ -82,7 +81,7 @@ class Driver(ArmNode):
 
     `read` runs in a thread of its own, all others in the node's thread, or in that one, under a lock: never two
     at a time. A driver whose samples come as ROS messages, or that moves on its own grid of time, overrides
-    `connect`, `start` and `stop` and calls `publish` itself.
+    `connect`, `start` and `stop` and calls `publish` itself, and `begin_session` where the device has restarted.
 
     Parameters
     ----------
@@ -147,7 +146,7 @@ class Driver(ArmNode):
         parameters.resolve({"joints": len(self.arm.joints), "gauges": len(self.arm.gauges)})
         self.fault, self.safe = "", True
         self._published, self._before = 0, 0
-        self._first = self._last = self._thread = None
+        self._first = self._last = self._arrived = self._thread = None
         self._reading = False
         self._lock = threading.RLock()
         self.open()
@@ -179,6 +178,9 @@ class Driver(ArmNode):
         return time.monotonic()
 
     def start(self):
+        self._first = (
+            None  # the device may have been restarted, or moved to another zero, meanwhile
+        )
         self._reading = True
         self._thread = threading.Thread(target=self._read, name="device", daemon=True)
         self._thread.start()
@@ -188,9 +190,20 @@ class Driver(ArmNode):
         self._reading = False
         if self._thread is not None:
             self._thread.join()
+        self.begin_session()
         with self._lock:
-            self.gate.begin(self.gate.session)
             self.actuate()
+
+    def begin_session(self):
+        """Begin a new session: the device has restarted, or its zeros may have changed.
+
+        There is no torque until a controller has answered in the new session; one that was in motion is in fault then.
+        Samples whose numbers do not rise, that come after `SILENT` seconds without any, or after one without a time,
+        begin one by themselves, and so does each activation.
+        """
+        with self._lock:
+            self._first = None
+            self.gate.begin(new_session())
 
     # Device to topics --------------------------------------------------------------------------
 
@@ -213,15 +226,17 @@ class Driver(ArmNode):
 
     def _number(self, sample):
         """Publish a sample of the device under its sequence in the session."""
-        if self._last is not None and sample.number <= self._last:
-            self._first = None  # the device has restarted
-        self._last = sample.number
+        now = self.now()
+        if self._last is not None and (
+            sample.number <= self._last or sample.stamp_ns is None or now - self._arrived > SILENT
+        ):
+            self._first = None  # the device has restarted, or may have
+        self._last, self._arrived = sample.number, now
         if sample.stamp_ns is None:
             return
         if self._first is None:
+            self.begin_session()
             self._first = sample.number
-            with self._lock:
-                self.gate.begin(new_session())
         sample.number = (sample.number - self._first) % WRAP
         self.publish(sample)
         self.watch()
@@ -229,15 +244,16 @@ class Driver(ArmNode):
     def publish(self, sample):
         """Publish a `Sample`, whose number is its sequence in the session, and note when."""
         with self._lock:
-            self.fill(sample)
-            self.gate.sent(sample.number, self.now())
+            self.fill(sample, self.gate.sent(sample.number, self.now()))
             self.state_publisher.publish(self.writer.message)
         self.publish_joints(sample)
 
-    def fill(self, sample):
-        """Write a sample into the message of `arm_state`."""
+    def fill(self, sample, controller_id):
+        """Write a sample into the message of `arm_state`, and whose answer to it will act."""
         writer = self.writer
-        writer.head(sample.stamp_ns, self.gate.session, sample.number)
+        writer.head(sample.stamp_ns, self.gate.session, sample.number, controller_id)
+        doubt = self.gate.controllers.doubt(self.now())
+        writer.trust(ArmState.DISTRUSTED if doubt else ArmState.TRUSTED, doubt)
         writer.write("joint_position", sample.position)
         writer.write("joint_velocity", sample.velocity)
         writer.write("joint_torque", sample.torque)
@@ -269,7 +285,7 @@ class Driver(ArmNode):
         with self._lock:
             refusal = self.gate.offer(message, self.now())
             self.answered(message)
-        if refusal:
+        if refusal and refusal != self.gate.UNCONFIRMED:
             self.refused(refusal)
 
     def answered(self, message):
@@ -312,9 +328,7 @@ class Driver(ArmNode):
     def judge(self, samples):
         """Level and message for `/diagnostics`; `samples` were published in the last second."""
         gate = self.gate
-        problem = self.problem(samples)
-        if not problem and gate.controllers.several(self.now()):
-            problem = gate.SEVERAL
+        problem = self.problem(samples) or gate.controllers.doubt(self.now())
         if problem:
             return ERROR, problem
         if gate.reason:

@@ -176,12 +176,12 @@ class TorqueWriter:
     ----------
     arm : Arm
     controller_id : int, optional
-        Tells two controllers of one arm apart: a random one at each start, if not given.
+        Tells two controllers of one arm apart, never 0: a random one at each start, if not given.
     """
 
     def __init__(self, arm, controller_id=None):
         if controller_id is None:
-            controller_id = int.from_bytes(os.urandom(4), "little")
+            controller_id = int.from_bytes(os.urandom(4), "little") or 1
         self.message = msg = JointTorque()
         msg.joint_names = list(arm.joint_names)
         msg.controller_id = controller_id

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of `joint_torque`: which torque a driver may apply, and when it takes the safe action.
 
-A torque acts while it answers a state of this session that was published no longer than the timeout ago.
-Otherwise the joints take their safe action: before the first torque, without a fresh one, on DISABLED, after a
-message that can't be used, and while two controllers send in turn.
+A torque acts while it answers a state of this session that was published for the first time no longer than the timeout
+ago, and that names the torque's controller. Otherwise the joints take their safe action: before the first such torque,
+without a fresh one, on DISABLED, after a message that can't be used, and while two controllers send.
 """
 
 import numpy as np
@@ -12,16 +12,19 @@ from flexarm_dynamics.errors import MessageError
 
 from .messages import TorqueReader
 
+#: Sequence numbers on the topics are uint32.
+WRAP = 2**32
+
 
 class Controllers:
-    """Notices a second controller: an id that comes back after another one.
+    """Notices a second controller: an id that comes back after another one, or two answers where one is due.
 
     A controller that was restarted has a new id and is accepted at once.
 
     Parameters
     ----------
     alone : float
-        After two have sent in turn, one must be silent for this long; in the unit of the times given [s].
+        After two have sent, one must be silent for this long; in the unit of the times given [s].
 
     Attributes
     ----------
@@ -31,6 +34,10 @@ class Controllers:
         The last two that sent in turn, ascending; empty before.
     """
 
+    #: Reasons: two ids in turn; one id with two torques for one state.
+    SEVERAL = "several controllers publish joint_torque: stop all but one"
+    RACED = "two torques answer one state under one controller_id: a second program publishes joint_torque"
+
     def __init__(self, alone):
         self.alone = alone
         self.forget()
@@ -38,21 +45,33 @@ class Controllers:
     def forget(self):
         """Start again without any controller."""
         self.ids, self.pair = set(), ()
-        self._last, self._until = None, -np.inf
+        self._last, self._until, self._reason = None, -np.inf, ""
 
     def note(self, controller, now):
-        """Note a message; return whether two send in turn."""
+        """Note a message; return whether two send."""
         if controller != self._last:
             if controller in self.ids:
-                self._until = now + self.alone
                 self.pair = tuple(sorted((controller, self._last)))
+                ids = ", ".join(map(str, self.pair))
+                self._dispute(now, self.SEVERAL.replace("controllers", f"controllers ({ids})"))
             self._last = controller
             self.ids.add(controller)
         return self.several(now)
 
+    def race(self, now):
+        """Note that two torques answered one state under one id."""
+        self._dispute(now, self.RACED)
+
+    def _dispute(self, now, reason):
+        self._until, self._reason = now + self.alone, reason
+
     def several(self, now):
-        """Whether two send in turn."""
+        """Whether two send."""
         return now < self._until
+
+    def doubt(self, now):
+        """Why it is unknown whose torque is the right one; empty where it is known."""
+        return self._reason if self.several(now) else ""
 
 
 class TorqueLimit:
@@ -79,6 +98,10 @@ class TorqueLimit:
 class TorqueGate:
     """Lets one controller's fresh torque through, clipped to the joints' limits.
 
+    A controller claims the arm by answering a state. From then on the states name it, and its answers to *those* act: a
+    stranger has to listen, and to race the controller, which is noticed. The claim ends when no answer has come for the
+    timeout, with a message that can't be used, and with another controller's message.
+
     It has no clock: the caller gives all times, in seconds of one steady clock. It is not thread-safe: a driver
     that reads its device in another thread holds a lock around each call.
 
@@ -87,9 +110,9 @@ class TorqueGate:
     arm : Arm
         Its joint names and torque limits apply.
     timeout : float
-        A torque is too late when it answers a state that was published longer ago than this [s].
+        A torque is too late when it answers a state that was first published longer ago than this [s].
     alone : float
-        After two controllers have sent in turn, one must be silent for this long [s].
+        After two controllers have sent, one must be silent for this long [s].
 
     Attributes
     ----------
@@ -105,15 +128,15 @@ class TorqueGate:
 
     #: Default of `alone` [s].
     ALONE = 1.0
-    #: Reasons: two controllers send in turn; a message had the mode DISABLED.
-    SEVERAL = "several controllers publish joint_torque: stop all but one"
+    #: Reasons: a message had the mode DISABLED; the state that it answers did not name its controller.
     DISABLED = "the controller says DISABLED"
+    UNCONFIRMED = "the controller's first answer: those to states with its controller_id act"
 
     def __init__(self, arm, timeout, alone=ALONE):
         self.timeout = timeout
         self.controllers = Controllers(alone)
         self._reader, self._limit = TorqueReader(arm), TorqueLimit(arm)
-        self._torque = np.zeros(len(arm.joints))
+        self._torque, self._answer = np.zeros((2, len(arm.joints)))
         self.refused = 0
         self.begin(0)
 
@@ -125,17 +148,31 @@ class TorqueGate:
     def begin(self, session):
         """Begin a new session of the source: earlier messages answer nothing any more."""
         self.session = session
-        self._sent = {}  # sequence -> time of its publication, oldest first
-        self._answered = None
+        self._sent = {}  # sequence -> (time of its first publication, controller that it names), oldest first
+        self._newest = self._answered = None
+        self._enabled = False  # mode of the answer to the state `_answered`
+        self._claimant = 0
         self._fresh_until = self._until = -np.inf
         self.controllers.forget()
         self.reason = "no torque yet"
 
+    def controller_id(self, now):
+        """Id of the controller whose answer to a state that is published now will act; 0: of none."""
+        return self._claimant if self._fresh_until >= now else 0
+
     def sent(self, sequence, now):
-        """Note that the state `sequence` is published now."""
-        self._sent[sequence] = now
-        while next(iter(self._sent.values())) < now - self.timeout:
-            del self._sent[next(iter(self._sent))]
+        """Note that the state `sequence` is published now; the `controller_id` that it has to name.
+
+        A state that is published again keeps its first time: a repeat is no sign of life.
+        """
+        named = self.controller_id(now)
+        if sequence in self._sent:
+            self._sent[sequence] = self._sent[sequence][0], named
+        elif self._newest is None or 0 < (sequence - self._newest) % WRAP < WRAP // 2:
+            self._sent[sequence], self._newest = (now, named), sequence
+            while next(iter(self._sent.values()))[0] < now - self.timeout:
+                del self._sent[next(iter(self._sent))]
+        return named
 
     def offer(self, message, now):
         """Accept a `JointTorque` message, or say why not.
@@ -147,27 +184,40 @@ class TorqueGate:
         str
             Why it is not applied; empty where it is.
         """
+        sequence, controller = message.sequence, message.controller_id
         if message.session != self.session:
             return f"torque for session {message.session}, this is session {self.session}"
-        if self.controllers.note(message.controller_id, now):
-            ids = ", ".join(map(str, self.controllers.pair))
-            return self._close(self.SEVERAL.replace("controllers", f"controllers ({ids})"))
-        if message.sequence not in self._sent:
-            return f"torque for state {message.sequence}, which is older than the timeout or was never sent"
-        if self._answered is not None and (message.sequence - self._answered) % 2**32 >= 2**31:
-            return f"torque for state {message.sequence} after that for {self._answered}"
+        if self.controllers.note(controller, now):
+            return self._drop(self.controllers.doubt(now))
+        sent, named = self._sent.get(sequence, (-np.inf, 0))
+        if sent < now - self.timeout:
+            return f"torque for state {sequence}, which is older than the timeout or was never sent"
+        if self._answered is not None and (sequence - self._answered) % WRAP >= WRAP // 2:
+            return f"torque for state {sequence} after that for {self._answered}"
         try:
             torque = self._reader.read(message)
+            if not controller:
+                raise MessageError(
+                    "is no controller's: draw one at random", field="controller_id", value=0
+                )
         except MessageError as error:
             self.refused += 1
-            return self._close(str(error))
-        self._answered = message.sequence
-        self._fresh_until = self._sent[message.sequence] + self.timeout
+            return self._drop(str(error))
+        if torque is not None and sequence == self._answered and controller == self._claimant:
+            if not self._enabled:
+                return f"torque for state {sequence} after DISABLED for it"
+            if (torque != self._answer).any():
+                self.controllers.race(now)
+                return self._drop(self.controllers.doubt(now))
+        self._answered, self._enabled = sequence, torque is not None
+        self._claimant, self._fresh_until = controller, sent + self.timeout
         if torque is None:
             return self._close(self.DISABLED)
+        self._answer[:] = torque
+        if named != controller:
+            return self._close(self.UNCONFIRMED)
         self._torque[:] = self._limit.clip(torque)
-        self._until = self._fresh_until
-        self.reason = ""
+        self._until, self.reason = self._fresh_until, ""
         return ""
 
     def torque(self, now):
@@ -183,5 +233,11 @@ class TorqueGate:
         return self._answered is not None and self._fresh_until < now
 
     def _close(self, reason):
+        """Take the safe action; the claim stays."""
         self._until, self.reason = -np.inf, reason
         return reason
+
+    def _drop(self, reason):
+        """Take the safe action, and end the claim."""
+        self._claimant = 0
+        return self._close(reason)

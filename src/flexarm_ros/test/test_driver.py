@@ -8,7 +8,7 @@ import pytest
 import rclpy
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_msgs.msg import JointTorque
+from flexarm_msgs.msg import ArmState, JointTorque
 from flexarm_ros.driver import Driver, Sample
 from flexarm_ros.node import ERROR, OK, WARN
 
@@ -20,7 +20,11 @@ class FakeArm(Driver):
         self.actions, self.states, self.time, self.broken = [], [], 0.0, ""
 
     def connect(self, torques):
-        self.state_publisher.publish = lambda m: self.states.append((m.session, m.sequence))
+        self.state_publisher.publish = self.note
+
+    def note(self, message):
+        self.states.append((message.session, message.sequence))
+        self.newest = message
 
     def start(self):
         """Start without a thread."""
@@ -70,6 +74,15 @@ def arm(monkeypatch):
     rclpy.shutdown()
 
 
+def claim(arm, controller_id=1):
+    """Two samples: the controller answers the first one, the second names it."""
+    arm.reads(1)
+    arm.answer(0.0, controller_id=controller_id)
+    assert arm.newest.controller_id == 0 and arm.actions[-1] == "safe"
+    arm.reads(2)
+    assert arm.newest.controller_id == controller_id
+
+
 def test_lost_samples_are_gaps_and_a_device_that_restarts_begins_a_session(arm):
     arm.reads(5, stamp_ns=None)  # its time is not known yet: not published
     arm.reads(6, 7, 9)
@@ -80,7 +93,7 @@ def test_lost_samples_are_gaps_and_a_device_that_restarts_begins_a_session(arm):
 
 
 def test_a_torque_acts_until_it_is_too_old_and_the_safe_action_follows(arm):
-    arm.reads(1)
+    claim(arm)
     arm.answer(2.0)
     assert arm.actions[-1] == [2.0] and arm.diagnose()[:2] == (OK, "")
     arm.time = 0.05
@@ -93,30 +106,69 @@ def test_a_torque_acts_until_it_is_too_old_and_the_safe_action_follows(arm):
 
 
 def test_two_controllers_are_an_error(arm):
-    arm.reads(1)
+    claim(arm)
     for controller_id in (1, 2, 1):
         arm.answer(2.0, controller_id=controller_id)
     assert arm.actions[-1] == "safe"
+    arm.reads(3)
+    assert arm.newest.controller_id == 0 and arm.newest.trust == ArmState.DISTRUSTED
+    assert "several controllers (1, 2)" in arm.newest.doubt
     level, message, values = arm.diagnose()
-    assert (level, message) == (ERROR, arm.gate.SEVERAL) and values["samples per second"] == 1
+    assert (level, message) == (ERROR, arm.newest.doubt) and values["samples per second"] == 3
+    arm.time += 1.1
+    arm.reads(4)
+    assert (arm.newest.trust, arm.newest.doubt) == (ArmState.TRUSTED, "")
+
+
+def test_one_state_published_for_ever_has_no_torque(arm):
+    claim(arm)
+    held = Sample(1, 1, np.zeros(1))
+    for _ in range(100):
+        arm.answer(2.0)
+        assert (arm.actions[-1] == [2.0]) == (arm.time <= 0.05)
+        arm.time += 0.001
+        arm.publish(held)
+    arm.watch()
+    assert arm.actions[-1] == "safe" and arm.newest.controller_id == 0
+
+
+def test_whatever_may_have_moved_the_zero_begins_a_session(arm):
+    def session(*numbers, **stamp):
+        arm.reads(*numbers, **stamp)
+        return arm.newest.session
+
+    first = session(1)
+    arm.time += 0.5
+    assert session(2) == first
+    arm.time += 0.501
+    silent = session(3)
+    arm.reads(4, stamp_ns=None)
+    clock = session(5)
+    arm.trigger_deactivate()
+    arm.trigger_activate()
+    again = session(6)
+    arm.begin_session()
+    by_hand = session(7)
+    assert len({first, silent, clock, again, by_hand}) == 5
 
 
 def test_errors_of_the_device_are_shown_until_a_sample_comes(arm):
-    arm.reads(1)
+    claim(arm)
     arm.broken = "the line is cut"
     arm.answer(2.0)
     assert arm.diagnose()[:2] == (ERROR, "the line is cut")
     arm.broken = ""
-    arm.reads(2)
+    arm.reads(3)
     assert arm.diagnose()[0] == OK
     arm.broken = "the line is cut again"
-    arm.reads(3)
+    arm.reads(4)
     assert arm.diagnose()[:2] == (ERROR, "the line is cut again")
 
 
 def test_a_driver_that_stops_leaves_the_arm_safe_and_closes_the_device(arm):
-    arm.reads(1)
+    claim(arm)
     arm.answer(2.0)
+    assert arm.actions[-1] == [2.0]
     arm.trigger_deactivate()
     assert arm.actions[-1] == "safe"
     arm.answer(2.0)

@@ -26,7 +26,7 @@ class ArmSample:
     velocity_known : bool
         False where the source gave no joint velocity.
     controller_id : int
-        Of the controller whose torque acts from now on; 0: none, or not told.
+        Of the controller whose answer to this state acts; 0: of none, or unknown.
     trust : int
         `TRUSTED`; `STOP`: to bring the arm to rest with; `DISTRUSTED`: not to be used.
     doubt : str

@@ -96,6 +96,7 @@ def check(faults, parameters):
 def _message(true, sample):
     """A new `ArmState` with the values of a faulty sample."""
     message = ArmState(session=true.session, sequence=sample.sequence)
+    message.trust, message.doubt = true.trust, true.doubt
     message.header.frame_id = true.header.frame_id
     set_stamp(message.header.stamp, sample.stamp_ns)
     for key, names in sample.names.items():

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulator node: the simulated arm as a driver, in lockstep or in real time."""
 
-from flexarm_ros.driver import WRAP, Driver, Sample
+from flexarm_ros.driver import Driver, Sample
 from flexarm_ros.node import ERROR, OK, WARN, run
 from flexarm_ros.start import leave
-from flexarm_ros.torque_gate import TorqueGate
+from flexarm_ros.torque_gate import WRAP, TorqueGate
 
 from .. import simulator
 from . import faults, pacing, services
@@ -85,7 +85,8 @@ class SimulatorNode(Driver):
         self.pacing.go_on()
 
     def stop(self):
-        """Nothing to do: the simulated arm stands still with the node."""
+        """Forget the torque; the simulated arm stands still with the node."""
+        self.gate.begin(self.gate.session)
 
     # Torque in, state out ----------------------------------------------------------------------
 
@@ -112,11 +113,8 @@ class SimulatorNode(Driver):
         self.publish(self._sample)
 
     def publish(self, sample):
-        self.fill(sample)
+        self.fill(sample, self.gate.controller_id(self.now()))
         self.sent = self.faults.outgoing(self.writer.message, self.sim.time)
-        for message in self.sent:
-            age = (sample.number - message.sequence) % WRAP  # a fault may have delayed it
-            self.gate.sent(message.sequence, self.now() - age * self.period)
         self.send()
         # The newest of several: the others are of the samples before it.
         self.awaited = max((m.sequence for m in self.sent), default=None)
@@ -125,6 +123,9 @@ class SimulatorNode(Driver):
     def send(self):
         """Send the messages of the present sample, for the first time or again."""
         for message in self.sent:
+            age = (self.sim.sequence - message.sequence) % WRAP  # a fault may have delayed it
+            then = self.now() - age * self.period
+            message.controller_id = self.gate.sent(message.sequence, then)
             self.state_publisher.publish(message)
 
     # Services, diagnostics ---------------------------------------------------------------------
@@ -162,8 +163,8 @@ class SimulatorNode(Driver):
         return values | ({"faults": str(self.faults)} if str(self.faults) else {})
 
     def judge(self, samples):
-        if self.fault or self.gate.controllers.several(self.now()):
-            return ERROR, self.fault or self.gate.SEVERAL
+        if problem := self.fault or self.gate.controllers.doubt(self.now()):
+            return ERROR, problem
         if self.paused:
             return OK, "paused: call ~/pause with data false"
         if not samples or (self.safe and not self.parameters["lockstep"]):

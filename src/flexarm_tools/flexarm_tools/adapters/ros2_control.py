@@ -17,10 +17,11 @@ from std_msgs.msg import Float64MultiArray
 from flexarm_dynamics.errors import MessageError, ParameterError
 from flexarm_dynamics.parameters import parameter
 from flexarm_ros import qos
-from flexarm_ros.driver import TORQUE_TIMEOUT, WRAP, Driver, Sample
+from flexarm_ros.driver import SILENT, TORQUE_TIMEOUT, Driver, Sample
 from flexarm_ros.messages import stamp_ns
 from flexarm_ros.node import ARM, run
 from flexarm_ros.start import leave
+from flexarm_ros.torque_gate import WRAP
 
 #: Timeout for delivering the last efforts, which are zero.
 LAST_EFFORTS = Duration(seconds=0.2)
@@ -177,7 +178,7 @@ class AdapterNode(Driver):
         self._limit = self.arm.torque_limits
         self._velocity, self._moved_at = np.zeros(n), -math.inf
         self._applied, self._sequence = np.zeros(n), 0
-        self._position = self._stamp = None
+        self._position = self._stamp = self._arrived = None
 
     def connect(self, torques):
         # All topics are served alike: none of them is the control path alone.
@@ -226,14 +227,22 @@ class AdapterNode(Driver):
         velocity, effort = readings.joints(msg, "velocity"), readings.joints(msg, "effort")
         if position is None:
             raise MessageError("is empty", field="position")
-        if self._stamp is not None and stamp <= self._stamp:
-            return None
+        if self._stamp is not None:
+            if now - self._arrived > SILENT or self._stamp - stamp > 1e9 * SILENT:
+                self._forget()  # the source was silent, or its clock went back: it may have restarted
+            elif stamp <= self._stamp:
+                return None
         self._note_velocity(position, velocity, stamp, now)
-        self._position, self._stamp = position, stamp
+        self._position, self._stamp, self._arrived = position, stamp, now
         number, self._sequence = self._sequence, (self._sequence + 1) % WRAP
         torque = effort if self.parameters["use_effort"] else self._applied
         strain = readings.strain_at(now) if self.arm.gauges else None
         return Sample(number, stamp, position, velocity, torque, strain)
+
+    def _forget(self):
+        """Begin a new session."""
+        self._stamp, self._sequence = None, 0
+        self.begin_session()
 
     def _note_velocity(self, position, velocity, stamp, now):
         """Keep the newest velocity for damping; where it is not measured, from the positions."""
@@ -254,7 +263,7 @@ class AdapterNode(Driver):
         self.apply(np.clip(-damping * self._velocity, -self._limit, self._limit))
 
     def stop(self):
-        self.gate.begin(self.gate.session)
+        self._forget()
         self.apply(np.zeros(self._limit.size))
         # The effort controller keeps the last efforts: they must arrive before the node is gone.
         self._efforts.wait_for_all_acked(LAST_EFFORTS)

@@ -18,6 +18,8 @@ from .samples import Finding, Received, Verdict, samples
 
 #: Half the duration of a jolt forth and back; time for which torques that must be refused are sent [s].
 JOLT, REFUSED = 0.15, 0.15
+#: Time for which states are answered with DISABLED before a push, so that they name this program [s].
+CLAIM = 0.05
 #: Attempts at a push, when too many samples were lost to judge it.
 TRIES = 3
 #: Wall time that a phase may take beyond its own: in addition [s], and as a factor.
@@ -126,6 +128,10 @@ class Conversation:
         """Send DISABLED, so that the arm takes its safe action."""
         self.send(message, np.zeros(len(self._arm.joints)), mode=self._kind.DISABLED)
 
+    def claim(self):
+        """Answer states with DISABLED for a while, so that the driver expects torque from here; what has come."""
+        return self.listen(CLAIM, lambda _, message: self.disable(message))
+
     def alone(self):
         """Whether this program is the only one that publishes torque."""
         return self.node.count_publishers(self._publisher.topic_name) == 1
@@ -204,7 +210,7 @@ class Examination:
 
     def _pushed(self, joint, angle):
         """Push a joint once; return the push, its samples and the torque sent."""
-        position = np.array(self._samples(self.driver.listen(0.05)).position[-1])
+        position = np.array(self._samples(self.driver.claim()).position[-1])
         push = moving.plan(self.model, position, joint, angle)
         sequences, torques = [], []
 
@@ -228,6 +234,7 @@ class Examination:
             self.driver.send(message, torque)
             last[:] = message.sequence, torque
 
+        self.driver.claim()
         received = self.driver.listen(2.0 * JOLT, answer)
         received += self.driver.listen(5.0 * self.tolerances.torque_timeout + 0.2)
         self.findings.append(
