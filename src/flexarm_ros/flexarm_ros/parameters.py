@@ -76,8 +76,7 @@ class NodeParameters:
                 parameter.check(node._parameter_overrides[name].value, prefix=prefix)
                 raise ParameterError(f"{name}: {error}") from None
         self._warn_unknown()
-        self._values = {}
-        self._values = self._checked({})
+        self._values = self._checked(self._given())
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._on_applied)
 
@@ -104,7 +103,7 @@ class NodeParameters:
         ParameterError
         """
         self._sizes = dict(sizes)
-        self._values = self._checked({})
+        self._values = self._checked(self._given())
 
     def on_change(self, listener):
         """Call ``listener(set of changed names)`` after a set has been taken."""
@@ -126,27 +125,33 @@ class NodeParameters:
             if of == prefix and (names is None or p.name in names)
         }
 
-    def _checked(self, changes):
+    def _given(self):
+        """All values as the node holds them."""
+        return {name: self._node.get_parameter(name).value for name in self._declared}
+
+    def _checked(self, given):
+        """Those of `given` values by full names that are declared here, checked; the others can't have changed."""
         values = {}
-        for name, (prefix, parameter) in self._declared.items():
-            value = changes.get(name, self._node.get_parameter(name).value)
-            if hasattr(value, "tolist"):  # arrays come as array.array
-                value = value.tolist()
-            values[name] = parameter.check(value, self._sizes, prefix)
+        for name, value in given.items():
+            if name in self._declared:
+                prefix, parameter = self._declared[name]
+                if hasattr(value, "tolist"):  # arrays come as array.array
+                    value = value.tolist()
+                values[name] = parameter.check(value, self._sizes, prefix)
         return values
 
     def _on_set(self, parameters):
         # Validates only: nothing is applied here, so that a refused set leaves no trace.
         try:
-            self._checked({p.name: p.value for p in parameters if p.name in self._declared})
+            self._checked({p.name: p.value for p in parameters})
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _on_applied(self, parameters):
-        changed = {p.name for p in parameters if p.name in self._declared}
+        changed = self._checked({p.name: p.value for p in parameters})
         if not changed:
             return
-        self._values = self._checked({p.name: p.value for p in parameters if p.name in changed})
+        self._values = {**self._values, **changed}
         if self._listener is not None:
-            self._listener(changed)
+            self._listener(set(changed))

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changed parameters of the controller node: applied, after a design where they need one, or set back."""
 
+from collections import deque
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from threading import Event
+from time import monotonic
 
 from rclpy.parameter import Parameter as RosParameter
 
@@ -9,9 +12,15 @@ from flexarm_dynamics.errors import FlexarmError
 
 from .controller_parameters import of_design, of_limits
 
+#: After a design the next one waits as long as it took, at most for this time [s].
+MAX_PAUSE = 0.2
+
 
 class Designs:
     """Applies changed parameters, or sets them back to the active ones.
+
+    Of changes that come faster than designs are made, as from a slider, the newest is designed; where it is refused,
+    the newest one before it that is not. Between two designs the processor is left to the control path for a while.
 
     Parameters
     ----------
@@ -23,7 +32,9 @@ class Designs:
 
     def __init__(self, node, core, designer):
         self._node, self._core, self._designer = node, core, designer
-        # Designs are made one at a time, in the order of the changes.
+        self._waiting = deque()  # values to design for, the newest last
+        self._closed = Event()
+        # Designs are made one at a time.
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
         values = node.parameters.values()
         self._limits, self._design = of_limits(values), of_design(values)
@@ -34,7 +45,8 @@ class Designs:
         if of_limits(dict.fromkeys(names)):
             self._take_limits()
         if of_design(dict.fromkeys(names)):
-            self._thread.submit(self._redesign, of_design(self._node.parameters.values()))
+            self._waiting.append(of_design(self._node.parameters.values()))
+            self._thread.submit(self._redesign)
 
     def _take_limits(self):
         limits = of_limits(self._node.parameters.values())
@@ -46,8 +58,20 @@ class Designs:
         else:
             self._limits = limits
 
-    def _redesign(self, values):
+    def _redesign(self):
         """In the design thread: the new control replaces the old one whole, or the parameters are set back."""
+        newest_first = [self._waiting.popleft() for _ in range(len(self._waiting))][::-1]
+        if not newest_first:  # designed for with a newer one
+            return
+        begun, newest = monotonic(), newest_first[0]
+        any(self._designed(values) for values in newest_first)
+        if self._design != newest and not self._designer.closed:
+            self._set_back(newest, self._design)
+        if self._waiting:
+            self._closed.wait(min(monotonic() - begun, MAX_PAUSE))
+
+    def _designed(self, values):
+        """Design for values and hand the control over; False when they are refused."""
         log = self._node.get_logger()
         try:
             law = self._designer.design(values)
@@ -56,14 +80,14 @@ class Designs:
             self._node.hand_over(self._core.replace_law, law)
             self._design = values
         except CancelledError:
-            return
+            pass
         except Exception as error:
             # A user's law may raise anything, and a thread drops what it raises.
-            if self._designer.closed:
-                return
-            kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
-            log.error(f"design refused, the old law goes on: {kind}{error}")
-            self._set_back(values, self._design)
+            if not self._designer.closed:
+                kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+                log.error(f"design refused, the old law goes on: {kind}{error}")
+                return False
+        return True
 
     def _set_back(self, values, active):
         """Set the parameters that differ from the active ones back to those."""
@@ -72,4 +96,5 @@ class Designs:
 
     def close(self):
         """Take no more changes; a design under way is not waited for."""
+        self._closed.set()
         self._thread.shutdown(wait=False, cancel_futures=True)
