@@ -5,6 +5,7 @@ In real time: nothing here depends on how fast that is, or on how late a process
 """
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from flexarm_tools.running.processes import arguments, executable
 TEMPLATE = Path(__file__).resolve().parents[1] / "examples" / "flexarm_driver_template"
 RATE = 200.0  # [Hz]
 TIMEOUT = 0.2  # [s] of the torque; generous, for a machine that is busy
+WATCHDOG = 0.4  # [s] of the fake device
 #: What a busy machine adds to ages and intervals is not the driver's fault.
 EASY = ["--duration", "1", "--rate-error", "0.3", "--jitter", "100", "--age", "5"]
 EASY += ["--torque-timeout", str(TIMEOUT), "--timeout", "30"]
@@ -28,7 +30,8 @@ def start_template(bench, port, *options, **parameters):
     path = f"{TEMPLATE}:{os.environ.get('PYTHONPATH', '')}"
     python = ["env", f"PYTHONPATH={path}", sys.executable, "-m"]
     fake = [*python, "flexarm_driver_template.fake_device", "--port", str(port)]
-    bench.processes.start("fake_device", [*fake, "--rate", str(RATE), *options])
+    fake += ["--rate", str(RATE), "--watchdog", str(WATCHDOG)]
+    bench.processes.start("fake_device", [*fake, *options])
     bench.wait_for("the fake device", port.exists)
     file = TEMPLATE / "config" / "driver.yaml"
     own = {"port": str(port), "torque_timeout": TIMEOUT, **parameters}
@@ -129,6 +132,71 @@ def test_two_controllers_in_turn_bring_the_safe_action_and_a_torque_is_clipped(l
     apply([1, 2], 1.0, lambda u: u == 0.0)
     line.wait_for("the warning", lambda: "several controllers" in line.log("driver"))
     apply([1], 0.5, lambda u: abs(u - 0.5) < 1e-6)
+
+
+def test_the_watchdog_bites_once_when_the_driver_is_silent(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(TEMPLATE)
+    from flexarm_driver_template import fake_device, protocol
+
+    device = fake_device.FakeDevice("R", RATE, watchdog=0.1)
+
+    def drive():
+        return protocol.frame(device.sample().strip(), 1, 2).drive
+
+    for _ in range(30):  # fed at each sample
+        device.receive(protocol.seal("T", 1000))
+        assert drive() == [1000]
+    applied = [drive() for _ in range(60)]
+    assert applied == 20 * [[1000]] + 40 * [[0]]  # 0.1 s, and then the safe action
+    assert device.watchdog.bites == 1 and capsys.readouterr().out.count("watchdog") == 1
+    assert abs(device.sim.velocity[0]) < 0.02  # [rad/s] braked
+    device.receive(protocol.seal("T", 1000))
+    assert drive() == [1000]
+    device.receive(protocol.seal("X"))
+    assert [drive() for _ in range(60)] == 60 * [[0]] and device.watchdog.bites == 1
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["SIGKILL", "SIGSTOP"])
+def test_when_the_driver_dies_in_motion_the_device_itself_takes_the_safe_action(
+    tmp_path, monkeypatch, number
+):
+    monkeypatch.syspath_prepend(TEMPLATE)
+    from flexarm_driver_template.device import Device
+
+    port, per_count = tmp_path / "arm", 2.0 * np.pi / 2**20  # [rad]
+    with Bench(tmp_path / "log") as bench:
+        start_template(bench, port)
+        bench.start("observer", {"arm": "R", "observer.type": "kalman"})
+        bench.start("controller", {"arm": "R", **PATIENT, "fast.alpha": 1.0})
+        arm = Arm(bench)
+        arm.wait_ready()
+        start = arm.measured.newest.joint_position[0]
+        arm.offer(trajectory(arm.joints, (2.0, [start + 1.5])))
+        bench.wait_for("the motion", lambda: arm.measured.newest.joint_position[0] > start + 0.4)
+        assert arm.measured.newest.joint_torque[0] != 0.0
+        before = bench.log("fake_device").count("watchdog")
+        driver = bench.processes.running["driver"]
+        bench.processes.expect_end("driver")
+        driver.send_signal(number)
+        # What the device does now, from its own frames, which no driver reads any more.
+        line, frames = Device(str(port), 1, 2), []
+        try:
+
+            def at_rest():
+                frames.extend(line.frames(wait=0.1))
+                last = frames[-50:]  # a quarter of a second
+                moved = np.ptp([f.encoder[0] for f in last]) * per_count if len(last) == 50 else 1.0
+                return moved < 0.01 and all(f.drive == [0] for f in last)
+
+            bench.wait_for("rest in the safe action", at_rest)
+        finally:
+            line.close()
+            if number == signal.SIGSTOP:
+                driver.send_signal(signal.SIGCONT)
+        assert bench.log("fake_device").count("watchdog") > before
+        went = (frames[-1].encoder[0] - frames[0].encoder[0]) * per_count
+        assert abs(went) < 0.6  # [rad] 0.4 s at the motion's 1.4 rad/s, and the brake
 
 
 @pytest.mark.real_time

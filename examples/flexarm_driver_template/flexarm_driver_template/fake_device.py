@@ -20,10 +20,49 @@ from . import protocol
 
 #: Scales of its electronics per count: a 20 bit encoder, a bridge of 1 nanostrain, a drive of 1 mN m.
 POSITION, STRAIN, TORQUE = 2.0 * np.pi / 2**20, 1e-9, 1e-3  # [rad], [-], [N m] per count
-#: Its own watchdog takes the safe action after this time without a torque [s].
-WATCHDOG = 0.5
+#: Its watchdog bites after this time without a torque [s]: twice the driver's own `torque_timeout`.
+WATCHDOG = 0.1
 #: Samples that it catches up with after the machine was busy; more are lost [-].
 MAX_BEHIND = 200
+
+
+class Watchdog:
+    """The device's own timer: it takes the safe action when the driver is silent, killed, stopped or cut off.
+
+    The driver's rules need a driver that runs. **Your device needs such a timer, too**: in the drives' firmware, or in a
+    circuit between this computer and the drives' enable input, which each torque line retriggers.
+
+    Parameters
+    ----------
+    timeout : float
+        Without a torque line for this long it bites [s].
+
+    Attributes
+    ----------
+    bites : int
+        How often it has.
+    """
+
+    def __init__(self, timeout):
+        self.timeout, self.bites = timeout, 0
+        self._fed = None  # by a torque line; None: none acts
+
+    def feed(self, now):
+        """Note a torque line at a time of the device's clock [s]."""
+        self._fed = now
+
+    def rest(self):
+        """Note the command to take the safe action: nothing to watch over."""
+        self._fed = None
+
+    def bite(self, now):
+        """Whether the torque ends now, once for each silence."""
+        bites = self._fed is not None and now - self._fed > self.timeout
+        if bites:
+            self._fed = None
+            self.bites += 1
+            print(f"watchdog: no torque for {self.timeout:g} s: safe action", flush=True)
+        return bites
 
 
 class FakeDevice:
@@ -37,30 +76,35 @@ class FakeDevice:
         Samples per second [Hz].
     ignore_torque : bool
         Simulate a drive without power: torques have no effect.
+    watchdog : float
+        See `Watchdog` [s].
     """
 
-    def __init__(self, arm, rate, ignore_torque=False):
+    def __init__(self, arm, rate, ignore_torque=False, watchdog=WATCHDOG):
         settings = check_all(simulator.PARAMETERS, {"arm": arm, "rate": rate})
         n = len(simulator.arm_file.load(arm).joints)
         settings["initial_position"] = n * [0.0]
         self.sim = simulator.Simulator(settings)
         self.period = 1e-9 * self.sim.period_ns
         self.ignore_torque = ignore_torque
-        self._torque, self._commanded, self._lines = None, 0, protocol.Lines()
+        self.watchdog = Watchdog(watchdog)
+        self._torque, self._lines = None, protocol.Lines()
 
     def receive(self, data):
         """Process received bytes."""
         for line in self._lines.feed(data):
             word, numbers = protocol.unseal(line) or ("", [])
             if word == "T" and len(numbers) == self.sim.torque.size:
-                self._torque, self._commanded = TORQUE * np.array(numbers), self.sim.sequence
+                self._torque = TORQUE * np.array(numbers)
+                self.watchdog.feed(self.sim.time)
             elif word == "X":
                 self._torque = None
+                self.watchdog.rest()
 
     def sample(self):
         """Advance by one period; the line of the next sample."""
         sim = self.sim
-        if (sim.sequence - self._commanded) * self.period > WATCHDOG:
+        if self.watchdog.bite(sim.time):
             self._torque = None
         sim.advance(None if self.ignore_torque else self._torque)
         return protocol.seal(
@@ -97,12 +141,15 @@ def main(args=None):
     parser.add_argument(
         "--ignore-torque", action="store_true", help="simulate a drive without power"
     )
+    parser.add_argument(
+        "--watchdog", type=float, default=WATCHDOG, help="bites after so long without a torque [s]"
+    )
     options = parser.parse_args(args)
     stopped = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.append(True))
     try:
-        device = FakeDevice(options.arm, options.rate, options.ignore_torque)
+        device = FakeDevice(options.arm, options.rate, options.ignore_torque, options.watchdog)
     except FlexarmError as error:
         print(f"fake_device: {error}", file=sys.stderr)
         sys.exit(1)
