@@ -253,13 +253,13 @@ class Arm:
         self.bench.wait_for(f"the loop to stand at sample {sequence}", stands)
         return self.now
 
-    def reset(self, recover=False):
-        """Reset the simulator and wait until the controller answers in the new session, out of a fault if asked to."""
+    def reset(self):
+        """Reset the simulator and recover, if need be, until the controller answers in the new session; its number."""
         answer = self.bench.call(Trigger, f"{self.namespace}simulator/reset")
         assert answer.success, answer.message
         session = int(answer.message.split()[-1])
-        if recover:
-            self.recover()
+        self.bench.wait_for("the new session", lambda: self.state.session == session)
+        self.recover()
         self.wait_standing(session=session)
         return session
 

@@ -156,7 +156,7 @@ def check_row(arm, name):
     """Check one row, and return its line of the table."""
     row = ROWS[name]
     inject(arm)
-    session = arm.reset(recover=True)
+    session = arm.reset()
     arm.offer(trajectory(J, (0.4, [0.1], [0.0], [0.0])))
     inject(arm, begins(row))
     arm.pause(False)
@@ -185,7 +185,7 @@ def check_row(arm, name):
         assert {m.mode for m in torques} == {JointTorque.ENABLED}
     inject(arm)
     assert arm.recover() == (row.end == FAULT)
-    arm.reset(recover=True)
+    arm.reset()
     check_move(arm, 0.03, 0.3)
     reaction = "-" if since is None else f"{since} ms"
     does = "goes on" if since is None else "hard stop, `FAULT`"
@@ -220,7 +220,7 @@ def test_the_table_of_the_document_is_what_was_measured(measured):
 def moving(arm):
     """The arm in the middle of a long move, without faults."""
     inject(arm)
-    arm.reset(recover=True)
+    arm.reset()
     arm.offer(trajectory(J, (2.0, [0.5], [0.0], [0.0])))
     arm.run(0.6)
     assert arm.state.supervisor_state == CompositeState.TRACKING

@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_control import trajectory
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import design
-from flexarm_control.loop.arm_controller import PARAMETERS, ArmController
+from flexarm_control.loop.arm_controller import MAX_REPEATS, PARAMETERS, ArmController
+from flexarm_control.loop.authority import Authority
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.arm.units import POUND_FORCE_FOOT
@@ -40,8 +41,12 @@ def sample(k=0, position=0.0, session=1, n=1, **fields):
     return s
 
 
+#: Torque at once and at any rate: what the law gives is what is sent.
+AT_ONCE = {"return_time": 0.0, "torque_rate_limit": [1e9]}
+
+
 def controller(model, law=None, **settings):
-    law = law or design(model, SLOW, FAST)
+    law, settings = law or design(model, SLOW, FAST), {**AT_ONCE, **settings}
     checked = check_all(PARAMETERS, settings, {"joints": model.n_joints, "modes": model.n_modes})
     return ArmController(model, law, checked)
 
@@ -165,17 +170,46 @@ def test_a_repeat_changes_no_rate_limited_torque(arm_r):
         assert_allclose(core.torque, [0.1 * k], rtol=1e-12)
 
 
-def test_a_new_session_starts_at_the_measured_position_with_no_trajectory(arm_r):
+def test_a_new_session_before_any_torque_starts_at_the_measured_position(arm_r):
     core = controller(arm_r)
-    core.step(sample(50))
+    core.step(sample(50, rate=None))
     core.offer(motion())
-    feed(core, range(51, 60))
-    assert core.state == State.TRACKING
     # earlier stamps and numbers: the simulator was reset
     for k in range(40):
         assert core.step(sample(k, 0.02, session=2)) is True
         assert core.state == State.READY
         assert_array_equal(core.reference.position, [0.02])
+
+
+def test_a_new_session_of_an_arm_that_rests_where_it_did_goes_on_in_a_ramp(arm_r):
+    core = controller(arm_r, Scripted(*[2.0] * 19), return_time=0.1)
+    feed(core, range(50, 60))
+    assert core.step(sample(0, 0.002, session=2)) is True
+    assert (core.state, core.reason) == (State.READY, "")
+    assert_array_equal(core.torque, [0.0])
+    core.step(sample(50, 0.002, session=2))
+    assert_allclose(core.torque, [0.5], rtol=1e-12)
+
+
+RESTARTS = {
+    "has restarted during a motion": (True, {}),
+    "has restarted, and joint1 is at 0.5 rad, before at 0": (False, {"position": 0.5}),
+    "has restarted while joint1 moves (0.3 rad/s)": (False, {"velocity": [0.3]}),
+}
+
+
+@pytest.mark.parametrize("reason", RESTARTS)
+def test_a_new_session_in_motion_or_elsewhere_is_a_latched_fault(arm_r, reason):
+    moving, fields = RESTARTS[reason]
+    core = started(arm_r)
+    if moving:
+        core.offer(motion(duration=0.5))
+    feed(core, range(1, 10))
+    assert core.step(sample(0, session=2, **fields)) is False
+    assert core.state == State.FAULT and reason in core.reason
+    assert not any(core.step(sample(k, session=2)) for k in range(1, 9))
+    assert core.recover()
+    assert core.step(sample(9, session=2)) is True
 
 
 def test_a_sample_that_comes_after_a_later_one_needs_no_answer_and_changes_nothing(arm_r):
@@ -195,9 +229,9 @@ def test_a_sample_that_comes_after_a_later_one_needs_no_answer_and_changes_nothi
 def test_a_source_that_counts_anew_in_its_session_is_followed_after_a_while(arm_r):
     core = controller(arm_r)
     core.step(sample(5000))
-    late = [core.step(sample(k, 0.3, stamp_ns=stamp(6000 + k))) for k in range(300)]
+    late = [core.step(sample(k, 0.003, stamp_ns=stamp(6000 + k))) for k in range(300)]
     assert late[:199] == [None] * 199 and late[199:] == [True] * 101
-    assert_array_equal(core.reference.position, [0.3])
+    assert_array_equal(core.reference.position, [0.003])
 
 
 @pytest.mark.parametrize("back", [sample(7, stamp_ns=stamp(5)), sample(8, stamp_ns=stamp(1))])
@@ -226,17 +260,30 @@ def test_a_stamp_that_jumps_ahead_is_a_fault_a_short_gap_is_bridged(arm_r):
     )
 
 
-def test_two_sources_are_a_fault(arm_r):
+@pytest.mark.parametrize("torque", [True, False])
+def test_two_sources_are_a_fault_with_torque_or_without(arm_r, torque):
     core = controller(arm_r)
-    core.step(sample(0, session=1))
-    assert core.step(sample(0, session=2)) is True  # a restart
-    assert core.step(sample(1, session=1)) is False
+    fields = {} if torque else {"rate": None}
+    for k in range(3):
+        core.step(sample(k, session=1, **fields))
+        core.step(sample(k, session=2, **fields))
     assert core.state == State.FAULT
     assert "two sources send states (sessions 2 and 1)" in core.reason
     # The one that stays may be either.
     core.recover()
-    verdicts = [core.step(sample(k, session=1)) for k in range(2, 250)]
-    assert not any(verdicts[:190]) and all(verdicts[200:])
+    verdicts = [core.step(sample(k, session=1)) for k in range(3, 250)]
+    assert not any(verdicts)
+    core.recover()
+    assert core.step(sample(250, session=1)) is True
+
+
+def test_one_late_message_of_a_source_that_ended_before_the_first_torque_is_none(arm_r):
+    core = controller(arm_r)
+    core.step(sample(0, session=1, rate=None))
+    core.step(sample(0, session=2, rate=None))
+    assert core.step(sample(1, session=1)) is False
+    assert core.state == State.INACTIVE
+    assert core.step(sample(1, session=2)) is True
 
 
 def test_with_synchronised_clocks_an_old_state_or_one_of_the_future_is_a_fault(arm_r):
@@ -308,18 +355,166 @@ def test_a_state_to_stop_with_ends_the_motion_smoothly_with_the_sources_reason(a
     assert (core.state, core.reason) == (State.STOPPING, "strain of root: lost")
 
 
-def test_when_the_states_stop_the_last_sample_sent_again_makes_it_ready_once_recovered(arm_r):
+def test_when_the_states_stop_only_a_new_one_or_a_stopped_clock_makes_it_ready_once_recovered(
+    arm_r,
+):
+    for clock_stopped in (False, True):
+        core = started(arm_r)
+        core.step(sample(1, 0.002))
+        core.distrust("no arm_state_estimate for 0.5 s")
+        assert (core.enabled, core.reason) == (False, "no arm_state_estimate for 0.5 s")
+        assert core.state == State.FAULT
+        assert_array_equal(core.torque, [0.0])
+        assert core.step(sample(1, 0.002)) is False
+        core.recover()
+        assert core.step(sample(1, 0.002, clock_stopped=clock_stopped)) is clock_stopped
+        assert core.step(sample(2, 0.002)) is True
+        assert core.state == State.READY
+        assert_array_equal(core.reference.position, [0.002])
+
+
+def test_a_state_that_is_repeated_for_ever_is_a_fault_and_no_sign_of_life(arm_r):
     core = started(arm_r)
-    core.step(sample(1, 0.2))
-    core.distrust("no arm_state_estimate for 0.5 s")
-    assert (core.enabled, core.reason) == (False, "no arm_state_estimate for 0.5 s")
+    core.step(sample(1))
+    assert core.alive
+    answers = [(core.step(sample(1)), core.alive) for _ in range(MAX_REPEATS)]
+    assert answers == [(True, False)] * MAX_REPEATS
+    assert core.step(sample(1)) is False
     assert core.state == State.FAULT
+    assert core.reason.startswith("state 1 was sent again 11 times: the source repeats it")
+
+
+def test_a_simulator_whose_clock_stands_still_is_alive_as_long_as_it_likes(arm_r):
+    core = started(arm_r)
+    core.offer(motion())
+    core.step(sample(1))
+    before = answer(core)
+    for _ in range(10 * MAX_REPEATS):
+        assert core.step(sample(1, clock_stopped=True)) is True and core.alive
+    assert answer(core) == before
+    assert core.step(sample(2)) is True and core.state == State.TRACKING
+
+
+# --------------------------------------------------------------------------- torque that returns
+
+
+def test_torque_returns_in_a_ramp_and_less_than_a_tenth_of_it_within_20_ms(arm_r):
+    core = controller(arm_r, Scripted(*[10.0] * 200), return_time=0.065, torque_rate_limit=[1e9])
+    torques = []
+    for k in range(100):
+        core.step(sample(k))
+        torques.append(core.torque[0])
+    limit = core.torque_limit[0]
+    assert torques[0] == 0.0 and torques[20] <= 0.1 * limit
+    assert (np.diff(torques[:66]) > 0.0).all() and torques[66:] == [10.0] * 34
+    assert not core.saturated
+
+
+def test_an_arm_under_gravity_is_held_from_the_first_sample_on(long_reach):
+    sizes = {"joints": 4, "modes": long_reach.n_modes}
+    authority = Authority(long_reach, check_all(PARAMETERS, {}, sizes))
+    q = np.array([0.0, 1.2, 0.8, -0.8])
+    authority.begin(q)
+    a, B = slow_subsystem(long_reach.terms(q, np.zeros(4)))
+    assert_allclose(a + B @ authority.torque, np.zeros(4), atol=1e-9)
+    assert np.abs(authority.torque).max() > 50.0
+
+
+def test_the_budget_of_the_torques_change_is_the_files_or_from_limit_and_lowest_frequency(arm_r):
+    def rate(model, **settings):
+        sizes = {"joints": 1, "modes": 2}
+        return Authority(model, check_all(PARAMETERS, settings, sizes)).rate
+
+    omega = arm_r.frequencies(np.zeros(1), locked=True)[0]
+    assert_allclose(rate(arm_r), [8.0 * omega * FILE_LIMIT], rtol=1e-12)
+    joint = arm_r.arm.joints[0]
+    stated = replace(joint, limits=replace(joint.limits, torque_rate=20.0))
+    assert_array_equal(rate(build(replace(arm_r.arm, joints=(stated,)))), [20.0])
+    assert_array_equal(rate(arm_r, torque_rate_limit=[3.0]), [3.0])
+    assert_array_equal(rate(arm_r, torque_rate_limit=[1e9]), [np.inf])
+
+
+def test_a_gap_beyond_resume_gap_gives_the_motion_up_and_torque_returns_in_a_ramp(arm_r):
+    core = started(arm_r, return_time=0.065)
+    feed(core, range(1, 100))
+    core.offer(motion(duration=1.0))
+    feed(core, range(100, 200))
+    assert core.step(sample(249)) is True  # 50 ms: none
+    assert core.state == State.TRACKING and core.interruptions == 0
+    assert core.step(sample(300)) is True
+    assert core.reason == (
+        "no state for 0.051 s: torque returns in a ramp, the motion was given up: send it again"
+    )
+    assert (core.interruptions, core.state) == (1, State.READY)
     assert_array_equal(core.torque, [0.0])
-    assert core.step(sample(1, 0.2)) is False
-    core.recover()
-    assert core.step(sample(1, 0.2)) is True
-    assert core.state == State.READY
-    assert_array_equal(core.reference.position, [0.2])
+    assert not core.reference.active
+
+
+def test_at_a_low_rate_a_period_is_no_gap(arm_r):
+    core = started(arm_r)
+    for k in range(1, 10):
+        assert core.step(sample(k, stamp_ns=stamp(100 * k))) is True
+    assert core.interruptions == 1  # the first: no period was known
+
+
+# --------------------------------------------------------------------------- what the driver applies
+
+
+def applying(core, numbers, torque=None, controller_id=0):
+    """Answers, where the driver reports the torque of the answer before, or another one."""
+    found = []
+    for k in numbers:
+        reported = core.torque.copy() if torque is None else [torque]
+        found.append(core.step(sample(k, torque=reported, controller_id=controller_id)))
+    return found
+
+
+def test_a_driver_that_reports_another_torque_for_50_ms_is_a_fault(arm_r):
+    core = started(arm_r, Scripted(*[5.0] * 300))
+    assert all(applying(core, range(1, 100)))
+    assert all(applying(core, range(100, 149), 0.0))
+    assert not any(applying(core, range(151, 160), 0.0))
+    assert core.state == State.FAULT
+    assert core.reason.startswith("the driver reports 0 N m at joint1, sent were 5: it does not")
+
+
+def test_a_late_torque_is_the_one_that_was_sent(arm_r):
+    random = np.random.default_rng(1)
+    core = started(arm_r, Scripted(*random.uniform(-10.0, 10.0, 400)))
+    sent = [0.0]
+    for k in range(1, 300):
+        assert core.step(sample(k, torque=[sent[max(0, len(sent) - 30)]]))
+        sent.append(core.torque[0])
+
+
+def test_the_comparison_can_be_switched_off(arm_r):
+    core = started(arm_r, Scripted(*[5.0] * 300), torque_mismatch=0.0)
+    assert all(applying(core, range(1, 200), 0.0))
+
+
+def test_a_driver_that_confirms_no_longer_or_another_controller_is_a_fault(arm_r):
+    for later, text in ((0, "applies no torque of this"), (8, "torque of another controller (8)")):
+        core = started(arm_r)
+        core.controller_id = 7
+        assert all(applying(core, range(1, 50), controller_id=0))
+        assert all(applying(core, range(50, 100), controller_id=7))
+        assert all(applying(core, range(100, 149), controller_id=later))
+        assert not any(applying(core, range(151, 155), controller_id=later))
+        assert core.state == State.FAULT and text in core.reason
+
+
+def test_a_driver_that_never_confirms_is_not_asked(arm_r):
+    core = started(arm_r)
+    core.controller_id = 7
+    assert all(applying(core, range(1, 600), controller_id=0))
+
+
+def test_while_a_sensor_is_in_doubt_no_motion_is_accepted(arm_r):
+    core = started(arm_r)
+    core.step(sample(1, trust=ArmSample.STOP, doubt="strain of root: lost"))
+    assert core.offer(motion()).reason == "a sensor is in doubt: strain of root: lost"
+    core.step(sample(2))
+    assert core.offer(motion()).accepted
 
 
 # --------------------------------------------------------------------------- failing laws
@@ -482,11 +677,11 @@ def test_an_identical_trajectory_sent_again_is_no_refusal_and_no_restart(arm_r):
     core = started(arm_r)
     assert core.offer(motion(duration=0.5)).accepted
     core.step(sample(1))
-    core.step(sample(100))
+    core.step(sample(40))
     before = core.reference.position.copy()
     verdict = core.offer(motion(duration=0.5))
     assert (verdict.accepted, verdict.repeat, core.reason) == (False, True, "")
-    core.step(sample(101))
+    core.step(sample(41))
     assert core.reference.position > before
     assert core.trajectory_id == 1
 

@@ -100,6 +100,7 @@ class StateReader:
         sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
         sample.controller_id, sample.doubt = msg.controller_id, msg.doubt
+        sample.clock_stopped = msg.clock_stopped
         if msg.trust > ArmState.DISTRUSTED:
             limit = "TRUSTED (0), STOP (1) or DISTRUSTED (2)"
             raise MessageError("is no degree of trust", field="trust", value=msg.trust, limit=limit)

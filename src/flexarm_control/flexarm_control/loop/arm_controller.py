@@ -6,22 +6,32 @@ import numpy as np
 from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.parameters import parameter
 
-from ..arrays import clip
 from ..trajectory import ReferenceGenerator, Verdict, validate
-from . import supervisor
+from . import applied, authority, supervisor
+from .applied import Applied
+from .authority import Authority
 from .samples import ArmSample, SampleOrder
 from .supervisor import State, Supervisor
 
 #: Time in which the fast control comes back, or goes, when it is switched [s].
 FAST_RAMP = 0.1
 
+#: A source that restarts during operation must find each joint within this of where it was [rad], and at rest [rad/s].
+SAME_PLACE, AT_REST = 0.01, 0.05
+#: So many periods without a state are no interruption, however long.
+PERIODS_OF_GAP = 5.0
+#: A doubt that its source does not explain.
+UNSTATED = "the source asks for a stop"
+#: More repeats of one state than this are a fault: they are no sign of life.
+MAX_REPEATS = 10
+
 #: Parameters of the controller that belong to no single law.
 PARAMETERS = (
-    parameter("torque_limit", [0.0], "N m", 0.0, 1e6, length="joints").described(
-        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's."
-    ),
-    parameter("torque_rate_limit", [0.0], "N m/s", 0.0, 1e9, length="joints").described(
-        "Largest change of torque per second, against the last torque sent; 0.0: none."
+    *authority.PARAMETERS,
+    *applied.PARAMETERS,
+    parameter("resume_gap", 0.05, "s", 1e-3, 1e4).described(
+        "After a longer time without a state the motion is given up, and torque returns in a ramp; set it to the"
+        " driver's torque_timeout. A gap of up to five periods is none."
     ),
     *supervisor.PARAMETERS,
 )
@@ -58,8 +68,12 @@ class ArmController:
         Whether the fast control takes part, see `enable_fast`.
     saturated : bool
         A limit was met at this sample.
-    late, missed : int
-        Samples that came after a later one, and were left out; and that never came.
+    late, missed, interruptions : int
+        Samples that came after a later one, and were left out; that never came; gaps in which torque was lost.
+    alive : bool
+        Whether the last sample was a sign of life of the source: a new one, or its clock stands still.
+    controller_id : int
+        Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
     """
 
     def __init__(self, model, law, settings, start_tolerance=0.01):
@@ -68,18 +82,27 @@ class ArmController:
         fastest = model.arm.velocity_limits
         self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
         self._start_tolerance = start_tolerance
-        self.torque = np.zeros(n)
         self._nothing = np.zeros(0)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
         self.enabled, self.saturated, self.fast_enabled = False, False, True
         self._trajectory_reason = ""
         self._waiting = False  # joints known, deflections not yet
-        self.late = self.missed = 0
-        self._order = SampleOrder()
-        self._last_ns = 0
-        limit = self._torque_limit(settings)
-        self.supervisor = Supervisor(model, settings, limit)
-        self._take_limits(settings, limit)
+        self.late = self.missed = self.controller_id = 0
+        self._order, self._repeats = SampleOrder(), 0
+        self._last_ns, self._period, self._count = (
+            0,
+            0.0,
+            1,
+        )  # [ns], [s], and states since the last one
+        self._doubt = ""  # of the last sample
+        self._foreign = self.interruptions = 0
+        self._position = np.zeros(n)  # at the last sample
+        self.alive = True
+        self._authority = Authority(model, settings)
+        self.torque = self._authority.torque
+        self.supervisor = Supervisor(model, settings, self.torque_limit)
+        self._applied = Applied(model, settings, self.torque_limit)
+        self._take_limits(settings)
 
     def replace_law(self, law):
         """Go on with another control, from the states of the present one; call between two samples."""
@@ -94,20 +117,13 @@ class ArmController:
         ParameterError
             Nothing has changed then.
         """
-        limit = self._torque_limit(settings)
-        self.supervisor.configure(settings, limit)
-        self._take_limits(settings, limit)
+        self.supervisor.configure(settings, self._authority.limits_of(settings))
+        self._authority.configure(settings)
+        self._take_limits(settings)
 
-    def _torque_limit(self, settings):
-        from_file = self.model.arm.torque_limits
-        wanted = np.array(settings["torque_limit"])
-        return np.where(wanted > 0.0, np.minimum(wanted, from_file), from_file)
-
-    def _take_limits(self, settings, limit):
-        rate = np.array(settings["torque_rate_limit"])
-        rate = np.where(rate > 0.0, rate, np.inf)
-        self._limit, self._least, self._rate_limit = limit, -limit, rate
-        self._rate_limited = bool(np.isfinite(rate).any())
+    def _take_limits(self, settings):
+        self._applied.configure(settings, self.torque_limit)
+        self._resume_gap = settings["resume_gap"]
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
 
@@ -119,7 +135,7 @@ class ArmController:
     @property
     def torque_limit(self):
         """Active limit, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
-        return self._limit
+        return self._authority.limit
 
     @property
     def trajectory_id(self):
@@ -188,6 +204,8 @@ class ArmController:
             verdict = Verdict(False, f"in fault, call ~/recover first: {self.supervisor.reason}", 0)
         elif not (self.enabled or self._waiting):
             verdict = Verdict(False, f"no valid state: {self.supervisor.reason or 'none yet'}", 0)
+        elif self._doubt:
+            verdict = Verdict(False, f"a sensor is in doubt: {self._doubt}", 0)
         else:
             verdict = self.reference.offer(trajectory)
         if verdict.accepted:
@@ -224,25 +242,34 @@ class ArmController:
         if verdict == SampleOrder.STALE:
             self.late += 1
             return None
-        if verdict == SampleOrder.REPEAT and (self.enabled or self._waiting):
+        self.alive = verdict != SampleOrder.REPEAT or sample.clock_stopped
+        if verdict == SampleOrder.REPEAT and not self._may_go_on(sample):
             return self.enabled
         if self.state == State.FAULT:
             return False
         if sample.trust == ArmSample.DISTRUSTED:
             self.distrust(sample.doubt or "the source distrusts this state")
             return False
-        if verdict == SampleOrder.REPEAT and sample.stamp_ns != self._order.stamp_ns:
-            self.distrust(f"state {sample.sequence} came again with another stamp")
+        if verdict == SampleOrder.RESTART and self.enabled and (why := self._restarted(sample)):
+            self.fail(why)
             return False
+        self._doubt = sample.doubt or UNSTATED if sample.trust == ArmSample.STOP else ""
         law = self.answered_by = self.law
-        law.limit = self._limit
+        law.limit = self.torque_limit
         if sample.amplitude is None or (sample.rate is None and law.needs_rates):
             self._wait(sample, verdict)
             return False
+        dt = 1e-9 * (sample.stamp_ns - self._last_ns)
         if verdict == SampleOrder.RESTART or not self.supervisor.running:
             self._begin(sample, verdict)
-            law.reset()
-        return self._control(sample, 1e-9 * (sample.stamp_ns - self._last_ns))  # 0 for the first
+            dt = 0.0
+        elif dt > self._resume_gap and dt > PERIODS_OF_GAP * self._period:
+            self._period = dt / self._count
+            self._interrupted(sample, dt)
+            dt = 0.0
+        else:
+            self._period = dt / self._count
+        return self._control(sample, dt)
 
     def _control(self, sample, dt):
         """The torque for a sample that can be trusted; whether it may be applied."""
@@ -261,17 +288,20 @@ class ArmController:
             i = int(np.argmin(np.isfinite(u)))
             self.fail(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
             return False
-        self._limited(u, dt)
+        self.saturated = self._authority.send(u, dt)
         self._last_ns = sample.stamp_ns
         error = None if law.free else self.position_error
         verdict, why = supervisor.watch(q, qd, sample.amplitude, error, self.saturated, dt)
-        if verdict == State.FAULT:
-            self.fail(why)
+        refused = self._applied.judge(sample, self.controller_id, dt)
+        if verdict == State.FAULT or refused:
+            self.fail(refused or why)
             return False
+        self._applied.note(self.torque)
+        self._position[:] = q
         self.enabled = True
         supervisor.follow(reference)
-        if verdict is None and sample.trust == ArmSample.STOP:
-            verdict, why = State.STOPPING, sample.doubt or "the source asks for a stop"
+        if verdict is None and self._doubt:
+            verdict, why = State.STOPPING, self._doubt
         if verdict == State.STOPPING and (reference.active or reference.pending):
             self.brake(why)  # from the next sample on
         return self.enabled
@@ -316,6 +346,7 @@ class ArmController:
 
     def recover(self):
         """Leave a fault: torque again with the next valid state, from where the arm is then; whether there was one."""
+        self._foreign = self._repeats = 0
         return self.supervisor.recover()
 
     def enable_fast(self, enabled):
@@ -339,7 +370,7 @@ class ArmController:
 
     def _off(self):
         self.enabled = self.saturated = self._waiting = False
-        self.torque[:] = 0.0
+        self._authority.off()
 
     # Samples -------------------------------------------------------------------------------------
 
@@ -350,6 +381,9 @@ class ArmController:
         if verdict == SampleOrder.STALE:
             return verdict
         if verdict == SampleOrder.FOREIGN:
+            self._foreign += 1
+            if self._foreign > 1:  # a single late message of a source that has ended is none
+                self.supervisor.fail(str(order.two_sources(sample)))
             raise order.two_sources(sample)
         since_ns = sample.stamp_ns - order.stamp_ns
         missed = max(sample.sequence - order.sequence - 1, 0)
@@ -362,6 +396,7 @@ class ArmController:
         if now_ns is not None and self._max_age is not None:
             self._check_age(sample, now_ns)
         if verdict == SampleOrder.NEW:
+            self._repeats, self._count = 0, missed + 1
             self.missed += missed
             if since_ns > self._max_gap and self.enabled:
                 problem = (
@@ -402,12 +437,58 @@ class ArmController:
         if keeps and (given_up := self._left_behind(sample)):
             self._trajectory_reason = given_up
             keeps = False
+        self._return(sample, keeps)
+
+    def _return(self, sample, keeps=False):
+        """Torque returns in a ramp; the reference begins where the arm is, and brakes it where it moves."""
         if not keeps:
             self.reference.start(sample.position, sample.stamp_ns)
-        self._waiting = False
+        self._waiting, self._repeats = False, 0
         self.supervisor.begin()
-        self.torque[:] = 0.0
-        self._last_ns = sample.stamp_ns
+        self._authority.begin(sample.position)
+        self._applied.begin(self.torque)
+        self.law.reset()
+
+    def _interrupted(self, sample, gap):
+        """States were missing for `gap` [s], in which the driver took its safe action."""
+        moved = self.reference.active or self.reference.pending
+        self.interruptions += 1
+        self._trajectory_reason = f"no state for {gap:.3g} s: torque returns in a ramp" + (
+            ", the motion was given up: send it again" if moved else ""
+        )
+        self._return(sample)
+
+    def _restarted(self, sample):
+        """Why a new session of the source is a fault; empty for an arm that rests where it did."""
+        reference, names = self.reference, self.model.joint_names
+        if reference.active or reference.pending or reference.stopping:
+            return "the source of the states has restarted during a motion: is its zero the same?"
+        moved, speed = np.abs(sample.position - self._position), np.abs(sample.velocity)
+        if moved.max() > SAME_PLACE:
+            i = int(np.argmax(moved))
+            return (
+                f"the source of the states has restarted, and {names[i]} is at {sample.position[i]:.4g} rad,"
+                f" before at {self._position[i]:.4g}: is its zero the same?"
+            )
+        if speed.max() > AT_REST:
+            i = int(np.argmax(speed))
+            return f"the source of the states has restarted while {names[i]} moves ({speed[i]:.3g} rad/s)"
+        return ""
+
+    def _may_go_on(self, sample):
+        """Whether a repeated state may give torque anew; it is a fault if it is repeated too often, or changed."""
+        if not (self.enabled or self._waiting):
+            if sample.stamp_ns != self._order.stamp_ns:
+                self.distrust(f"state {sample.sequence} came again with another stamp")
+                return False
+            return sample.clock_stopped
+        self._repeats = 0 if sample.clock_stopped else self._repeats + 1
+        if self._repeats > MAX_REPEATS:
+            self.distrust(
+                f"state {sample.sequence} was sent again {self._repeats} times: the source repeats it, and measures"
+                " nothing new"
+            )
+        return False
 
     def _left_behind(self, sample):
         """Why what was offered while waiting can't be followed from here; empty if it can."""
@@ -418,18 +499,6 @@ class ArmController:
             name = self.model.joint_names[int(np.argmax(moved))]
             return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
         return ""
-
-    def _limited(self, u, dt):
-        """Torque within its size and rate, into `torque`."""
-        ranges = [(self._least, self._limit)]  # the last: the size holds whatever comes before
-        if self._rate_limited:
-            step = np.full_like(u, np.inf)  # not inf * dt, which is NaN at a start, where dt is 0
-            np.multiply(self._rate_limit, dt, out=step, where=np.isfinite(self._rate_limit))
-            ranges.insert(0, (self.torque - step, self.torque + step))
-        np.copyto(self.torque, u)
-        for low, high in ranges:
-            clip(self.torque, low, high)
-        self.saturated = bool((self.torque != u).any())
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):

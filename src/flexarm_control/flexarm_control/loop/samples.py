@@ -31,6 +31,8 @@ class ArmSample:
         `TRUSTED`; `STOP`: to bring the arm to rest with; `DISTRUSTED`: not to be used.
     doubt : str
         Which sensor is in doubt, and why; empty if none is.
+    clock_stopped : bool
+        The source's clock stands still until it is answered or goes on: it sends the same sample again.
     """
 
     #: As in ArmState.
@@ -38,6 +40,7 @@ class ArmSample:
 
     __slots__ = (
         "amplitude",
+        "clock_stopped",
         "controller_id",
         "doubt",
         "position",
@@ -61,6 +64,7 @@ class ArmSample:
         self.rate = None
         self.velocity_known = True
         self.controller_id, self.trust, self.doubt = 0, self.TRUSTED, ""
+        self.clock_stopped = False
 
     @property
     def key(self):

@@ -59,6 +59,7 @@ class ControllerNode(ArmNode):
         self._reader = StateReader(arm)
         self._sample = ArmSample(len(arm.joints), len(arm.modes))
         self._torque = TorqueWriter(arm)
+        self.core.controller_id = self._torque.message.controller_id
         self._state = CompositeStateWriter(self.model)
         self._synchronised = parameters["synchronised_clocks"]
         self._ticks, self._seen = 0, False
@@ -108,7 +109,8 @@ class ControllerNode(ArmNode):
             enabled = False
         if enabled is None:
             return
-        self._ticks, self._seen = 0, True
+        if core.alive:
+            self._ticks, self._seen = 0, True
         self._torque_pub.publish(self._torque.answer(sample, enabled, core.torque))
         took = perf_counter() - started
         if self._state_pub.get_subscription_count():

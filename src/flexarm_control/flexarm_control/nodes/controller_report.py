@@ -21,13 +21,16 @@ class Report:
         self._node, self._core = node, core
         self._latency, self._logged = Latency(), core.state
         self._samples = self._samples_before = 0
-        self._saturated = self._saturated_before = 0
+        self._saturated = self._saturated_before = self._interruptions = 0
 
     def answered(self, took):
         """Count a sample; `took` is the time from its message to its torque [s]."""
         self._latency.add(took)
         self._samples += 1
         self._saturated += self._core.saturated
+        if self._core.interruptions != self._interruptions:
+            self._interruptions = self._core.interruptions
+            self._node.get_logger().warning(self._core.reason)
         if self._core.state != self._logged:
             self.log_state()
 
@@ -59,6 +62,7 @@ class Report:
             **self._latency.values(),
             "states lost": core.missed,
             "states too late": core.late,
+            "interruptions": core.interruptions,
             "stops": core.supervisor.stops,
             "faults": core.supervisor.faults,
             "fast control": "on" if core.fast_enabled else "off",

@@ -81,6 +81,7 @@ class ObserverNode(ArmNode):
             return
         writer.head(sample.stamp_ns, sample.session, sample.sequence, sample.controller_id)
         writer.trust(sample.trust, sample.doubt)
+        writer.message.clock_stopped = sample.clock_stopped
         writer.write("joint_position", core.position)
         writer.write("joint_velocity", core.velocity)
         writer.write("joint_torque", sample.torque)

@@ -250,6 +250,7 @@ def _limits(joint):
         position=s.vector("position", 2, "angle", (-np.inf, np.inf)),
         velocity=s.number("velocity", "none", np.inf, positive=True),
         torque=s.number("torque", "torque", np.inf, positive=True),
+        torque_rate=s.number("torque_rate", "torque", np.inf, positive=True),
     )
     s.done()
     if not out.position[0] < out.position[1]:

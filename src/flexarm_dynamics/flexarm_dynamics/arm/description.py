@@ -35,6 +35,9 @@ class Limits:
     position: tuple = (-np.inf, np.inf)  # [rad] low, high
     velocity: float = np.inf  # [rad/s]
     torque: float = np.inf  # [N m]
+    torque_rate: float = (
+        np.inf
+    )  # [N m/s]; infinite: a budget from torque limit and lowest frequency
 
 
 @dataclass(frozen=True)
@@ -207,6 +210,11 @@ class Arm:
     def torque_limits(self):
         """Largest torque of each joint, (n,) [N m]; infinite where the file has none."""
         return np.array([j.limits.torque for j in self.joints], float)
+
+    @property
+    def torque_rates(self):
+        """Largest change of each joint's torque per second, (n,) [N m/s]; infinite where the file has none."""
+        return np.array([j.limits.torque_rate for j in self.joints], float)
 
     def link(self, name):
         """The link called `name`."""

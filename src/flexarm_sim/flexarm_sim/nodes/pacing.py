@@ -86,7 +86,7 @@ class RealTime:
     def resend(self):
         """Steady clock: in a pause, send the state again."""
         if self._node.active and self._node.paused:
-            self._node.send()
+            self._node.send(again=True)
 
 
 class Lockstep:
@@ -154,7 +154,7 @@ class Lockstep:
         if node.awaited is None:
             self.go_on()
             return
-        node.send()
+        node.send(again=True)
         if not node.paused and self._resent * node.parameters["resend_period"] >= UNANSWERED:
             node.report(
                 f"no joint_torque answers state {node.sim.sequence} for {UNANSWERED:g} s: are observer and"

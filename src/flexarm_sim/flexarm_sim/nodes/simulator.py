@@ -120,12 +120,13 @@ class SimulatorNode(Driver):
         self.awaited = max((m.sequence for m in self.sent), default=None)
         self.publish_joints(sample)
 
-    def send(self):
-        """Send the messages of the present sample, for the first time or again."""
+    def send(self, again=False):
+        """Send the messages of the present sample, for the first time or, while simulated time stands still, again."""
         for message in self.sent:
             age = (self.sim.sequence - message.sequence) % WRAP  # a fault may have delayed it
             then = self.now() - age * self.period
             message.controller_id = self.gate.sent(message.sequence, then)
+            message.clock_stopped = again
             self.state_publisher.publish(message)
 
     # Services, diagnostics ---------------------------------------------------------------------

@@ -134,6 +134,7 @@ class ClosedLoop:
         e.amplitude = observer.amplitude
         e.rate = observer.rate if converged else None
         e.controller_id, e.trust, e.doubt = measured.controller_id, measured.trust, measured.doubt
+        e.clock_stopped = measured.clock_stopped
         return e
 
     #: The observer has this long to converge [s].

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the driver applies what is sent to it: its report of torque and controller beside the answers sent.
+
+A driver that refuses, clips or replaces the torque leaves the arm on its safe action while the reference goes on.
+Two reports show it. The torque that it says it applied must lie between the least and the largest sent in the last
+`SENT` answers, within `torque_mismatch` times the torque limit; so no delay needs to be known. A driver that
+confirms its controller (``controller_id``) must name this one. What contradicts for `PATIENCE` is a refusal.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.parameters import parameter
+
+#: Answers that the reported torque may belong to.
+SENT = 64
+#: A contradiction that lasts for this long is a refusal [s].
+PATIENCE = 0.05
+#: A driver that confirms controllers has this long to confirm one, after its first torque [s].
+CONFIRMED_WITHIN = 0.25
+
+PARAMETERS = (
+    parameter("torque_mismatch", 0.1, "-", 0.0, 10.0).described(
+        "Largest difference between the torque sent and what the driver reports to apply, over the torque limit, for"
+        " 50 ms; beyond it a fault. 0.0: not compared."
+    ),
+)
+
+
+class Applied:
+    """Judges what the driver reports; see the module.
+
+    Parameters
+    ----------
+    model : ArmModel
+    settings : mapping
+        Checked values of `PARAMETERS`.
+    limit : ndarray, shape (n,)
+        Torque limits [N m]; a joint without one is not compared.
+    """
+
+    def __init__(self, model, settings, limit):
+        self._names = model.joint_names
+        self._sent = np.zeros((SENT, model.n_joints))
+        #: Whether the driver has confirmed any controller in this session.
+        self.tells = False
+        self.configure(settings, limit)
+        self.begin(np.zeros(model.n_joints))
+
+    def configure(self, settings, limit):
+        """Take another tolerance."""
+        share = settings["torque_mismatch"]
+        self._tolerance = np.where(np.isfinite(limit), share * limit, np.inf) if share else None
+
+    def begin(self, torque):
+        """The first torque (n,) [N m] after an interruption."""
+        self._sent[:] = torque
+        self._at, self._elapsed = 0, 0.0
+        self._other_for = self._wrong_for = 0.0
+        self._confirmed = False
+
+    def note(self, torque):
+        """Remember a torque (n,) [N m] that is sent."""
+        self._at = (self._at + 1) % SENT
+        self._sent[self._at] = torque
+
+    def judge(self, sample, controller_id, dt):
+        """Why the driver's report contradicts what this controller sends; empty where it does not.
+
+        Parameters
+        ----------
+        sample : ArmSample
+        controller_id : int
+            Of this controller; 0: unknown, not compared.
+        dt : float
+            Time since the last sample [s].
+        """
+        self._elapsed += dt
+        self._other_for = self._other_for + dt if self._is_other(sample, controller_id) else 0.0
+        if self._other_for > PATIENCE:
+            if sample.controller_id:
+                return f"the driver applies the torque of another controller ({sample.controller_id}): stop it"
+            return (
+                "the driver applies no torque of this controller: its log and /diagnostics say why"
+            )
+        joint = self._mismatch(sample.torque)
+        self._wrong_for = 0.0 if joint is None else self._wrong_for + dt
+        if self._wrong_for > PATIENCE:
+            reported, sent = sample.torque[joint], self._sent[self._at, joint]
+            return (
+                f"the driver reports {reported:.3g} N m at {self._names[joint]}, sent were {sent:.3g}:"
+                " it does not apply the torque, or not as it reports"
+            )
+        return ""
+
+    def _is_other(self, sample, controller_id):
+        """Whether the driver's report of its controller names none, or another."""
+        if not controller_id:
+            return False
+        if sample.controller_id == controller_id:
+            self._confirmed = self.tells = True
+            return False
+        if sample.controller_id:
+            return True
+        return self._confirmed or (self.tells and self._elapsed > CONFIRMED_WITHIN)
+
+    def _mismatch(self, reported):
+        """The joint whose reported torque is none of those sent; None where all are, or are unknown."""
+        tolerance, last = self._tolerance, self._sent[self._at]
+        if tolerance is None or (np.abs(reported - last) <= tolerance).all():
+            return None
+        low, high = self._sent.min(axis=0) - tolerance, self._sent.max(axis=0) + tolerance
+        wrong = (reported < low) | (reported > high)  # false for NaN, which means unknown
+        return int(np.argmax(wrong)) if wrong.any() else None

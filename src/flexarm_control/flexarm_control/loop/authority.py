@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""How much of the law's torque is sent: its size, its rate of change, and the ramp with which it returns.
+
+After any time without torque, the law's torque u comes back about the torque u_g that holds the arm's weight where
+it is found,
+
+.. math:: u_{sent} = u_g + a(t)\,(u - u_g), \qquad a = \min(1, (t/T)^2),
+
+so that torque and stiffness grow together. With T = `return_time` of 65 ms, a is below a tenth for the first 20 ms.
+Without gravity u_g is zero. Where u begins within `SMALL` of u_g, at rest, there is nothing to return from: no ramp.
+
+The rate is bounded in any case. The budget of an arm that states none is :math:`8\,\omega_1` times its torque limit
+per second, with omega_1 its lowest bending frequency with the joints locked: a torque that swings between its limits
+eight times as fast as the softest mode. A motion needs a hundredth of it.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.parameters import parameter
+from flexarm_dynamics.singular_perturbation import slow_torque
+
+from ..arrays import clip
+
+#: Of the torque limit: an arm that is taken over with less than this needs no ramp.
+SMALL = 0.02
+#: A rate that is none [N m/s].
+NO_RATE = 1e9
+#: Budget of an arm that states none, over its torque limit and lowest bending frequency.
+BUDGET = 8.0
+
+PARAMETERS = (
+    parameter("torque_limit", [0.0], "N m", 0.0, 1e6, length="joints").described(
+        "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's."
+    ),
+    parameter("torque_rate_limit", [0.0], "N m/s", 0.0, NO_RATE, length="joints").described(
+        "Largest change of torque per second, against the last torque sent; 0.0: the arm file's limits.torque_rate;"
+        " 1e9: none."
+    ),
+    parameter("return_time", 0.065, "s", 0.0, 10.0).described(
+        "Time in which torque returns after an interruption, and at the start; 0.0: at once."
+    ),
+)
+
+
+def torque_rates(model):
+    """Largest rate of each joint's torque, (n,) [N m/s]: the arm file's, or the budget; infinite without either."""
+    arm = model.arm
+    stated = arm.torque_rates
+    if not np.isinf(stated).any() or not model.n_modes:
+        return stated
+    omega = float(model.frequencies(np.zeros(model.n_joints), locked=True)[0])
+    return np.where(np.isinf(stated), BUDGET * omega * arm.torque_limits, stated)
+
+
+class Authority:
+    """Torque within its size and rate, returned in a ramp; see the module.
+
+    Parameters
+    ----------
+    model : ArmModel
+    settings : mapping
+        Checked values of `PARAMETERS`.
+
+    Attributes
+    ----------
+    limit, rate : ndarray, shape (n,)
+        Active limits [N m], [N m/s]; infinite where there is none.
+    torque : ndarray, shape (n,)
+        What was sent last [N m]; overwritten in place.
+    returned : bool
+        Whether the ramp is over.
+    """
+
+    def __init__(self, model, settings):
+        self.model = model
+        self._rates = torque_rates(model)
+        self.torque, self._weight = np.zeros((2, model.n_joints))
+        self._elapsed, self._first = np.inf, False
+        self.configure(settings)
+
+    def configure(self, settings):
+        """Take new limits."""
+        self.limit = self.limits_of(settings)
+        wanted = np.array(settings["torque_rate_limit"])
+        self.rate = np.where(wanted > 0.0, wanted, self._rates)
+        self.rate[wanted >= NO_RATE] = np.inf
+        self._least, self._time = -self.limit, settings["return_time"]
+        self._small = np.where(np.isfinite(self.limit), SMALL * self.limit, 0.0)
+        self._bounded = np.isfinite(self.rate)
+        self._any_bounded = bool(self._bounded.any())
+
+    def limits_of(self, settings):
+        """Torque limits that settings ask for, (n,) [N m]; never above the arm file's."""
+        from_file, wanted = self.model.arm.torque_limits, np.array(settings["torque_limit"])
+        return np.where(wanted > 0.0, np.minimum(wanted, from_file), from_file)
+
+    @property
+    def returned(self):
+        """Whether all of the torque is there."""
+        return self._elapsed >= self._time
+
+    def begin(self, q):
+        """Torque returns, to an arm at q (n,) [rad]: the ramp begins at the torque that holds its weight there."""
+        self._elapsed, self._first = 0.0, True
+        self._weight[:] = self._holding(q)
+        clip(self._weight, self._least, self.limit)
+        self.torque[:] = self._weight
+
+    def _holding(self, q):
+        n = self.model.n_joints
+        try:
+            found = slow_torque(self.model.terms(q, np.zeros(n)), np.zeros(n))
+        except (FlexarmError, np.linalg.LinAlgError):
+            return 0.0
+        return np.where(np.isfinite(found), found, 0.0)
+
+    def off(self):
+        """No torque."""
+        self.torque[:] = 0.0
+
+    def send(self, u, dt):
+        """Put what may be sent of a torque u (n,) [N m], dt [s] after the last, into `torque`.
+
+        Returns
+        -------
+        bool
+            Whether a limit was met.
+        """
+        torque, wanted = self.torque, u
+        if self._first:
+            self._first = False
+            if (np.abs(u - self._weight) <= self._small).all():
+                self._elapsed = np.inf
+                np.copyto(torque, u)
+                return False
+        if self._elapsed < self._time:
+            self._elapsed += dt
+            a = min(1.0, (self._elapsed / self._time) ** 2)
+            wanted = self._weight + a * (u - self._weight)
+        if self._any_bounded:
+            # Not inf * dt, which is NaN at a start, where dt is 0.
+            step = np.multiply(self.rate, dt, out=np.full_like(u, np.inf), where=self._bounded)
+            low, high = torque - step, torque + step
+            np.copyto(torque, wanted)
+            clip(torque, low, high)
+        else:
+            np.copyto(torque, wanted)
+        clip(torque, self._least, self.limit)  # last: the size holds whatever comes before
+        return bool((torque != wanted).any())
