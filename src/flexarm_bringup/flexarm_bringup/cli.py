@@ -115,6 +115,11 @@ COMMANDS = {
         "analyze",
         "time scales, a bound on mu, margins, domain of attraction and Monte Carlo of a design",
     ),
+    "attack": Command(
+        "flexarm_studies.attack.command",
+        "attack",
+        "a driver that lies, users and strangers that interfere: what the arm does until it rests",
+    ),
     "compare": Command(
         "flexarm_studies.comparison.command",
         "compare",

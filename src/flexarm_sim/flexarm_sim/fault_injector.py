@@ -7,7 +7,7 @@ needs no ROS.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -27,6 +27,7 @@ FIELDS = {
     "joint_torque": "joint_names",
     "strain": "gauge_names",
     "modal_amplitude": "mode_names",
+    "modal_rate": "mode_names",
 }
 WINDOW = ("from", "for")
 #: What the number of a key may be.
@@ -45,6 +46,9 @@ VALUE_KINDS = {
     "huge": ((), ()),
     "stick": ((), ()),
     "bias": (("by",), ("by",)),
+    "drift": (("by",), ("by",)),
+    "scale": (("by",), ("by",)),
+    "exchange": ((), ()),
     "saturate": (("at",), ("at",)),
     "delay": (("by",), ("by",)),
 }
@@ -58,10 +62,17 @@ OTHER_KINDS = {
         "duplicate": ((), ()),
         "swap": ((), ()),
         "future": (("by",), ("by",)),
+        "jitter": (("by", "seed"), ("by",)),
+        "freeze": ((), ()),
+        "repeat": ((), ()),
     },
     "clock": {"jump": (("by", "at"), ("by", "at"))},
+    "session": {"change": (("at",), ("at",)), "alternate": ((), ())},
     "names": {"reorder": ((), ()), "wrong": ((), ())},
 }
+
+#: They begin `at` a time and have no end.
+EVENTS = (("clock", "jump"), ("session", "change"))
 
 
 @dataclass
@@ -74,13 +85,26 @@ class Sample:
     names : dict of str to list of str
         ``joint_names``, ``gauge_names``, ``mode_names``.
     values : dict of str to ndarray or None
-        `FIELDS` and ``modal_rate``; None: unknown, empty on the topic.
+        `FIELDS`; None: unknown, empty on the topic.
+    session : int
+        Added to the session of the source; 0 while there is one source that does not restart.
     """
 
     sequence: int
     stamp_ns: int
     names: dict = field(default_factory=dict)
     values: dict = field(default_factory=dict)
+    session: int = 0
+
+    def copy(self):
+        """The same, in lists and arrays of its own."""
+        return Sample(
+            self.sequence,
+            self.stamp_ns,
+            {k: list(v) for k, v in self.names.items()},
+            {k: None if v is None else np.array(v) for k, v in self.values.items()},
+            self.session,
+        )
 
 
 @dataclass(frozen=True)
@@ -111,7 +135,7 @@ class Fault:
 
     def acts(self, time):
         """Whether it acts at `time` [s], which counts to the nanosecond."""
-        begin = self.get("at", 0.0) if self.signal == "clock" else self.get("from", 0.0)
+        begin = self.get("at" if (self.signal, self.kind) in EVENTS else "from", 0.0)
         return begin - 1e-9 <= time < begin + self.get("for", math.inf) - 1e-9
 
 
@@ -154,7 +178,7 @@ def parse(text, arm):
         more = ": one entry can't be missing, use nan" if dot and words[1] in FIELD_KINDS else ""
         refuse(words[1], f"no kind of {words[0]}{more}", ", ".join(kinds))
     allowed, needed = kinds[words[1]]
-    if signal != "clock":
+    if (signal, words[1]) not in EVENTS:
         allowed = (*allowed, *WINDOW)
     keys = {}
     for word in words[2:]:
@@ -204,6 +228,8 @@ class FaultInjector:
     Attributes
     ----------
     faults : tuple of Fault
+    session : int
+        What the source itself has added to its session by now: a driver that has restarted.
     """
 
     def __init__(self, arm, lines=()):
@@ -223,6 +249,7 @@ class FaultInjector:
 
     def reset(self):
         """Begin a new session: times start again."""
+        self.session = 0
         self._kept = {}  # number of a fault to what it holds
         self._waiting = []  # (due [ns], sample), in the order they came
         self._swapped = None
@@ -242,19 +269,28 @@ class FaultInjector:
         list of Sample
         """
         now = sample.stamp_ns
-        out = Sample(
-            sample.sequence,
-            sample.stamp_ns,
-            {k: list(v) for k, v in sample.names.items()},
-            {k: None if v is None else np.array(v) for k, v in sample.values.items()},
-        )
+        out = sample.copy()
         for number, fault in enumerate(self.faults):
             if fault.signal in FIELDS:
                 self._value_fault(number, fault, out, time)
-        for fault in self.faults:
-            if fault.acts(time):
-                _whole_fault(fault, out)
-        return self._messages(out, now, time)
+        for number, fault in enumerate(self.faults):
+            if fault.kind in ("freeze", "repeat"):
+                out = self._held(number, fault, out, fault.acts(time))
+        acting = [f for f in self.faults if f.acts(time)]
+        for fault in acting:
+            _whole_fault(fault, out)
+        self.session = out.session
+        return _with_second_source(acting, self._messages(out, now, time))
+
+    def _held(self, number, fault, out, acts):
+        """The message of the fault's start: all of it, or under the present number and stamp."""
+        if not acts:
+            self._kept.pop(number, None)
+            return out
+        kept = self._kept.setdefault(number, out).copy()
+        if fault.kind == "freeze":
+            kept.sequence, kept.stamp_ns = out.sequence, out.stamp_ns
+        return kept
 
     def _value_fault(self, number, fault, out, time):
         """Apply a fault of one field."""
@@ -279,6 +315,12 @@ class FaultInjector:
             values[where] = self._kept.setdefault(number, values.copy())[where]
         elif fault.kind == "bias":
             values[where] += fault.get("by", 0.0)
+        elif fault.kind == "drift":
+            values[where] += fault.get("by", 0.0) * (time - fault.get("from", 0.0))
+        elif fault.kind == "scale":
+            values[where] *= fault.get("by", 0.0)
+        elif fault.kind == "exchange":
+            _exchange(values, where)
         elif fault.kind == "saturate":
             level = fault.get("at", 0.0)
             values[where] = np.clip(values[where], -level, level)
@@ -323,6 +365,22 @@ class FaultInjector:
         return out
 
 
+def _exchange(values, where):
+    """Let an entry and the next one change places, the last with the first; the whole field: turn it round."""
+    if isinstance(where, list):
+        pair = [where[0], (where[0] + 1) % values.size]
+        values[pair] = values[pair[::-1]]
+    else:
+        values[:] = values[::-1].copy()
+
+
+def _with_second_source(acting, ready):
+    """With `session alternate`, each message is followed by that of a second source."""
+    if not any((f.signal, f.kind) == ("session", "alternate") for f in acting):
+        return ready
+    return [s for own in ready for s in (own, replace(own, session=own.session + 1))]
+
+
 def _lost(fault, sequence):
     if fault.kind != "drop":
         return False
@@ -337,11 +395,16 @@ def _whole_fault(fault, out):
     if fault.signal == "clock" or fault.kind == "future":
         # A message can't hold a stamp before 1970.
         out.stamp_ns = max(0, out.stamp_ns + round(1e9 * fault.get("by", 0.0)))
+    elif fault.kind == "jitter":
+        random = np.random.default_rng([fault.get("seed", 0), out.sequence])
+        out.stamp_ns += round(1e9 * fault.get("by", 0.0) * random.uniform(-1.0, 1.0))
+    elif (fault.signal, fault.kind) == ("session", "change"):
+        out.session += 1
     elif fault.signal == "names" and fault.kind == "wrong":
         out.names["joint_names"][0] = f"not_{out.names['joint_names'][0]}"
     elif fault.signal == "names":
         for key, names in out.names.items():
             names.reverse()
-            for name, of in (*FIELDS.items(), ("modal_rate", "mode_names")):
+            for name, of in FIELDS.items():
                 if of == key and out.values.get(name) is not None:
                     out.values[name] = out.values[name][::-1].copy()

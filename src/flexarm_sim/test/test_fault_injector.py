@@ -24,7 +24,7 @@ NAMES = {
 
 def sample(k):
     """Sample k: entry i of field f reads 100 f + 10 i + k / 1000."""
-    fields = (*FIELDS, "modal_rate")
+    fields = FIELDS
     values = {
         name: 100.0 * f + 10.0 * np.arange(2 if name.startswith("joint") else 4) + 1e-3 * k
         for f, name in enumerate(fields)
@@ -118,7 +118,7 @@ def faults(draw):
     }
     kind = draw(st.sampled_from(sorted(kinds)))
     allowed, needed = kinds[kind]
-    window = () if signal == "clock" else fault_injector.WINDOW
+    window = () if (signal, kind) in fault_injector.EVENTS else fault_injector.WINDOW
     optional = [k for k in (*allowed, *window) if k not in needed]
     given = [
         *needed,
@@ -255,7 +255,7 @@ def test_stamps_ahead_and_a_clock_that_jumps():
 
 def test_names_in_another_order_go_with_their_values():
     out, true = only(["names reorder"], 1)[0], sample(0)
-    for name, of in (*FIELDS.items(), ("modal_rate", "mode_names")):
+    for name, of in FIELDS.items():
         assert out.names[of] == NAMES[of][::-1]
         assert_array_equal(out.values[name], true.values[name][::-1])
 

@@ -71,7 +71,7 @@ class Faults:
         names = {key: getattr(message, key) for key in set(FIELDS.values())}
         values = {
             key: np.array(getattr(message, key)) if len(getattr(message, key)) else None
-            for key in (*FIELDS, "modal_rate")
+            for key in FIELDS
         }
         true = Sample(message.sequence, stamp_ns(message.header.stamp), names, values)
         return [_message(message, sample) for sample in self._injector.outgoing(true, time)]
@@ -95,8 +95,13 @@ def check(faults, parameters):
 
 def _message(true, sample):
     """A new `ArmState` with the values of a faulty sample."""
-    message = ArmState(session=true.session, sequence=sample.sequence)
-    message.trust, message.doubt = true.trust, true.doubt
+    session = (true.session + sample.session) % 2**32
+    message = ArmState(session=session, sequence=sample.sequence)
+    message.controller_id, message.trust, message.doubt = (
+        true.controller_id,
+        true.trust,
+        true.doubt,
+    )
     message.header.frame_id = true.header.frame_id
     set_stamp(message.header.stamp, sample.stamp_ns)
     for key, names in sample.names.items():

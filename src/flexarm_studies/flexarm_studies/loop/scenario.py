@@ -56,7 +56,7 @@ class Scenario:
         ``initial_position``.
     payload_scale, stiffness_scale, damping_scale : float
         Of the simulated arm alone, see `arm.scaled` [-].
-    plant_arm : str
+    plant_arm : str or Arm
         Arm file of the simulated arm, where it is another; scaled as well.
     plant_modes : int
         Modes per flexible direction of the simulated arm; 0: as in its file.
@@ -206,9 +206,9 @@ def loop_of(scenario):
     if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
     groups = {prefix: chosen(prefix, values) for prefix in COMPONENTS}
-    arm = scenario.arm if isinstance(scenario.arm, Arm) else arm_file.load(scenario.arm)
+    arm = _read(scenario.arm)
     plant = scaled(
-        arm_file.load(scenario.plant_arm) if scenario.plant_arm else arm,
+        _read(scenario.plant_arm) if scenario.plant_arm else arm,
         scenario.payload_scale,
         scenario.stiffness_scale,
         scenario.damping_scale,
@@ -218,6 +218,11 @@ def loop_of(scenario):
         network = Network(scenario.loss, scenario.delay, scenario.jitter, scenario.seed)
         return NetworkedLoop(arm, **parts, network=network)
     return ClosedLoop(arm, **parts, delay=scenario.delay)
+
+
+def _read(arm):
+    """An arm, as given or from its file."""
+    return arm if isinstance(arm, Arm) else arm_file.load(arm)
 
 
 def run(scenario):

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is attacked: arms with their motion and controller, observers, with and without measured joint velocity."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+from flexarm_control.observers.arm_observer import OBSERVERS
+from flexarm_dynamics import registry
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+
+from ..comparison.cases import COUNTS, STRAIN_NOISE
+from ..loop import scenario as scenarios
+
+#: Arm to its controller file (empty: the nodes' defaults), motion and rate [Hz].
+ARMS = {
+    "R": ("", "quintic:to=1,duration=2", 1000.0),
+    "two_link": ("two_link", "quintic:to=1.0472,duration=2", 1000.0),
+    "long_reach": (
+        "long_reach",
+        "quintic:from=0;1.2;0.8;-0.8,to=0.4;0.9;1.2;-0.4,duration=2",
+        500.0,
+    ),
+}
+#: Duration of the motions [s].
+MOTION = 2.0
+#: The motion starts at this time of the session: the observer has converged by then [s].
+START = 0.2
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm under one observer.
+
+    Attributes
+    ----------
+    arm, observer : str
+    velocity : bool
+        Whether joint velocities are measured.
+    noise : bool
+        Whether encoders count and gauges have noise.
+    amplitude : bool
+        Whether the driver sends modal amplitudes beside the strains.
+    rates : bool
+        Whether it sends modal rates.
+    """
+
+    arm: str
+    observer: str
+    velocity: bool
+    noise: bool = True
+    amplitude: bool = False
+    rates: bool = False
+
+    def __str__(self):
+        return f"{self.arm}, {self.observer}, {'with' if self.velocity else 'without'} velocity"
+
+    def scenario(self):
+        """The honest `Scenario`."""
+        file, motion, rate = ARMS[self.arm]
+        values = scenarios.parameters(file) if file else {}
+        if values.get("observer.type") != self.observer:
+            values = {k: v for k, v in values.items() if not k.startswith("observer.")}
+        values |= {
+            "observer.type": self.observer,
+            "publish_joint_velocity": self.velocity,
+            "publish_modal_amplitude": self.amplitude,
+            "publish_rates": self.rates,
+        }
+        return scenarios.Scenario(
+            arm_of(self.arm, self.noise), values, trajectory=motion, rate=rate, noise=self.noise
+        )
+
+
+@cache
+def arm_of(name, noise):
+    """The shipped arm; with `noise`, that of the comparison's sensors where its file states none."""
+    arm = arm_file.load(name)
+    if not noise:
+        return arm
+    gauges = tuple(replace(g, noise=g.noise or STRAIN_NOISE) for g in arm.gauges)
+    joints = tuple(replace(j, encoder_counts=j.encoder_counts or COUNTS) for j in arm.joints)
+    return replace(arm, gauges=gauges, joints=joints)
+
+
+def observers():
+    """All registered observers that an arm without measured rates can have."""
+    return tuple(n for n in registry.names(OBSERVERS) if n != "true_rates")
+
+
+def chosen(arms=None, names=None):
+    """The cases of some `arms`, and observers by their `names`, None for all; each with and without velocity.
+
+    Raises
+    ------
+    FlexarmError
+        For an arm or observer that there is not.
+    """
+    for option, given, known in (("--arms", arms, ARMS), ("--observers", names, observers())):
+        unknown = [name for name in given or () if name not in known]
+        if unknown:
+            raise FlexarmError(
+                "is unknown", field=option, value=",".join(unknown), limit=", ".join(known)
+            )
+    return [
+        Case(arm, observer, velocity)
+        for arm in arms or ARMS
+        for observer in names or observers()
+        for velocity in (False, True)
+    ]

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm attack``: a driver that lies, on every arm, under every observer."""
+
+import json
+import os
+from concurrent.futures import as_completed
+from functools import cache
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..commands.options import at_least
+from ..progress import Progress
+from ..workers import processes
+from . import report
+from .cases import ARMS, arm_of, chosen, observers
+from .lies import LIES, random_lies
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Simulates arms whose driver lies, users that stop and strangers that interfere, and judges"
+        " what the arm does until it rests."
+    )
+    parser.epilog = (
+        "example: flexarm attack --arms R --observers kalman --lies encoder,~/stop\n"
+        "exit code 1: a criterion does not hold"
+    )
+    add = parser.add_argument
+    add("--arms", help=f"separated by commas ({','.join(ARMS)})")
+    add("--observers", help=f"separated by commas ({','.join(observers())})")
+    add("--lies", help="those whose names have one of these texts, separated by commas (all)")
+    add("--list", action="store_true", help="list the lies, and do nothing else")
+    add("--random", type=int, default=0, metavar="N", help="so many random lies beside them (0)")
+    add("--healthy", type=int, metavar="SAMPLES", help="no lies: count alarms in healthy samples")
+    add("--seed", type=int, default=0, help="of random lies and healthy runs (0)")
+    add("--workers", type=int, metavar="N", help="processes (one per core)")
+    add("--json", metavar="FILE", help="write every run")
+    add("--write", metavar="FILE", help="write the table between the markers of this file")
+    add("--note", metavar="FILE", help="write the table, worst on top, and the worst runs to FILE")
+
+
+def attack(options):
+    """Run the sub-command; the exit code."""
+    at_least("--random", options.random, 0)
+    at_least("--workers", options.workers, 1)
+    at_least("--healthy", options.healthy, 1)
+    wanted = _lies(options)
+    if options.list:
+        print("\n".join(f"{lie.kind:13}{lie.name}" for lie in wanted.values()))
+        return 0
+    cases = chosen(_split(options.arms), _split(options.observers))
+    if options.healthy:
+        from .healthy import healthy
+
+        return healthy(options, cases)
+    rows = study(cases, wanted, options.workers)
+    entries = report.summary(rows)
+    if options.json:
+        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if options.write:
+        report.write(options.write, entries)
+    if options.note:
+        report.note(options.note, rows)
+    print("\n".join([*report.table(entries), "", *report.worst_runs(rows)]))
+    return int(any(row["failed"] for row in rows))
+
+
+def _split(text):
+    return None if text is None else [word.strip() for word in text.split(",")]
+
+
+def _lies(options):
+    """The lies that are asked for, by name."""
+    known = LIES | random_lies(options.random, options.seed)
+    words = _split(options.lies)
+    wanted = {k: v for k, v in known.items() if words is None or any(w in k for w in words)}
+    if not wanted:
+        limit = ", ".join(known)
+        raise FlexarmError("names no lie", field="--lies", value=options.lies, limit=limit)
+    return wanted
+
+
+def jobs(cases, wanted):
+    """(case, lie, moment, pick) of every run; runs of the same case stand together."""
+    found = {}
+    for case in cases:
+        for lie in wanted.values():
+            own = _case_of(lie, case)
+            if lie.suits(own, arm_of(own.arm, own.noise)):
+                found.setdefault(own, []).extend((own, lie, moment) for moment in lie.moments)
+    # The same lie may be one run of several cases: modal rates have an observer of their own.
+    return [job for own in found.values() for job in dict.fromkeys(own)]
+
+
+def _case_of(lie, case):
+    from .run import case_of
+
+    return case_of(lie, case)
+
+
+def study(cases, wanted, workers=None):
+    """Run all, in several processes; the rows, in the order of `jobs`."""
+    todo, progress = jobs(cases, wanted), Progress()
+    parts = _parts(todo)
+    rows = {}
+    progress.step(f"{len(todo)} runs of {len(wanted)} lies")
+    with processes(workers or os.cpu_count() or 1) as executor:
+        running = {executor.submit(run_all, part): part for part in parts}
+        for future in as_completed(running):
+            rows |= dict(zip(running[future], future.result(), strict=True))
+            progress.fraction(len(rows) / len(todo))
+    progress.done()
+    return [rows[job] for job in todo]
+
+
+#: Runs that go to a process at once: each process runs the honest motion of a case but once.
+AT_ONCE = 12
+
+
+def _parts(todo):
+    """Runs of one case, in small lists."""
+    parts = []
+    for job in todo:
+        if not parts or parts[-1][0][0] != job[0] or len(parts[-1]) == AT_ONCE:
+            parts.append([])
+        parts[-1].append(job)
+    return parts
+
+
+@cache
+def _honest(case):
+    from .run import Honest
+
+    return Honest(case)
+
+
+def run_all(part):
+    """Rows of the runs of one case, in a process of its own."""
+    from .run import attack as run
+
+    return [run(_honest(case), lie, moment) for case, lie, moment in part]

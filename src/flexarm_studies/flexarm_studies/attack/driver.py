@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The driver that lies: between an honest arm and its control, sample by sample, without ROS.
+
+The arm is a `Simulator` with its safe actions. What it measures goes through a `FaultInjector`, which tells the lies;
+observer and controller answer each message as their nodes do; the torques go through the rules of
+`flexarm_ros.torque_gate` (`Gate`), counted from the first time that a sample was sent.
+"""
+
+import numpy as np
+
+from flexarm_control.loop.samples import ArmSample
+from flexarm_dynamics.errors import MessageError
+from flexarm_sim.fault_injector import FIELDS, FaultInjector, Sample
+
+from ..loop import scenario as scenarios
+
+#: As the drivers' `torque_timeout` and the controller's `state_timeout` [s].
+TORQUE_TIMEOUT, STATE_TIMEOUT = 0.05, 0.5
+#: Fields of a fault's sample to those of an `ArmSample`.
+_ARRAYS = {
+    "joint_position": "position",
+    "joint_velocity": "velocity",
+    "joint_torque": "torque",
+    "strain": "strain",
+    "modal_amplitude": "amplitude",
+    "modal_rate": "rate",
+}
+
+
+class Gate:
+    """Which torque acts: the rules of `flexarm_ros.torque_gate.TorqueGate`, for one controller.
+
+    Parameters
+    ----------
+    session : int
+        Of the states that are sent.
+    timeout : float
+        A torque acts no longer than this after the sample that it answers was first sent [s].
+
+    Attributes
+    ----------
+    renews : bool
+        A wrong gate: a sample that is sent again renews the time of its torque.
+    """
+
+    def __init__(self, session, timeout=TORQUE_TIMEOUT):
+        self.timeout, self.renews = timeout, False
+        self.begin(session)
+
+    def begin(self, session):
+        """A new session: earlier torques answer nothing any more."""
+        self.session, self._sent, self._answered, self._newest = session, {}, -1, -1
+        self._torque, self._until = None, -np.inf
+
+    def sent(self, sequence, time):
+        """Note that a sample is sent at `time` [s]; that it is sent again changes nothing in a right gate."""
+        if self.renews or sequence > self._newest:
+            self._sent[sequence] = time
+            self._newest = sequence
+        for old in [k for k, t in self._sent.items() if t < time - self.timeout]:
+            del self._sent[old]
+
+    def offer(self, session, sequence, torque):
+        """A torque (n,) [N m], None for DISABLED, that answers a sample."""
+        if session != self.session or sequence not in self._sent or sequence < self._answered:
+            return
+        self._answered = sequence
+        self._torque = None if torque is None else torque.copy()
+        self._until = self._sent[sequence] + self.timeout
+
+    def torque(self, time):
+        """What acts at a `time` [s]; None: the safe action."""
+        # Rounding of the times must not end a torque a sample early.
+        return self._torque if time <= self._until + 1e-9 else None
+
+
+class LyingDriver:
+    """One run of an arm whose driver lies.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Arm, observer and controller; without delay, loss and jitter.
+    faults : sequence of str
+        Lines of `fault_injector`, their times counted from the session's start.
+    begin : float
+        From this time on samples go through the faults; before, they are as measured [s].
+
+    Attributes
+    ----------
+    refuses : bool
+        The drives do not take the torque: the safe action acts, and the report says so.
+    spoofed : ndarray or None
+        A stranger's torque (n,), which acts in place of the controller's [N m].
+    controller_id : int
+        Of the controller that is running.
+    answers : bool
+        Whether there is a controller that answers.
+    trust, reason : int, str
+        What the device itself says of its samples, as in `ArmState`.
+    last_new : float
+        When the last sample that was new was answered [s].
+    off : dict of str to list of (float, float)
+        Of each field that a fault falsifies: when, and by how much at most.
+    doubt : str
+        Of the last estimate: which sensor the observer doubts.
+    """
+
+    def __init__(self, scenario, faults=(), begin=0.0):
+        self.scenario, self.gate = scenario, Gate(1)
+        self.loop = loop = scenarios.loop_of(scenario)
+        self.period = 1e-9 * loop.simulator.period_ns
+        self.injector = FaultInjector(loop.model.arm, faults)
+        arm = loop.model.arm
+        self._names = {
+            "joint_names": list(arm.joint_names),
+            "gauge_names": list(arm.gauge_names),
+            "mode_names": list(arm.observed_modes),
+        }
+        self._begin, self.last_new, self._last_key = begin, 0.0, None
+        self.refuses, self.spoofed, self.controller_id, self.answers = False, None, 1, True
+        self.trust, self.reason, self.doubt = ArmSample.TRUSTED, "", ""
+        self._acts, self.off = 0, {}
+
+    @property
+    def time(self):
+        """Since the start of the session [s]."""
+        return self.loop.simulator.time
+
+    def answer(self):
+        """Measure, lie, and let observer and controller answer; the torque that acts next, or None."""
+        true, time = self.loop.measure(), self.time
+        true.controller_id, true.trust, true.doubt = self._acts, self.trust, self.reason
+        for message in self._messages(true, time):
+            if message.session == self._own_session:
+                self.gate.sent(message.sequence, time)
+            self._answered(message, time)
+        self._watch(time)
+        torque = None if self.refuses else self.gate.torque(time)
+        if self.spoofed is not None:
+            torque = self.spoofed
+        self._acts = 0 if torque is None else self.controller_id
+        return torque
+
+    def advance(self, torque):
+        """One period of the arm under the torque that acts."""
+        self.loop.simulator.advance(torque)
+
+    @property
+    def _own_session(self):
+        return 1 + self.injector.session
+
+    def _messages(self, true, time):
+        """What is sent for a sample, in order."""
+        if not self.injector.faults or time < self._begin - 1e-9:
+            return [_sample(true, _fields(true, self._names))]
+        out = self.injector.outgoing(_fields(true, self._names), time)
+        if self._own_session != self.gate.session:
+            self.gate.begin(self._own_session)  # the driver has restarted
+        for s in out[:1]:
+            self._note_lies(true, s, time)
+        return [_sample(true, s) for s in out]
+
+    def _note_lies(self, true, given, time):
+        for signal in {f.signal for f in self.injector.faults} & set(FIELDS):
+            right, wrong = getattr(true, _ARRAYS[signal]), given.values[signal]
+            if right is not None and wrong is not None and wrong.shape == right.shape:
+                size = float(np.abs(wrong - right).max(initial=0.0))
+                self.off.setdefault(signal, []).append((time, size))
+
+    def _answered(self, message, time):
+        """Observer and controller on one message, as their nodes."""
+        loop, controller = self.loop, self.loop.controller
+        if not self.answers:
+            return
+        if message.key != self._last_key:  # a repeat is no sign of life
+            self.last_new, self._last_key = time, message.key
+        try:
+            estimate = loop.estimate(message)
+            self.doubt = estimate.doubt
+            enabled = controller.step(estimate)
+        except MessageError as error:
+            controller.distrust(str(error))
+            self.doubt, enabled = str(error), False
+        if enabled is not None:
+            self.gate.offer(*message.key, controller.torque if enabled else None)
+
+    def _watch(self, time):
+        """The controller's node notices that the states have stopped."""
+        if time - self.last_new > STATE_TIMEOUT and self.loop.controller.enabled:
+            self.loop.controller.distrust(f"no arm_state_estimate for {STATE_TIMEOUT:g} s")
+            self.gate.offer(*self._last_key, None)
+
+
+def _fields(sample, names):
+    """An `ArmSample` as a sample of the fault injector."""
+    values = {name: getattr(sample, attribute) for name, attribute in _ARRAYS.items()}
+    if not sample.velocity_known:
+        values["joint_velocity"] = None
+    return Sample(sample.sequence, sample.stamp_ns, names, {k: values[k] for k in FIELDS}).copy()
+
+
+def _sample(true, given):
+    """A new `ArmSample` of what the fault injector gives for the `true` one."""
+    out = ArmSample(true.position.size)
+    out.stamp_ns, out.session, out.sequence = (
+        given.stamp_ns,
+        true.session + given.session,
+        given.sequence,
+    )
+    for name, attribute in _ARRAYS.items():
+        setattr(out, attribute, given.values[name])
+    out.velocity_known = out.velocity is not None
+    if out.velocity is None:
+        out.velocity = np.zeros_like(true.velocity)
+    out.controller_id, out.trust, out.doubt = true.controller_id, true.trust, true.doubt
+    return out
