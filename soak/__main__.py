@@ -28,6 +28,10 @@ def parser():
     top.add_argument("--seed", type=int, default=1)
     top.add_argument("--arm", default="R")
     top.add_argument("--without-faults", action="store_true", help="motions and parameters alone")
+    top.add_argument(
+        "--walk", type=int, metavar="STEPS",
+        help="instead: so many random transitions, services, parameter sets and motions, in this process",
+    )  # fmt: skip
     return top
 
 
@@ -90,6 +94,14 @@ def report(life, trouble):
 def main(arguments=None):
     """Run the command; returns the exit code."""
     options = parser().parse_args(arguments)
+    if options.walk:
+        from .walk import walk
+
+        lines, good = walk(
+            options.seed, options.walk, lambda text: print(text, flush=True), options.arm
+        )
+        print("\n".join(lines))
+        return 0 if good else 1
     life, trouble = soak(options, lambda text: print(text, flush=True))
     lines, good = report(life, trouble)
     print("\n".join(lines))

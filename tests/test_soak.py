@@ -14,6 +14,7 @@ from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
 from soak import __main__ as command
 from soak.invariants import Invariants
+from soak.walk import walk
 
 
 def test_a_short_life_with_faults_breaks_no_invariant():
@@ -24,6 +25,14 @@ def test_a_short_life_with_faults_breaks_no_invariant():
     assert good, "\n".join(lines)
     assert (life.rounds, life.motions, life.refusals) == (1, 1, 1)
     assert life.invariants.counts["enabled"] > 1000
+
+
+def test_a_random_walk_through_transitions_services_and_parameters_ends_in_a_motion():
+    lines, good = walk(3, 200, lambda text: None)
+    assert good, "\n".join(lines)
+    count = dict(line.rsplit(maxsplit=1) for line in lines)
+    assert int(count["transition"]) > 20 and int(count["wrong transition"]) > 10
+    assert int(count["enabled"]) > 200 and int(count["parameters refused"]) > 3
 
 
 def estimate(sequence, rate=0.0):
