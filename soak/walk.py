@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A random walk through the nodes' life: transitions, services, parameters and motions in any order, right and wrong.
 
-Simulator, observer and controller are in this process, joined by a queue (`tests/in_process.py`), in lockstep. Between two
-steps of the walk they exchange some messages. Nothing may be raised, every request has an answer, a wrong one changes
-nothing, and the torque keeps to its invariants. In the end the nodes are brought back, and a motion reaches its goal.
+Simulator, observer and controller are in this process, joined by a queue (`tests/in_process.py`), in lockstep. Between
+two steps of the walk they exchange some messages. Nothing may be raised, every request has an answer, a wrong one
+changes nothing, and the torque keeps to its invariants. In the end the nodes are brought back, and a motion reaches its
+goal.
 """
 
 import random
@@ -60,6 +61,8 @@ SERVICES = (
     ("simulator/pause", SetBool, {"data": True}),
     ("simulator/pause", SetBool, {"data": False}),
 )
+#: Largest change of torque from one sample to the next, and largest torque that may begin after none [of its limit].
+KICKS = {"between torques": 0.15, "after none": 0.05}
 #: How often each kind of step is taken, out of 100.
 WEIGHTS = {"transition": 25, "wrong transition": 15, "service": 15, "parameters": 15, "motion": 30}
 
@@ -88,7 +91,7 @@ class Walk:
         self.joints = self.description.joint_names
         self.limit = self.description.torque_limits
         self.invariants = Invariants(self.limit, np.full(len(self.joints), np.inf))
-        self.steps, self._last = {"between torques": 0.0, "after none": 0.0}, None
+        self.steps, self._last = dict.fromkeys(KICKS, 0.0), None
         simulator = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
         bench.start_loop(arm=arm, simulator=simulator)
         # There is always something that happens, even while no node is configured.
@@ -115,6 +118,9 @@ class Walk:
             before = self._last[1] if follows else np.zeros_like(torque)
             step = float((np.abs(torque - before) / self.limit).max())
             self.steps[kind] = max(self.steps[kind], step)
+            self.invariants._demand(
+                step <= KICKS[kind], f"no kick {kind}", f"{step:.3g}, state {key}"
+            )
         self._last = key, torque
 
     def serve(self, messages):
