@@ -33,7 +33,7 @@ def refuse_a_second(driver):
 
 
 def spoof(driver):
-    """A stranger's torque passes the gate for a while."""
+    """A stranger sends torques under the controller's name for a while."""
     torque = SPOOFED * driver.loop.model.arm.torque_limits
     return [
         (0.0, lambda: setattr(driver, "spoofed", torque)),
@@ -74,6 +74,7 @@ def _restart(driver, after):
     def start():
         driver.loop.controller, driver.answers = fresh, True
         driver.controller_id += 1
+        fresh.controller_id = driver.controller_id
 
     return [(0.0, kill), (after, start)]
 

@@ -105,12 +105,13 @@ def study(cases, wanted, workers=None):
     todo, progress = jobs(cases, wanted), Progress()
     parts = _parts(todo)
     rows = {}
-    progress.step(f"{len(todo)} runs of {len(wanted)} lies")
+    total = len(todo)
+    progress.step(f"{total} runs of {len(wanted)} lies")
     with processes(workers or os.cpu_count() or 1) as executor:
         running = {executor.submit(run_all, part): part for part in parts}
         for future in as_completed(running):
             rows |= dict(zip(running[future], future.result(), strict=True))
-            progress.fraction(len(rows) / len(todo))
+            progress.step(str(running[future][0][0]), len(rows), total)
     progress.done()
     return [rows[job] for job in todo]
 

@@ -16,6 +16,10 @@ from ..loop import scenario as scenarios
 
 #: As the drivers' `torque_timeout` and the controller's `state_timeout` [s].
 TORQUE_TIMEOUT, STATE_TIMEOUT = 0.05, 0.5
+#: After a race for one sample's answer, silence for this long [s].
+ALONE = 1.0
+#: Rounding of times must not end a torque a sample early [s].
+ROUNDING = 1e-9
 #: Fields of a fault's sample to those of an `ArmSample`.
 _ARRAYS = {
     "joint_position": "position",
@@ -28,14 +32,16 @@ _ARRAYS = {
 
 
 class Gate:
-    """Which torque acts: the rules of `flexarm_ros.torque_gate.TorqueGate`, for one controller.
+    """Which torque acts: the rules of `flexarm_ros.torque_gate.TorqueGate`, which has messages of ROS.
+
+    A sample names the controller whose answer to the one before was taken; only that controller's answer to it acts,
+    and no longer than `TORQUE_TIMEOUT` after the sample was first sent. Two torques that answer one sample under one
+    name are a race: the safe action acts for `ALONE`.
 
     Parameters
     ----------
     session : int
         Of the states that are sent.
-    timeout : float
-        A torque acts no longer than this after the sample that it answers was first sent [s].
 
     Attributes
     ----------
@@ -43,35 +49,48 @@ class Gate:
         A wrong gate: a sample that is sent again renews the time of its torque.
     """
 
-    def __init__(self, session, timeout=TORQUE_TIMEOUT):
-        self.timeout, self.renews = timeout, False
+    def __init__(self, session):
+        self.renews = False
         self.begin(session)
 
     def begin(self, session):
         """A new session: earlier torques answer nothing any more."""
-        self.session, self._sent, self._answered, self._newest = session, {}, -1, -1
-        self._torque, self._until = None, -np.inf
+        self.session, self._sent, self._newest, self._answered = session, {}, -1, -1
+        self._claimant, self._fresh_until = 0, -np.inf
+        self._torque, self._answer, self._until, self._raced_until = None, None, -np.inf, -np.inf
+
+    def names(self, time):
+        """Id of the controller whose answer to a sample of this `time` [s] will act; 0: of none."""
+        return self._claimant if time <= self._fresh_until + ROUNDING else 0
 
     def sent(self, sequence, time):
         """Note that a sample is sent at `time` [s]; that it is sent again changes nothing in a right gate."""
         if self.renews or sequence > self._newest:
-            self._sent[sequence] = time
+            self._sent[sequence] = time, self.names(time)
             self._newest = sequence
-        for old in [k for k, t in self._sent.items() if t < time - self.timeout]:
+        for old in [k for k, (t, _) in self._sent.items() if t < time - TORQUE_TIMEOUT - ROUNDING]:
             del self._sent[old]
 
-    def offer(self, session, sequence, torque):
-        """A torque (n,) [N m], None for DISABLED, that answers a sample."""
+    def offer(self, session, sequence, controller, torque, time):
+        """A controller's torque (n,) [N m], None for DISABLED, that answers a sample, at a `time` [s]."""
         if session != self.session or sequence not in self._sent or sequence < self._answered:
             return
-        self._answered = sequence
-        self._torque = None if torque is None else torque.copy()
-        self._until = self._sent[sequence] + self.timeout
+        if time < self._raced_until:
+            self._claimant, self._torque = 0, None
+            return
+        again = sequence == self._answered and controller == self._claimant and torque is not None
+        if again and (self._answer is None or (torque != self._answer).any()):
+            self._raced_until = time + ALONE
+            self._claimant, self._torque = 0, None
+            return
+        sent, named = self._sent[sequence]
+        self._answered, self._claimant, self._answer = sequence, controller, torque
+        self._fresh_until = self._until = sent + TORQUE_TIMEOUT
+        self._torque = torque if named == controller else None
 
     def torque(self, time):
         """What acts at a `time` [s]; None: the safe action."""
-        # Rounding of the times must not end a torque a sample early.
-        return self._torque if time <= self._until + 1e-9 else None
+        return self._torque if time <= self._until + ROUNDING else None
 
 
 class LyingDriver:
@@ -91,7 +110,7 @@ class LyingDriver:
     refuses : bool
         The drives do not take the torque: the safe action acts, and the report says so.
     spoofed : ndarray or None
-        A stranger's torque (n,), which acts in place of the controller's [N m].
+        A stranger's torque (n,), which is sent under the controller's name, session and sequence [N m].
     controller_id : int
         Of the controller that is running.
     answers : bool
@@ -120,7 +139,8 @@ class LyingDriver:
         self._begin, self.last_new, self._last_key = begin, 0.0, None
         self.refuses, self.spoofed, self.controller_id, self.answers = False, None, 1, True
         self.trust, self.reason, self.doubt = ArmSample.TRUSTED, "", ""
-        self._acts, self.off = 0, {}
+        self.off = {}
+        loop.controller.controller_id = self.controller_id
 
     @property
     def time(self):
@@ -130,17 +150,14 @@ class LyingDriver:
     def answer(self):
         """Measure, lie, and let observer and controller answer; the torque that acts next, or None."""
         true, time = self.loop.measure(), self.time
-        true.controller_id, true.trust, true.doubt = self._acts, self.trust, self.reason
+        true.controller_id = 0 if self.refuses else self.gate.names(time)
+        true.trust, true.doubt = self.trust, self.reason
         for message in self._messages(true, time):
             if message.session == self._own_session:
                 self.gate.sent(message.sequence, time)
             self._answered(message, time)
         self._watch(time)
-        torque = None if self.refuses else self.gate.torque(time)
-        if self.spoofed is not None:
-            torque = self.spoofed
-        self._acts = 0 if torque is None else self.controller_id
-        return torque
+        return None if self.refuses else self.gate.torque(time)
 
     def advance(self, torque):
         """One period of the arm under the torque that acts."""
@@ -183,13 +200,19 @@ class LyingDriver:
             controller.distrust(str(error))
             self.doubt, enabled = str(error), False
         if enabled is not None:
-            self.gate.offer(*message.key, controller.torque if enabled else None)
+            self._send(message.key, controller.torque.copy() if enabled else None)
+
+    def _send(self, key, torque):
+        """The controller's answer to a sample; a stranger's comes right after it."""
+        self.gate.offer(*key, self.controller_id, torque, self.time)
+        if self.spoofed is not None:
+            self.gate.offer(*key, self.controller_id, self.spoofed, self.time)
 
     def _watch(self, time):
         """The controller's node notices that the states have stopped."""
         if time - self.last_new > STATE_TIMEOUT and self.loop.controller.enabled:
             self.loop.controller.distrust(f"no arm_state_estimate for {STATE_TIMEOUT:g} s")
-            self.gate.offer(*self._last_key, None)
+            self._send(self._last_key, None)
 
 
 def _fields(sample, names):

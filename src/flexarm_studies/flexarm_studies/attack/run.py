@@ -4,7 +4,7 @@ r"""Runs of a lie, and what they measure.
 A run is compared with the honest one of the same case, `Honest`, whose motion sets the scale:
 
 - *speed*: the largest speed of a joint over its largest in the motion, :math:`\max|\dot q_i|/\max|\dot q_i^h|`;
-- *strain*: the largest strain on a gauge over the largest in the motion;
+- *strain*: the largest strain on a gauge over the largest in the motion; *strain under torque*: before the safe action;
 - *excursion*: how far a joint leaves the range that it passes through in the motion [rad];
 - *step*: the largest change of torque between two samples over that in the motion, its first
   sample and its end left out;
@@ -31,8 +31,8 @@ from . import actions, lies
 from .cases import MOTION, START
 from .driver import LyingDriver
 
-#: A run ends at most so long after the lie [s].
-AFTER = 3.0
+#: A run ends at most so long after the lie, and after one of a single sample [s].
+AFTER, AT_ONCE = 3.0, 0.6
 #: A joint rests below this fraction of its largest speed in the motion [-]; so long, and a run is over [s].
 RESTS, RESTED = 0.03, 0.3
 #: A joint's or gauge's own peak counts for at least this fraction of the largest one [-].
@@ -42,6 +42,8 @@ SOON = 0.02
 #: Beyond this the arm is lost [rad].
 LOST = 20.0
 
+#: Of a measure that may reach its criterion.
+ROUNDING = 1e-9
 #: What has to hold: measure, largest value, for which kinds of lies; the issue's own numbers.
 CRITERIA = {
     "speed": 1.5,
@@ -54,6 +56,8 @@ CRITERIA = {
     "stop step": 2.0,
     "stop strain": 1.5,
 }
+#: Runs of these are over as well when the arm rests under a torque.
+RESTING = (lies.SINGLE, lies.INTERRUPTION, lies.STOP)
 _MOTION = ("speed", "strain", "excursion", "silent")
 OF_KIND = {
     lies.LASTING: (*_MOTION, "named"),
@@ -106,7 +110,7 @@ class Trace:
         return slice(int(np.searchsorted(self.time, time - 1e-9)), None)
 
 
-def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.0):
+def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.0, holds=False):
     """Run a `LyingDriver` through the case's motion.
 
     Parameters
@@ -118,6 +122,8 @@ def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.
         End of the run [s].
     begin, rest : float
         After `begin` the run is over once no torque acts and all joints have been slower than `rest` for `RESTED`.
+    holds : bool
+        A run is over as well when the arm rests under a torque.
 
     Returns
     -------
@@ -152,7 +158,7 @@ def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.
         if text != last:
             last = text
             texts.append((time, text))
-        slow = torque is None and np.abs(plant.qd).max() < rest
+        slow = (holds or torque is None) and np.abs(plant.qd).max() < rest
         rested = rested + driver.period if slow and time > begin else 0.0
         if rested > RESTED:
             break
@@ -258,7 +264,9 @@ def attack(honest, lie, moment, pick=0):
     events = getattr(actions, lie.action)(driver) if lie.action else []
     events = sorted(((at + after, call) for after, call in events), key=lambda e: e[0])
     over = events[-1][0] if events else at
-    trace = drive(driver, events, at + AFTER, max(over, at) + 0.3, RESTS * honest.speed.min())
+    after = AT_ONCE if lie.kind == lies.SINGLE else AFTER
+    rest = RESTS * honest.speed.min()
+    trace = drive(driver, events, at + after, over + 0.3, rest, lie.kind in RESTING)
     row = {"arm": honest.case.arm, "observer": honest.case.observer}
     row |= {"velocity": honest.case.velocity, "lie": lie.name, "kind": lie.kind, "moment": moment}
     return judged(row | measured(honest, lie, trace, driver, at), lie)
@@ -268,6 +276,8 @@ def measured(honest, lie, trace, driver, at):
     """The measures of a run."""
     part = trace.since(at)
     speed = np.abs(trace.velocity[part])
+    strain = np.abs(trace.strain[part]) / (honest.strain or 1.0)
+    acting = np.flatnonzero(trace.acts[part])
     q = trace.position[part]
     steps = np.abs(np.diff(trace.torque[part], axis=0)) / honest.step
     steps = steps[np.isfinite(steps).all(axis=1)]
@@ -275,7 +285,10 @@ def measured(honest, lie, trace, driver, at):
     named, text = _named(lie, trace, at, _seen(honest, lie, trace, driver, at))
     return {
         "speed": float((speed / honest.speed).max()),
-        "strain": float(np.abs(trace.strain[part]).max(initial=0.0) / (honest.strain or 1.0)),
+        "strain": float(strain.max(initial=0.0)),
+        "strain under torque": float(
+            strain[: acting[-1] + 2 if acting.size else 1].max(initial=0.0)
+        ),
         "excursion": float(np.maximum(honest.low - q, q - honest.high).max(initial=0.0)),
         "step": float(steps.max(initial=0.0)),
         "torque": float(np.nanmax(fraction, initial=0.0)),
@@ -350,10 +363,9 @@ def judged(row, lie):
     failed = []
     for name in OF_KIND[lie.kind]:
         value = row[name.removeprefix("stop ")]
-        if value is not None and not value <= CRITERIA[name] * (1.0 + 1e-9) + (
-            1e-3 if name == "silent" else 0.0
-        ):
-            failed.append(name)
+        if value is not None and value > CRITERIA[name] * (1.0 + ROUNDING):
+            of_brakes = name == "strain" and row["strain under torque"] <= CRITERIA["strain"]
+            failed.append("the safe action's strain" if of_brakes else name)
     if row["lost"]:
         failed.append("arm lost")
     if lie.ends and row["state"] != lie.ends:
