@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ParameterError
@@ -271,3 +271,59 @@ def test_several_faults_act_together():
     out = sent(lines, 5)
     assert numbers(out) == [[0], [1], [2], [], []]
     assert (out[0][0].values["strain"] == 0.5).all()
+
+
+# --------------------------------------------------------------------------- lies that keep on
+
+
+def test_drift_scale_and_exchange_change_an_entry_or_a_field():
+    entry = "strain.link1_middle"
+    for line, changed in (
+        (f"{entry} drift by=2.0 from=0.005", lambda v, t: v + [0, 2.0 * (t - 0.005), 0, 0]),
+        (f"{entry} scale by=-1.0 from=0.005", lambda v, t: v * [1, -1, 1, 1]),
+        (f"{entry} exchange from=0.005", lambda v, t: v[[0, 2, 1, 3]]),
+        ("strain.link2_middle exchange from=0.005", lambda v, t: v[[3, 1, 2, 0]]),
+        ("strain exchange from=0.005", lambda v, t: v[::-1]),
+        ("modal_rate bias by=900 from=0.005", lambda v, t: v + 900.0),
+    ):
+        name = line.split()[0].split(".")[0]
+        for k, out in enumerate(only([line], 8)):
+            true = sample(k).values[name]
+            expected = true if k < 5 else changed(true, 1e-3 * k)
+            assert_allclose(out.values[name], expected, rtol=1e-12, err_msg=line)
+
+
+def test_a_frozen_frame_has_the_number_and_stamp_of_now_and_a_repeat_those_of_then():
+    for kind in ("freeze", "repeat"):
+        out = only([f"state {kind} from=0.003 for=0.004"], 10)
+        for k, message in enumerate(out):
+            held = 3 if 3 <= k < 7 else k
+            for name, value in message.values.items():
+                assert_array_equal(value, sample(held).values[name], err_msg=kind)
+            own = held if kind == "repeat" else k
+            assert (message.sequence, message.stamp_ns) == (own, START + own * PERIOD)
+
+
+def test_stamps_jitter_within_their_bound_and_alike_with_the_same_seed():
+    off = [
+        [
+            m.stamp_ns - START - k * PERIOD
+            for k, m in enumerate(only([f"state jitter by=4e-4 seed={seed}"]))
+        ]
+        for seed in (1, 1, 2)
+    ]
+    assert off[0] == off[1] != off[2]
+    assert 300_000 < max(np.abs(off[0])) <= 400_000
+
+
+def test_a_session_changes_for_good_and_a_second_source_sends_in_turn():
+    injector = FaultInjector(ARM, ["session change at=0.003"])
+    assert [m[0].session for m in sent([], 6, injector)] == [0, 0, 0, 1, 1, 1]
+    assert injector.session == 1
+    injector.reset()
+    assert injector.session == 0
+    out = sent(["session alternate from=0.002 for=0.002"], 6)
+    assert [[m.session for m in messages] for messages in out] == [[0]] * 2 + [[0, 1]] * 2 + [
+        [0]
+    ] * 2
+    assert numbers(out) == [[0], [1], [2, 2], [3, 3], [4], [5]]

@@ -32,6 +32,11 @@ class Faults:
     parameters : mapping
         Values of `PARAMETERS`.
 
+    Attributes
+    ----------
+    restarted : bool
+        Whether the last messages are the first of another session: the driver acts as if it had restarted.
+
     Raises
     ------
     ParameterError
@@ -49,6 +54,7 @@ class Faults:
     def set(self, lines):
         """Replace the faults, all or none."""
         self._injector.set(self.allowed(lines))
+        self.restarted, self._restarts = False, 0
 
     def allowed(self, lines):
         """The lines, where faults are allowed."""
@@ -60,6 +66,7 @@ class Faults:
     def reset(self):
         """Begin a new session: the times of the faults start again."""
         self._injector.reset()
+        self.restarted, self._restarts = False, 0
 
     def outgoing(self, message, time):
         """The messages to publish for a true one: that one, or what the faults make of it.
@@ -67,6 +74,7 @@ class Faults:
         `time` is that since the start of the session [s].
         """
         if not self._injector.faults:
+            self.restarted = False
             return [message]
         names = {key: getattr(message, key) for key in set(FIELDS.values())}
         values = {
@@ -74,7 +82,10 @@ class Faults:
             for key in FIELDS
         }
         true = Sample(message.sequence, stamp_ns(message.header.stamp), names, values)
-        return [_message(message, sample) for sample in self._injector.outgoing(true, time)]
+        before, samples = self._restarts, self._injector.outgoing(true, time)
+        self._restarts = self._injector.session
+        self.restarted = self._restarts != before
+        return [_message(message, sample, sample.session - before) for sample in samples]
 
 
 def check(faults, parameters):
@@ -93,9 +104,9 @@ def check(faults, parameters):
     return SetParametersResult(successful=True)
 
 
-def _message(true, sample):
-    """A new `ArmState` with the values of a faulty sample."""
-    session = (true.session + sample.session) % 2**32
+def _message(true, sample, later):
+    """A new `ArmState` with the values of a faulty sample, of a session so much `later` than the true one's."""
+    session = (true.session + later) % 2**32
     message = ArmState(session=session, sequence=sample.sequence)
     message.controller_id, message.trust, message.doubt = (
         true.controller_id,

@@ -115,9 +115,11 @@ class SimulatorNode(Driver):
     def publish(self, sample):
         self.fill(sample, self.gate.controller_id(self.now()))
         self.sent = self.faults.outgoing(self.writer.message, self.sim.time)
+        if self.faults.restarted:
+            self.gate.begin((self.gate.session + 1) % WRAP)
         self.send()
         # The newest of several: the others are of the samples before it.
-        self.awaited = max((m.sequence for m in self.sent), default=None)
+        self.awaited = max((m.sequence for m in self.sent if self._is_own(m)), default=None)
         self.publish_joints(sample)
 
     def send(self, again=False):
@@ -125,9 +127,14 @@ class SimulatorNode(Driver):
         for message in self.sent:
             age = (self.sim.sequence - message.sequence) % WRAP  # a fault may have delayed it
             then = self.now() - age * self.period
-            message.controller_id = self.gate.sent(message.sequence, then)
+            if self._is_own(message):
+                message.controller_id = self.gate.sent(message.sequence, then)
             message.clock_stopped = again
             self.state_publisher.publish(message)
+
+    def _is_own(self, message):
+        """Whether a state is this driver's, and not that of a second one that a fault plays."""
+        return message.session == self.gate.session
 
     # Services, diagnostics ---------------------------------------------------------------------
 
