@@ -5,6 +5,7 @@ BENCH_ARGS ?=
 COMPARE_ARGS ?=
 FUZZ_ARGS ?= --inputs 1000000 --dds 10000
 SOAK_ARGS ?= --minutes 30
+ATTACK_ARGS ?=
 LATENCY_ARGS ?=
 MUTANTS_ARGS ?=
 
@@ -16,7 +17,7 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo check test mutants docs bench compare latency fuzz soak lint release-check clean distclean
+.PHONY: help build demo check test mutants docs bench compare latency fuzz soak attack lint release-check clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -30,6 +31,7 @@ help:
 	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
 	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
 	@echo 'make fuzz       build, then malformed input for every reader and node; FUZZ_ARGS="--inputs 10000"'
+	@echo 'make attack     build, then a driver that lies, on every arm; ATTACK_ARGS="--arms R --observers kalman"'
 	@echo 'make soak       build, then random motions, parameters and faults; SOAK_ARGS="--minutes 5"'
 	@echo 'make lint       check style (ruff)'
 	@echo 'make release-check   versions, style, docs, and the packages without ROS on every Python at hand'
@@ -97,6 +99,11 @@ fuzz: build
 
 soak: build
 	@. tools/env.sh && python -m soak $(SOAK_ARGS)
+
+# The table of docs/safety.md, of a whole run alone.
+ATTACK_OUT := --json docs/attack.json --write docs/safety.md
+attack: build
+	@. tools/env.sh && python -m flexarm_bringup.cli attack $(if $(ATTACK_ARGS),$(ATTACK_ARGS),$(ATTACK_OUT))
 
 lint: build
 	@. tools/env.sh && ruff check && ruff format --check

@@ -23,7 +23,7 @@ import numpy as np
 
 from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.errors import FlexarmError, ModelError
-from flexarm_dynamics.singular_perturbation import slow_subsystem
+from flexarm_dynamics.singular_perturbation import slow_torque
 from flexarm_sim.sensors import Sensors
 
 from ..loop import scenario as scenarios
@@ -233,9 +233,8 @@ class Honest:
 
     def static(self, position):
         """What holds the arm against gravity, (n,) [N m]."""
-        n, m = self.model.n_joints, self.model.n_modes
-        a, B = slow_subsystem(self.model.terms(position, np.zeros(n + m)[:n]))
-        return np.linalg.solve(B, -a)
+        still = np.zeros(self.model.n_joints)
+        return slow_torque(self.model.terms(position, still), still)
 
 
 def attack(honest, lie, moment, pick=0):
