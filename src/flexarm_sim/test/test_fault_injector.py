@@ -279,8 +279,8 @@ def test_several_faults_act_together():
 def test_drift_scale_and_exchange_change_an_entry_or_a_field():
     entry = "strain.link1_middle"
     for line, changed in (
-        (f"{entry} drift by=2.0 from=0.005", lambda v, t: v + [0, 2.0 * (t - 0.005), 0, 0]),
-        (f"{entry} scale by=-1.0 from=0.005", lambda v, t: v * [1, -1, 1, 1]),
+        (f"{entry} drift by=2.0 from=0.005", lambda v, t: v + np.eye(4)[1] * 2.0 * (t - 0.005)),
+        (f"{entry} scale by=-1.0 from=0.005", lambda v, t: v * (1.0 - 2.0 * np.eye(4)[1])),
         (f"{entry} exchange from=0.005", lambda v, t: v[[0, 2, 1, 3]]),
         ("strain.link2_middle exchange from=0.005", lambda v, t: v[[3, 1, 2, 0]]),
         ("strain exchange from=0.005", lambda v, t: v[::-1]),
