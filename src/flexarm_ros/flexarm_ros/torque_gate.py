@@ -36,7 +36,9 @@ class Controllers:
 
     #: Reasons: two ids in turn; one id with two torques for one state.
     SEVERAL = "several controllers publish joint_torque: stop all but one"
-    RACED = "two torques answer one state under one controller_id: a second program publishes joint_torque"
+    RACED = (
+        "two answers to one state under one controller_id: a second program publishes joint_torque"
+    )
 
     def __init__(self, alone):
         self.alone = alone
@@ -46,6 +48,7 @@ class Controllers:
         """Start again without any controller."""
         self.ids, self.pair = set(), ()
         self._last, self._until, self._reason = None, -np.inf, ""
+        self._withdrawn = -np.inf  # when a torque was last withdrawn
 
     def note(self, controller, now):
         """Note a message; return whether two send."""
@@ -61,6 +64,12 @@ class Controllers:
     def race(self, now):
         """Note that two torques answered one state under one id."""
         self._dispute(now, self.RACED)
+
+    def withdraw(self, now):
+        """Note DISABLED after a torque for the same state: once it is a controller's stop, twice they are two."""
+        if now - self._withdrawn < self.alone:
+            self.race(now)
+        self._withdrawn = now
 
     def _dispute(self, now, reason):
         self._until, self._reason = now + self.alone, reason
@@ -208,6 +217,10 @@ class TorqueGate:
                 return f"torque for state {sequence} after DISABLED for it"
             if (torque != self._answer).any():
                 self.controllers.race(now)
+                return self._drop(self.controllers.doubt(now))
+        if torque is None and sequence == self._answered and self._enabled:
+            self.controllers.withdraw(now)
+            if self.controllers.several(now):
                 return self._drop(self.controllers.doubt(now))
         self._answered, self._enabled = sequence, torque is not None
         self._claimant, self._fresh_until = controller, sent + self.timeout

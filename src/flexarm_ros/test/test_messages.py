@@ -332,7 +332,7 @@ def controllers_state_is_written_in_place():
     sample = ArmSample(1, 2)
     sample.session, sample.rate = 1, np.array([0.01, -0.02])
     for k in range(3):
-        sample.sequence, sample.stamp_ns = k, 10**9 * (k + 1)
+        sample.sequence, sample.stamp_ns = k, 10**9 + 10**6 * k
         sample.position[:], sample.velocity[:] = 0.1 * k, 0.2
         sample.amplitude[:] = [1e-3, -1e-4 * k]
         assert core.step(sample)

@@ -167,7 +167,7 @@ def test_a_stranger_with_another_id_is_not_applied_and_ends_the_claim(gate):
 def test_two_torques_for_one_state_under_one_id_are_a_race(gate, values):
     assert gate.offer(torque(values[0]), 0.031) == ""
     assert gate.offer(torque(values[0]), 0.032) == ""  # sent again
-    assert "two torques answer one state" in gate.offer(torque(values[1]), 0.033)
+    assert "two answers to one state" in gate.offer(torque(values[1]), 0.033)
     assert gate.torque(0.033) is None and gate.controllers.doubt(0.034) == Controllers.RACED
     for k in range(4, 120):
         now = 0.01 * k
@@ -183,6 +183,20 @@ def test_disabled_may_follow_a_torque_for_the_same_state_but_no_torque_follows_d
     assert gate.torque(0.033) is None and not gate.controllers.several(0.033)
     assert gate.sent(4, 0.04) == 1  # it is still the one whose torque would act
     assert gate.offer(torque(sequence=4), 0.041) == ""
+
+
+def test_a_torque_that_is_withdrawn_again_and_again_is_a_race():
+    gate = TorqueGate(arm_file.load("R"), TIMEOUT)
+    gate.begin(SESSION)
+    acted = []
+    for k in range(2000):  # a stranger sends torque under the id of a controller that says DISABLED
+        now = 0.001 * k
+        gate.sent(k, now)
+        gate.offer(torque(9.0, sequence=k), now)
+        acted.append(gate.torque(now) is not None)
+        gate.offer(torque(sequence=k, mode=JointTorque.DISABLED), now)
+        assert gate.torque(now) is None
+    assert sum(acted) <= 4 and gate.controllers.doubt(now) == Controllers.RACED
 
 
 def test_a_state_that_is_published_for_ever_keeps_no_torque(gate):
