@@ -120,10 +120,11 @@ class Reference(Reader):
 
     def run(self, rng):
         fastest = rng.choice((None, FASTEST))
-        reference, refused = ReferenceGenerator(JOINTS, 0.01, fastest), 0
-        now = rng.choice((0, 10**9, 2**62))
-        reference.start([rng.uniform(-0.4, 0.4) for _ in JOINTS], now)
-        self.given = history = [("start", now)]
+        reference = ReferenceGenerator(JOINTS, 0.01, fastest, rng.choice((0.0, 0.5)))
+        refused, now = 0, rng.choice((0, 10**9, 2**62))
+        velocity = rng.choice((None, [rng.uniform(-1.0, 1.0) for _ in JOINTS]))
+        reference.start([rng.uniform(-0.4, 0.4) for _ in JOINTS], now, velocity)
+        self.given = history = [("start", now, velocity)]
         for _ in range(self.batch):
             kind = rng.randrange(6)
             if kind == 0:
@@ -140,10 +141,11 @@ class Reference(Reader):
 
     def _stop(self, rng, reference, now, history):
         deceleration = rng.choice((1.0, 20.0, [1.0, 2.0], 1e-9, *odd.FLOATS, [1.0], "a", None))
-        history.append(("stop", now, deceleration))
+        given = rng.random() < 0.5
+        history.append(("stop", now, deceleration, given))
         before = _numbers(reference)
         try:
-            reference.stop(now, deceleration)
+            reference.stop(now, deceleration, given)
         except TrajectoryError as error:
             self.check_message(error)
             demand(np.array_equal(before, _numbers(reference)), "a refused stop has moved it")

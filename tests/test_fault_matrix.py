@@ -232,7 +232,7 @@ def test_stop_brings_the_reference_to_rest_and_the_next_move_goes_on_from_there(
     speed = arm.state.reference_velocity[0]
     answer = arm.bench.call(Trigger, "controller/stop")
     assert answer.success and "STOPPING" in answer.message
-    arm.run(0.5)
+    arm.run(1.5)
     reported = [m for m in arm.samples(session).values() if m.sequence > 610]
     states = list(dict.fromkeys(m.supervisor_state for m in reported))
     assert states == [CompositeState.TRACKING, CompositeState.STOPPING, HOLDING] or states == [

@@ -19,10 +19,21 @@ The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the j
 frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. If the arm's
 inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated. A
 trajectory that arrives while the arm moves is then followed on the slow manifold alone.
+
+The manifold jumps wherever the reference's jerk or snap does: between the polynomials of a trajectory, at its start and
+end. The regulator's torque must not. So the jump is added to what the regulator tracks, and fades:
+
+.. math::
+    s_{ref}(t) + \sum_i J_i\,\phi(t - t_i), \qquad
+    \phi(t) = \bigl(1 + \lambda t + \tfrac{1}{2}\lambda^2t^2\bigr)\,e^{-\lambda t},
+
+likewise u_ref. J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives. Its
+first two derivatives are zero at t_i; lambda = `FADING` omega_1.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -47,14 +58,22 @@ APART = 0.12
 NEGLIGIBLE = 1e-6
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
+#: Rate at which a jump of the motion that the regulator tracks fades, over the lowest bending frequency.
+FADING = 3.0
+#: A jump is gone when this is left of it, in any coordinate and torque.
+GONE = 1e-12
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
 SAME_START = 1e-6
 
 
+def _lowest(model, q):
+    """Lowest bending frequency with the joints locked, omega_1 [rad/s]; 10 for a rigid arm."""
+    return float(model.frequencies(q, locked=True)[0]) if model.n_modes else 10.0
+
+
 def regulator(model, q):
     """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module."""
-    n = model.n_joints
-    omega = float(model.frequencies(q, locked=True)[0]) if model.n_modes else 10.0
+    n, omega = model.n_joints, _lowest(model, q)
     A, B = linear_plant(model, q, coulomb=False)
     Q = np.zeros(A.shape)
     inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
@@ -138,21 +157,128 @@ def gains_along(model, path, period):
     return Gains(grid[at], gains)
 
 
-class _Ahead:
-    """The reference at a coming stamp and the result for it; the reference itself does not change."""
+class Fading:
+    """Jumps that fade; see the module.
 
-    def __init__(self, reference, dt, limit):
-        self.path, self.dt, self.limit = reference.path, dt, limit
-        self.start_ns, self.stamp_ns = self.path.start_ns, reference.stamp_ns + round(dt * SECOND)
-        state = np.zeros((3, reference.position.size))
-        self.path.evaluate(self.stamp_ns, state)
+    Parameters
+    ----------
+    size : int
+        Of the signal that jumps.
+    rate : float
+        lambda [1/s].
+
+    Attributes
+    ----------
+    left : ndarray, shape (size,)
+        What is left of them all.
+    """
+
+    def __init__(self, size, rate):
+        self.rate = rate
+        # (c0 + c1 t + c2 t^2) e^{-lambda t} from now on: jumps add up in it, however many there were.
+        self._c = np.zeros((3, size))
+        self.left, self._active = self._c[0], False
+
+    def clear(self):
+        """Forget all jumps."""
+        self._c[:], self._active = 0.0, False
+
+    def take(self, other):
+        """Take the jumps of another of the same size."""
+        self._c[:], self._active = other._c, other._active
+
+    def advance(self, dt):
+        """Go on by a time [s]."""
+        if not self._active:
+            return
+        c0, c1, c2 = self._c
+        c0 += dt * (c1 + dt * c2)
+        c1 += 2.0 * dt * c2
+        self._c *= np.exp(-self.rate * dt)
+        if np.abs(self._c).max() < GONE:
+            self.clear()
+
+    def jump(self, by):
+        """Add a jump, (size,)."""
+        for c, factor in zip(self._c, (1.0, self.rate, 0.5 * self.rate**2), strict=True):
+            c += factor * by
+        self._active = True
+
+
+class _Source(NamedTuple):
+    """What the motion that the regulator tracks is taken from at a sample, and that motion."""
+
+    path: object  # None: a hold
+    piece: object  # of the path
+    plan: object  # followed in place of the manifold; None: none
+    stamp_ns: int
+    state: np.ndarray  # (2 (n + m),)
+    torque: np.ndarray  # (n,) [N m]
+
+    @property
+    def rests(self):
+        """Whether the reference does not move."""
+        return self.path is None or self.piece == Path.END
+
+    def goes_on(self, other):
+        """Whether one formula gave this and the other's motion."""
+        return self[:3] == other[:3]
+
+
+class _Run:
+    """The simulated arm, and the regulator's memory.
+
+    Attributes
+    ----------
+    state, torque : ndarray, shapes (2 (n + m),) and (n,)
+    fading : Fading
+        Of (state, torque).
+    source : _Source or None
+        Of the last sample.
+    gained : bool
+        Whether there was a gain at the last sample.
+    """
+
+    def __init__(self, size, n, rate):
+        self.state, self.torque = np.zeros(size), np.zeros(n)
+        self.fading, self.source, self.gained = Fading(size + n, rate), None, False
+
+    def take(self, other):
+        """Go on as the other one would."""
+        self.state[:], self.torque[:] = other.state, other.torque
+        self.fading.take(other.fading)
+        self.source, self.gained = other.source, other.gained
+
+    def copy(self):
+        """One to be run ahead."""
+        out = _Run(self.state.size, self.torque.size, self.fading.rate)
+        out.take(self)
+        return out
+
+
+class At:
+    """The reference on a path's polynomial of a stamp, at an offset from it; the reference itself does not change."""
+
+    def __init__(self, path, stamp_ns, offset=0.0):
+        self.path, self.stamp_ns, self._offset = path, stamp_ns, offset
+        state = np.zeros((3, path.begin_state.shape[1]))
+        path.near(stamp_ns, offset, state)
         self.position, self.velocity, self.acceleration = state
         self._near = np.zeros_like(state)
-        self.state = self.torque = None
 
     def near(self, offset):
-        self.path.near(self.stamp_ns, offset, self._near)
+        """State (position, velocity, acceleration), (3, n), at an `offset` [s] from there; overwritten by the next."""
+        self.path.near(self.stamp_ns, self._offset + offset, self._near)
         return self._near
+
+
+class _Ahead(At):
+    """The reference at a coming stamp, and the result for it."""
+
+    def __init__(self, reference, dt, limit):
+        super().__init__(reference.path, reference.stamp_ns + round(dt * SECOND))
+        self.dt, self.limit, self.start_ns = dt, limit, self.path.start_ns
+        self.run = None
 
     def foresaw(self, reference, dt):
         """Whether this is the sample that has come."""
@@ -169,7 +295,8 @@ class ModelFeedforward(Feedforward):
         n, m = model.n_joints, model.n_modes
         self._make_stepper()
         self._substeps = substeps(model, settings.period, "rk4")
-        self.state, self._error = np.zeros(2 * (n + m)), np.zeros(2 * (n + m))
+        self._error = np.zeros(2 * (n + m))
+        self._run = _Run(2 * (n + m), n, FADING * _lowest(model, settings.configuration))
         self._name_parts()
         #: The gain, if it does not depend on the joints; else None.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
@@ -185,12 +312,22 @@ class ModelFeedforward(Feedforward):
 
     def _name_parts(self):
         n, m = self.model.n_joints, self.model.n_modes
+        self.state, self.torque = self._run.state, self._run.torque
         parts = np.split(self.state, [n, n + m, 2 * n + m])
         self.position, self.amplitude, self.velocity, self.rate = parts
 
     def __getstate__(self):
         """Without compiled code, and without the views of `state`: for another process."""
-        left = ("_advance", "position", "amplitude", "velocity", "rate", "_ahead")
+        left = (
+            "_advance",
+            "position",
+            "amplitude",
+            "velocity",
+            "rate",
+            "state",
+            "torque",
+            "_ahead",
+        )
         return {name: value for name, value in self.__dict__.items() if name not in left}
 
     def __setstate__(self, state):
@@ -232,71 +369,115 @@ class ModelFeedforward(Feedforward):
 
     def resume(self, other):
         if isinstance(other, ModelFeedforward):
-            self.state[:], self.torque[:] = other.state, other.torque
+            self._run.take(other._run)
             self._first, self._prepared = other._first, other._prepared
             self._ahead = None
 
     def _preparation(self, reference):
         """What was designed for the active trajectory, and the time since its start; None, 0 without."""
         prepared, path = self._prepared, reference.path
-        if prepared is None or path is None or path.trajectory_id != prepared.trajectory_id:
+        if prepared is None or path is None:
             return None, 0.0
-        if np.abs(path.begin_state - prepared.start).max() > SAME_START:
+        followed = path.followed
+        if followed.trajectory_id != prepared.trajectory_id:
             return None, 0.0
-        return prepared, (reference.stamp_ns - path.start_ns) / SECOND
+        if np.abs(followed.begin_state - prepared.start).max() > SAME_START:
+            return None, 0.0
+        return prepared, path.elapsed(reference.stamp_ns)
 
-    def wanted(self, reference, prepared, elapsed):
-        """State (2 (n + m),) and torque (n,) that the regulator holds the simulated arm to."""
-        rests = not (reference.velocity.any() or reference.acceleration.any())
-        if rests and self._held is not None and np.array_equal(self._held[0], reference.position):
-            return self._held[1:]
+    def _planned(self, prepared, path, stamp_ns):
+        """The plan that is followed at a stamp in place of the slow manifold, if any."""
+
+    def _along(self, plan, path, stamp_ns, offset):
+        """State and torque of a plan, `offset` [s] from a stamp."""
+
+    def _source(self, reference, prepared):
+        """What the regulator holds the simulated arm to, and where it is from."""
+        path, stamp = reference.path, reference.stamp_ns
+        piece = Path.END if path is None else path.piece(stamp)
+        plan = self._planned(prepared, path, stamp)
+        held = self._held
+        if plan is not None:
+            piece = piece, path.followed.piece(stamp)
+            state, torque = self._along(plan, path, stamp, 0.0)
+        elif piece != Path.END:
+            state, torque = self._on_manifold(reference)
+        elif held is not None and np.array_equal(held[0], reference.position):
+            state, torque = held[1:]
+        else:
+            state, torque = self._on_manifold(reference)
+            self._held = reference.position.copy(), state, torque
+        return _Source(path, piece, plan, stamp, state, torque)
+
+    def _on_manifold(self, reference):
+        """State (2 (n + m),) and torque (n,) of the slow manifold."""
         delta, rate, torque = self.manifold.along(reference)
-        state = np.concatenate([reference.position, delta, reference.velocity, rate])
-        self._held = (reference.position.copy(), state, torque) if rests else None
-        return state, torque
+        return np.concatenate([reference.position, delta, reference.velocity, rate]), torque
+
+    def _continued(self, source, dt):
+        """State and torque that a source would give after a time [s], (2 (n + m) + n,)."""
+        if source.plan is not None:
+            state, torque = self._along(source.plan, source.path, source.stamp_ns, dt)
+        elif source.rests:
+            state, torque = source.state, source.torque
+        else:
+            state, torque = self._on_manifold(At(source.path, source.stamp_ns, dt))
+        return np.concatenate([state, torque])
 
     def update(self, reference, dt):
         ahead, self._ahead = self._ahead, None
         if ahead is not None and ahead.limit is self.limit and ahead.foresaw(reference, dt):
-            self.state[:], self.torque[:] = ahead.state, ahead.torque
+            self._run.take(ahead.run)
             self.acceleration[:] = ahead.acceleration
             return
         if not self._first and dt > 0.0:  # under the torque of the last sample
-            self._move(self.state, dt)
-        self._regulate(reference, self.state, self.torque)
+            self._move(self._run, dt)
+        self._regulate(reference, dt, self._run)
         self.acceleration[:] = reference.acceleration
 
-    def _regulate(self, reference, state, torque):
-        """Set the torque for a state of the simulated arm, both in place; the state, too, if the arm starts again."""
+    def _regulate(self, reference, dt, run):
+        """Set the torque of a run; its state, too, if the simulated arm starts again."""
         prepared, elapsed = self._preparation(reference)
-        wanted, nominal = self.wanted(reference, prepared, elapsed)
-        K = self.K
+        source, before = self._source(reference, prepared), run.source
+        K, fading, size = self.K, run.fading, run.state.size
         if K is None and prepared is not None and prepared.gains is not None:
             K = prepared.gains.at(elapsed)
-        np.subtract(wanted, state, out=self._error)
+        if self._first or before is None:
+            fading.clear()
+        else:
+            fading.advance(dt)
+            if not source.goes_on(before):
+                now = np.concatenate([source.state, source.torque])
+                fading.jump(self._continued(before, dt) - now)
+        if K is None and run.gained:  # what the regulator had not brought in is a jump, too
+            wanted = np.concatenate([source.state, source.torque]) + fading.left
+            fading.jump(np.concatenate([run.state, run.torque]) - wanted)
+        run.source, run.gained = source, K is not None
+        np.add(source.state, fading.left[:size], out=self._error)
+        self._error -= run.state
         if self._starts_again(reference, K):
-            state[:] = wanted
+            run.state += self._error
             self._error[:] = 0.0
-        np.copyto(torque, nominal)
+        np.add(source.torque, fading.left[size:], out=run.torque)
         if K is not None:
-            torque += K @ self._error
-        clip(torque, -self.limit, self.limit)
+            run.torque += K @ self._error
+        clip(run.torque, -self.limit, self.limit)
 
-    def _move(self, state, dt):
-        """Advance a state of the simulated arm in place, under the present torque."""
+    def _move(self, run, dt):
+        """Advance a run's simulated arm, under its present torque."""
         count = max(1, round(dt / self.settings.period)) * self._substeps
-        self._advance(state, self.torque, dt / count, count)
+        self._advance(run.state, run.torque, dt / count, count)
 
     def look_ahead(self, reference, dt):
         if self._first or dt <= 0.0 or reference.path is None:
             return None
         ahead = _Ahead(reference, dt, self.limit)
-        ahead.state, ahead.torque = self.state.copy(), self.torque.copy()
-        self._move(ahead.state, dt)
-        self._regulate(ahead, ahead.state, ahead.torque)
+        run = ahead.run = self._run.copy()
+        self._move(run, dt)
+        self._regulate(ahead, dt, run)
         self._ahead = ahead
-        n, size = self.model.n_joints, ahead.state.size // 2
-        return ahead.state[:n], ahead.state[size : size + n], ahead.acceleration
+        n, size = self.model.n_joints, run.state.size // 2
+        return run.state[:n], run.state[size : size + n], ahead.acceleration
 
     def _starts_again(self, reference, K):
         """Whether the simulated arm is put on the wanted state: at first, when lost, and at rest when it is there."""

@@ -18,6 +18,14 @@ solves one linear system. If its torque exceeds the limit, a linear programme (H
 the smallest maximum within the limit. The full equations are then integrated along the solution, linearised there, and
 solved again. All of this happens when the trajectory is received, off the control path. `model` follows the motion in
 place of the slow manifold: the regulator of its simulated arm removes the remaining error.
+
+In a stop, the plan can't be followed. Its bending beside the slow manifold is a vibration, which goes on in its own
+time and ends with the plan; the regulator damps it as the joints slow down. So with the manifold's motion s_ref along
+the stop, and s_path along the trajectory, the simulated arm is held to
+
+.. math:: s_{ref}(t) + \dot s(t)\,\bigl(s_{plan}(t) - s_{path}(t)\bigr),
+
+where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); likewise the torque.
 """
 
 from dataclasses import dataclass
@@ -30,7 +38,7 @@ from scipy.optimize import linprog
 from flexarm_dynamics.errors import DesignError
 
 from ..trajectory.values import SECOND
-from .model import ModelFeedforward
+from .model import At, ModelFeedforward
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -80,12 +88,22 @@ class Preview(ModelFeedforward):
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
             return _Planner(model, path, start, self.limit).solve()
 
-    def wanted(self, reference, prepared, elapsed):
-        if prepared is None or not 0.0 <= elapsed < prepared.plan.duration:
-            return super().wanted(reference, prepared, elapsed)
+    def _planned(self, prepared, path, stamp_ns):
+        if prepared is None:
+            return None
+        elapsed_ns = stamp_ns - path.followed.start_ns
+        return prepared.plan if 0 <= elapsed_ns < prepared.plan.duration * SECOND else None
+
+    def _along(self, plan, path, stamp_ns, offset):
+        way = path.followed
+        elapsed = (stamp_ns - way.start_ns) / SECOND + offset
         # The torque is held over the coming period: that of its middle.
-        plan = prepared.plan
-        return plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
+        state, torque = plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
+        if path is way:
+            return state, torque
+        stop, motion = (self._on_manifold(At(p, stamp_ns, offset)) for p in (path, way))
+        left = path.speed(stamp_ns, offset)
+        return stop[0] + left * (state - motion[0]), stop[1] + left * (torque - motion[1])
 
 
 def _finite(*arrays):

@@ -80,7 +80,9 @@ class ArmController:
         n = model.n_joints
         self.model, self.law, self.answered_by = model, law, law
         fastest = model.arm.velocity_limits
-        self.reference = ReferenceGenerator(model.joint_names, start_tolerance, fastest)
+        self.reference = ReferenceGenerator(
+            model.joint_names, start_tolerance, fastest, _longest_period(model)
+        )
         self._start_tolerance = start_tolerance
         self._nothing = np.zeros(0)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
@@ -337,7 +339,9 @@ class ArmController:
         if not self.enabled:
             return False
         try:
-            self.reference.stop(self._last_ns, self.supervisor.deceleration)
+            self.reference.stop(
+                self._last_ns, self.supervisor.deceleration, self.supervisor.deceleration_given
+            )
         except FlexarmError as error:
             self.fail(f"{reason}; and no smooth stop: {error}")
             return True
@@ -499,6 +503,13 @@ class ArmController:
             name = self.model.joint_names[int(np.argmax(moved))]
             return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
         return ""
+
+
+def _longest_period(model):
+    """Period of the lowest bending mode with straight, locked joints [s]; 0 for a rigid arm."""
+    if not model.n_modes:
+        return 0.0
+    return 2.0 * np.pi / float(model.frequencies(np.zeros(model.n_joints), locked=True)[0])
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):

@@ -68,7 +68,8 @@ PARAMETERS = (
         "With synchronised_clocks: an older state, or one so far from the future, is a fault."
     ),
     parameter("stop_deceleration", [0.0], "rad/s^2", 0.0, 1e5, length="joints").described(
-        "Deceleration of the reference in a smooth stop, per joint; 0.0: half of what the torque limit allows."
+        "Largest deceleration by which a smooth stop slows a motion down, per joint; 0.0: what keeps the arm to"
+        " about the motion's own acceleration and jerk."
     ),
 )
 
@@ -108,7 +109,9 @@ class Supervisor:
     stops, faults : int
         How many there have been.
     deceleration : ndarray, shape (n,)
-        Of a smooth stop [rad/s^2].
+        Of a smooth stop [rad/s^2]: asked for, or half of what the torque limit allows.
+    deceleration_given : ndarray, shape (n,), bool
+        Whether it was asked for.
 
     Raises
     ------
@@ -179,6 +182,7 @@ class Supervisor:
         self._limit, self._inverse = limit, 1.0 / limit
         self._watches_strain = bool(np.isfinite(limit[self._parts[4]]).any())
         self.deceleration = np.where(wanted > 0.0, wanted, finite)
+        self.deceleration_given = wanted > 0.0
 
     def forget(self):
         """No limit has been exceeded so far."""

@@ -23,10 +23,9 @@ Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 
 from .reference import ReferenceGenerator, Verdict
 from .request import JointTrajectoryData, validate
-from .values import BRAKING_STEP, MAX_MAGNITUDE, MAX_POINTS
+from .values import MAX_MAGNITUDE, MAX_POINTS
 
 __all__ = [
-    "BRAKING_STEP",
     "MAX_MAGNITUDE",
     "MAX_POINTS",
     "JointTrajectoryData",

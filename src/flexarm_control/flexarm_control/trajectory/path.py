@@ -1,9 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Piecewise polynomials through the points of a trajectory, evaluated on the control path."""
+r"""Piecewise polynomials through the points of a trajectory, and the way along them that ends in a stop.
+
+A stop slows down the trajectory's own time: the reference is :math:`q_r(s(t))`, with :math:`\dot s` from 1 to 0. The
+arm stays on its path, and is never faster than the motion. Over the stop's duration T, with x = t / T,
+
+.. math:: \dot s = 1 - S(x), \qquad S(x) = 35 x^4 - 84 x^5 + 70 x^6 - 20 x^7,
+
+whose first three derivatives are zero at both ends. Acceleration, jerk and snap of the reference,
+
+.. math::
+    \ddot q &= q_r^{(2)}\dot s^2 + q_r^{(1)}\ddot s \\
+    q^{(3)} &= q_r^{(3)}\dot s^3 + 3 q_r^{(2)}\dot s\ddot s + q_r^{(1)} s^{(3)},
+
+are then as continuous as those of the trajectory. A slow manifold is made of them, and moves without a step.
+"""
+
+import math
 
 import numpy as np
 
 from .values import SECOND
+
+#: Places of a polynomial at which its acceleration and jerk are looked at, as fractions of its length.
+PLACES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 def hermite(duration, before, after):
@@ -46,6 +65,26 @@ def hermite(duration, before, after):
     ]
 
 
+def _derivatives(coefficients, x):
+    """Velocity, acceleration and jerk, (3, k, n), of polynomials (k, order, n) at x (k, 1) [s]."""
+    order = coefficients.shape[1]
+    out = np.zeros((3, len(coefficients), coefficients.shape[2]))
+    for nu in range(1, 4):
+        for i in reversed(range(nu, order)):
+            out[nu - 1] *= x
+            out[nu - 1] += math.perm(i, nu) * coefficients[:, i]
+    return out
+
+
+def _peaks(coefficients, lengths):
+    """Largest speed, acceleration and jerk, (3, n), of polynomials (k, order, n) over lengths (k, 1) [s]."""
+    found = np.zeros((3, coefficients.shape[2]))
+    for fraction in PLACES:
+        size = np.abs(_derivatives(coefficients, fraction * lengths)).max(axis=1)
+        np.maximum(found, size, out=found)
+    return found
+
+
 class Path:
     """A piecewise polynomial from the reference at its start to its last point.
 
@@ -64,6 +103,9 @@ class Path:
         The trajectory of the path; 0: a stop.
     """
 
+    #: The piece that a path ends in: its last state, held.
+    END = -1
+
     def __init__(self, times_ns, derivatives, trajectory_id=0):
         k, n = derivatives[0].shape
         order = 2 * len(derivatives)
@@ -71,6 +113,7 @@ class Path:
         self.start_ns = 0
         self.begin_state = np.zeros((3, n))
         self.duration_ns = int(times_ns[-1])
+        self._rest_peaks = np.zeros((3, n))
         self._first = [values[0] for values in derivatives]
         self._end = np.zeros((3, n))
         self._end[0] = derivatives[0][-1]
@@ -82,6 +125,7 @@ class Path:
             after = [values[1:] for values in derivatives]
             for i, values in enumerate(hermite(lengths, before, after)):
                 self._coefficients[1:, i] = values
+            self._rest_peaks = _peaks(self._coefficients[1:], lengths)
         # Coefficients of the current segment, for position, velocity and acceleration side by side,
         # so that one Horner scheme evaluates all three. d/dx of sum c_i x^i has (i + 1) c_{i+1}.
         self._stack = np.zeros((order, 3, n))
@@ -92,6 +136,43 @@ class Path:
         # The last evaluated state: most stamps are evaluated twice, ahead of time and when sampled.
         self._last = np.zeros((3, n))
         self._forget_segment()
+
+    @property
+    def followed(self):
+        """The path whose way is taken: this one."""
+        return self
+
+    def elapsed(self, stamp_ns):
+        """Time of this path that a stamp stands for, from its start [s]."""
+        return (stamp_ns - self.start_ns) / SECOND
+
+    def piece(self, stamp_ns):
+        """Number of the polynomial at a stamp; `END` at the end and after it."""
+        elapsed_ns = max(stamp_ns - self.start_ns, 0)
+        if elapsed_ns >= self.duration_ns:
+            return self.END
+        if not self._low_ns <= elapsed_ns < self._high_ns:
+            self._enter_segment(elapsed_ns)
+        return self._segment
+
+    def peaks(self):
+        """Largest speed, acceleration and jerk of every joint on the path, (3, n) [rad/s], [rad/s^2], [rad/s^3].
+
+        Without the jumps between polynomials; from six places of each, which is right to a few thousandths.
+        """
+        first = self._knots_ns[1:2, None] / SECOND
+        return np.maximum(_peaks(self._coefficients[:1], first), self._rest_peaks)
+
+    def derivatives(self, elapsed):
+        """Velocity, acceleration and jerk, (3, k, n), at times (k,) from the start [s]; zero after the end."""
+        elapsed_ns = np.clip(np.rint(elapsed * SECOND), 0.0, self.duration_ns).astype(np.int64)
+        over = elapsed_ns >= self.duration_ns
+        segment = np.searchsorted(self._knots_ns, elapsed_ns, side="right") - 1
+        segment[over] = 0
+        x = ((elapsed_ns - self._knots_ns[segment]) / SECOND)[:, None]
+        out = _derivatives(self._coefficients[segment], x)
+        out[:, over] = 0.0
+        return out
 
     def _forget_segment(self):
         self._segment, self._low_ns, self._high_ns = -1, 0, 0
@@ -127,14 +208,18 @@ class Path:
         return True
 
     def near(self, stamp_ns, offset, out):
-        """Fill `out` (3, n) with the state `offset` [s] from a stamp, on the polynomial at that stamp."""
+        """Fill `out` (3, n) with the state `offset` [s] from `stamp_ns`, on the polynomial at that stamp.
+
+        Whether the stamp is before the end; after it the state is that of the end, at any offset.
+        """
         elapsed_ns = max(stamp_ns - self.start_ns, 0)
         if elapsed_ns >= self.duration_ns:
             np.copyto(out, self._end)
-            return
+            return False
         if not self._low_ns <= elapsed_ns < self._high_ns:
             self._enter_segment(elapsed_ns)
         self._horner((elapsed_ns - self._low_ns) / SECOND + offset, out)
+        return True
 
     def _horner(self, x, out):
         self._x[()] = x
@@ -158,3 +243,116 @@ class Path:
         stack[:, 0] = c
         np.multiply(c[1:], self._once, out=stack[:-1, 1])
         np.multiply(c[2:], self._twice, out=stack[:-2, 2])
+
+
+class Slowing:
+    """Time law of a stop: s(t) and its derivatives, from s' = 1 to rest; see the module.
+
+    Parameters
+    ----------
+    duration : float
+        T [s].
+    """
+
+    #: Largest S', at x = 1/2, and largest S'' [-].
+    MAX_SLOPE, MAX_BEND = 35.0 / 16.0, 84.0 / 25.0 * math.sqrt(5.0)
+
+    def __init__(self, duration):
+        self.duration = duration
+
+    def at(self, elapsed):
+        """s [s] and its first two derivatives [-], [1/s] at a time since the stop began [s]."""
+        x = elapsed / self.duration
+        if x <= 0.0:
+            return elapsed, 1.0, 0.0
+        if x >= 1.0:
+            return 0.5 * self.duration, 0.0, 0.0
+        covered, speed, change, _ = _slowing(x)
+        return covered * self.duration, speed, change / self.duration
+
+    @staticmethod
+    def table(count):
+        """At `count` places x from 0 to 1: s / T and its first three derivatives by x, (4, count) [-]."""
+        return np.array(_slowing(np.linspace(0.0, 1.0, count)))
+
+
+def _slowing(x):
+    y, x4 = 1.0 - x, x * x * x * x
+    return (
+        x - x4 * x * (7.0 - x * (14.0 - x * (10.0 - 2.5 * x))),
+        1.0 - x4 * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x))),
+        -140.0 * (x * y) ** 3,
+        -420.0 * (x * y) ** 2 * (y - x),
+    )
+
+
+class SlowedPath:
+    """A path that is slowed down to rest; see the module. It ends with the path, if that ends first.
+
+    Parameters
+    ----------
+    path : Path
+        Begun, and not changed any more.
+    start_ns : int
+        Stamp at which slowing begins [ns].
+    duration_ns : int
+        Of the slowing [ns].
+    """
+
+    trajectory_id = 0
+
+    def __init__(self, path, start_ns, duration_ns):
+        self.followed, self.start_ns, self.duration_ns = path, start_ns, duration_ns
+        self._slowing = Slowing(duration_ns / SECOND)
+        self._begin_ns = max(start_ns - path.start_ns, 0)
+        self.begin_state, self._end = np.zeros((2, *path.begin_state.shape))
+        path.evaluate(start_ns, self.begin_state)
+        path.near(*self._place(0.5 * self._slowing.duration), self._end)
+        self._end[1:] = 0.0
+
+    def _place(self, s):
+        """Stamp of the path, and what is left to it [s], at a time s of the path since the stop began [s]."""
+        whole = int(s * SECOND)
+        return self.followed.start_ns + self._begin_ns + whole, s - whole / SECOND
+
+    def elapsed(self, stamp_ns):
+        """Time of the path that a stamp stands for, from the path's start [s]."""
+        since = max(stamp_ns - self.start_ns, 0) / SECOND
+        return self._begin_ns / SECOND + self._slowing.at(since)[0]
+
+    def speed(self, stamp_ns, offset=0.0):
+        """How fast the path's time goes, s', `offset` [s] from a stamp [-]."""
+        return self._slowing.at((stamp_ns - self.start_ns) / SECOND + offset)[1]
+
+    def piece(self, stamp_ns):
+        """Number of the path's polynomial at a stamp; `Path.END` at the end and after it."""
+        elapsed_ns = max(stamp_ns - self.start_ns, 0)
+        if elapsed_ns >= self.duration_ns:
+            return Path.END
+        return self.followed.piece(self._place(self._slowing.at(elapsed_ns / SECOND)[0])[0])
+
+    def evaluate(self, stamp_ns, out):
+        """Fill `out` (3, n) with the state at a stamp; return whether it is before the end."""
+        return self.near(stamp_ns, 0.0, out)
+
+    def near(self, stamp_ns, offset, out):
+        """Fill `out` (3, n) with the state `offset` [s] from `stamp_ns`, on the path's polynomial at that stamp.
+
+        Whether the stamp is before the end; after it the state is that of the end, at any offset.
+        """
+        elapsed_ns = max(stamp_ns - self.start_ns, 0)
+        if elapsed_ns >= self.duration_ns:
+            np.copyto(out, self._end)
+            return False
+        now = elapsed_ns / SECOND
+        s, speed, change = self._slowing.at(now)
+        place, rest = self._place(s)
+        if offset:
+            later, speed, change = self._slowing.at(now + offset)
+            rest += later - s
+        moving = self.followed.near(place, rest, out)
+        _, velocity, acceleration = out
+        acceleration *= speed * speed
+        acceleration += change * velocity
+        velocity *= speed
+        return moving

@@ -7,7 +7,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
 
-from .path import Path, hermite
+from .path import Path, SlowedPath, Slowing
 from .request import JointTrajectoryData
 from .values import (
     BRAKING_STEP,
@@ -20,6 +20,13 @@ from .values import (
     refuse_joint,
     seconds,
 )
+
+#: Deceleration from a measured velocity, where none is given [rad/s^2].
+GENTLE = 2.0
+#: A motion that is slower than this fraction of what the joint could do is stopped faster than it would stop itself.
+SLOW_FRACTION = 0.2
+#: Ratio of the times that are tried for a stop, and the time law at the places where each is judged.
+LONGER, _TABLE = 1.1, Slowing.table(33)[:, :, None]
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,8 @@ class ReferenceGenerator:
         How far a first point at `time_from_start` 0 may be from the reference [rad].
     velocity_max : (n,) array_like, optional
         Limit of the mean speed between the reference at the start and the first point [rad/s].
+    period : float
+        Least duration of a stop [s]: about a period of the lowest bending mode, which it then hardly excites.
 
     Attributes
     ----------
@@ -65,7 +74,7 @@ class ReferenceGenerator:
         The number of the last accepted trajectory; 0: none since the reset.
     """
 
-    def __init__(self, joint_names, start_tolerance=0.01, velocity_max=None):
+    def __init__(self, joint_names, start_tolerance=0.01, velocity_max=None, period=0.0):
         self.joint_names = tuple(joint_names)
         if not 0.0 <= start_tolerance < np.inf:
             raise TrajectoryError(
@@ -78,6 +87,14 @@ class ReferenceGenerator:
         if velocity_max is not None:
             velocity_max = joint_limit("velocity_max", velocity_max, self.joint_names)
         self._velocity_max = velocity_max
+        if not 0.0 <= period <= MAX_BRAKING:
+            raise TrajectoryError(
+                "s is out of range",
+                field="period",
+                value=period,
+                limit=f"0 to {MAX_BRAKING:g} s",
+            )
+        self._period = float(period)
         n = len(self.joint_names)
         self._state = np.zeros((3, n))
         self._scratch, self._near = np.zeros((3, n)), np.zeros((3, n))
@@ -98,15 +115,42 @@ class ReferenceGenerator:
         self._last_accepted = None
         self.active = self.finished = self.stopping = False
 
-    def start(self, position, stamp_ns):
-        """Hold a measured `position` (n,) [rad] from `stamp_ns` [ns] on; earlier trajectories are forgotten."""
-        position = per_joint("joint_position", position, self.joint_names)
-        lost = ~np.isfinite(position)
-        problem, hint = "rad is not finite", "it is needed to hold the joint"
-        refuse_joint("joint_position", lost, position, self.joint_names, problem, hint=hint)
+    def start(self, position, stamp_ns, velocity=None, deceleration=GENTLE):
+        r"""Hold a measured position, or brake from how the arm moves; earlier trajectories are forgotten.
+
+        With a velocity v the reference goes on in its direction from the position, and comes to rest as in `stop`,
+        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least `period`, v T / 2 farther.
+
+        Parameters
+        ----------
+        position : (n,) array_like
+            [rad]
+        stamp_ns : int
+            From when on [ns].
+        velocity : (n,) array_like, optional
+            [rad/s]; zero, or not given: hold.
+        deceleration : float or (n,) array_like
+            D, greater than 0 [rad/s^2].
+
+        Raises
+        ------
+        TrajectoryError
+            If a number can't be used, or the stop takes more than `MAX_BRAKING`.
+        """
+        names = self.joint_names
+        position = _finite("joint_position", position, names, "rad", "hold the joint")
+        path = None
+        if velocity is not None:
+            velocity = _finite("joint_velocity", velocity, names, "rad/s", "brake the joint")
+            if velocity.any():
+                bound = _decelerations(deceleration, names)
+                path = _straight(position, velocity, bound, stamp_ns, self._period, names)
         self._drop_all()
         self._state[:] = 0.0
         self._state[0] = position
+        if path is not None:
+            self._state[1] = velocity
+            self._path, self.stopping = path, True
         self._last_ns = stamp_ns
 
     def offer(self, trajectory: JointTrajectoryData) -> Verdict:
@@ -264,35 +308,55 @@ class ReferenceGenerator:
         else:
             path.evaluate(stamp_ns, self._scratch)
 
-    def stop(self, stamp_ns, deceleration):
-        """Bring the reference to rest from its state at a stamp, then hold; cancel all trajectories.
+    def stop(self, stamp_ns, deceleration, given=True):
+        """Bring the reference to rest along its path, then hold; cancel all trajectories.
 
-        Each joint's velocity follows the cubic from its present velocity v and acceleration a to rest, over the
-        shortest time T in which no acceleration exceeds ``D = max(deceleration, |a|)``: with w = v / T and v >= 0 that
-        is (3 w + a)^2 = 3 D (2 w + a), from a = 0 ``T = 1.5 |v| / D``. T is rounded up to the next `BRAKING_STEP`: a
-        joint that is nearly at rest while it accelerates may move on by up to ``|a| T^2 / 12``.
+        The trajectory's own time is slowed down (module `path`), over a time T which is at least `period`, and
+        the first of a geometric sequence in which on all of the way
+
+        - where the deceleration D is given: slowing down takes at most D,
+        - otherwise: acceleration is at most 1.25 times the motion's own largest, jerk 1.5 times, or, for a slow motion,
+          what slowing down with `SLOW_FRACTION` D takes.
+
+        The bounds hold for every joint. If the path ends before, the reference ends with it. A stop within a stop
+        changes nothing but that trajectories which wait are cancelled.
 
         Parameters
         ----------
         stamp_ns : int
             The stamp at which braking begins [ns].
         deceleration : float or (n,) array_like
-            Bound of the deceleration, greater than 0 [rad/s^2].
+            D, greater than 0 [rad/s^2].
+        given : bool or (n,) array_like of bool
+            Whether D was asked for, or is what the joint could do.
 
         Raises
         ------
         TrajectoryError
-            If there is no state yet, or a deceleration is not finite and above 0.
+            If there is no state yet, a deceleration is not finite and above 0, or it takes more than `MAX_BRAKING`.
         """
         if self._last_ns is None:
             raise TrajectoryError("no state yet", hint="there is no reference to stop")
         bound = _decelerations(deceleration, self.joint_names)
-        self._reference_at(self._path, stamp_ns)
-        path = _braking_path(self._scratch, bound, self.joint_names)
-        path.begin(stamp_ns, self._scratch)
+        moving, path = self._moves_at(stamp_ns), self._path
+        if moving and path.trajectory_id:
+            limits = _limits(path, bound, np.asarray(given, dtype=bool), self._period)
+            duration_ns = _braking_time(path, stamp_ns, *limits)
+            path = SlowedPath(path, stamp_ns, duration_ns)
         self._drop_all()
-        self._path = path
+        self._path = path if moving else None
+        self.stopping = moving
+        if not moving:
+            np.copyto(self._state, self._scratch)
         self._last_ns = max(self._last_ns, stamp_ns)
+
+    def _moves_at(self, stamp_ns):
+        """Whether the reference moves at a stamp; its state goes to the scratch state."""
+        path, state = self._path, self._scratch
+        if path is None:
+            np.copyto(state, self._state)
+            return False
+        return path.evaluate(stamp_ns, state) and bool(state[1:].any())
 
 
 def _decelerations(deceleration, joint_names):
@@ -308,36 +372,67 @@ def _decelerations(deceleration, joint_names):
     return values
 
 
-def _braking_path(state, deceleration, joint_names):
-    """Return the path that brakes every joint as `ReferenceGenerator.stop` says.
+def _finite(field, values, joint_names, unit, need):
+    """Return one finite number per joint, (n,)."""
+    values = per_joint(field, values, joint_names)
+    problem, hint = f"{unit} is not finite", f"it is needed to {need}"
+    refuse_joint(field, ~np.isfinite(values), values, joint_names, problem, hint=hint)
+    return values
 
-    Its points are the moments at which a joint comes to rest. Between them the polynomials are
-    quartics, which the quintic interpolation reproduces.
-    """
-    position, velocity, acceleration = state
-    a = np.where(velocity < 0.0, -acceleration, acceleration)  # along the motion
-    bound = np.maximum(deceleration, np.abs(a))
-    w = (bound - a + np.sqrt(bound * (bound + a))) / 3.0
-    # Rounded up, all segments have at least one step: in nanoseconds the differences of nearby
-    # positions would leave no digits for the accelerations.
-    steps = np.maximum(np.ceil(np.abs(velocity) / w / BRAKING_STEP), 1.0)
-    times = steps * BRAKING_STEP
-    slow = ~(times <= MAX_BRAKING)
+
+def _straight(position, velocity, deceleration, stamp_ns, shortest, joint_names):
+    """The path of `ReferenceGenerator.start` with a velocity."""
+    times = Slowing.MAX_SLOPE * np.abs(velocity) / deceleration
     problem, hint = "s to stop is too long", "give a higher deceleration"
+    slow = ~(times <= MAX_BRAKING)
     refuse_joint("braking time", slow, times, joint_names, problem, MAX_BRAKING, hint)
-    durations_ns = np.rint(steps * (BRAKING_STEP * SECOND)).astype(np.int64)
-    times_ns = np.unique(durations_ns)
-    length = durations_ns / SECOND
-    x = np.minimum(times_ns[:, None] / SECOND, length)
-    # Of the velocity, b_0 + b_1 x + b_2 x^2 + b_3 x^3: the cubic Hermite, one order down.
-    rest = np.zeros_like(velocity)
-    b0, b1, b2, b3 = hermite(length, (velocity, acceleration), (rest, rest))
-    moving = x < length
-    return Path(
-        times_ns,
-        (
-            position + x * (b0 + x * (b1 / 2.0 + x * (b2 / 3.0 + x * b3 / 4.0))),
-            np.where(moving, b0 + x * (b1 + x * (b2 + x * b3)), 0.0),
-            np.where(moving, b1 + x * (2.0 * b2 + x * 3.0 * b3), 0.0),
-        ),
+    duration_ns = round(max(times.max(), shortest, BRAKING_STEP) * SECOND)
+    ahead = Path([duration_ns], [(position + velocity * (duration_ns / SECOND))[None]])
+    ahead.begin(stamp_ns, np.array([position, velocity, 0.0 * velocity]))
+    return SlowedPath(ahead, stamp_ns, duration_ns)
+
+
+def _limits(path, deceleration, given, period):
+    """What a stop keeps to: bounds (n,) of slowing down, acceleration [rad/s^2] and jerk [rad/s^3]; least time [s]."""
+    speed, acceleration, jerk = path.peaks()
+    slow = SLOW_FRACTION * deceleration
+    # How fast the motion itself changes.
+    scale = np.divide(speed, acceleration, out=np.zeros_like(speed), where=acceleration > 0.0).max()
+    shortest = max(min(max(period, 1.2 * scale or np.inf), 1.5 * period), BRAKING_STEP)
+    # What it takes to stop with that deceleration in the shortest time.
+    with np.errstate(over="ignore"):  # infinite is no bound
+        quick = slow * Slowing.MAX_BEND / (Slowing.MAX_SLOPE * shortest)
+    bounds = (
+        np.where(given, deceleration, np.inf),
+        np.where(given, np.inf, np.maximum(1.15 * acceleration, slow)),
+        np.where(given, np.inf, np.maximum(1.3 * jerk, quick)),
     )
+    return bounds, shortest
+
+
+def _braking_time(path, stamp_ns, limits, shortest):
+    """Time of a stop from a stamp on [ns], as `ReferenceGenerator.stop` says."""
+    begin = max(path.elapsed(stamp_ns), 0.0)
+
+    def fits(time):
+        covered, speed, change, bend = _TABLE
+        v, a, j = path.derivatives(begin + time * covered[:, 0])
+        slowing = v * (change / time)
+        total = a * speed**2 + slowing
+        jerk = j * speed**3 + 3.0 * a * speed * change / time + v * bend / time**2
+        found = (slowing, total, jerk)
+        return all((np.abs(x) <= y).all() for x, y in zip(found, limits, strict=True))
+
+    time = shortest
+    while not fits(time):
+        time *= LONGER
+        if time > MAX_BRAKING:
+            if begin + MAX_BRAKING < path.duration_ns / SECOND:
+                raise TrajectoryError(
+                    "s are not enough for a stop",
+                    field="braking time",
+                    value=MAX_BRAKING,
+                    hint="give a higher deceleration",
+                )
+            break  # the path itself ends before
+    return round(time * SECOND)
