@@ -59,7 +59,7 @@ NEGLIGIBLE = 1e-6
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: Rate at which a jump of the motion that the regulator tracks fades, over the lowest bending frequency.
-FADING = 3.0
+FADING = 12.0
 #: A jump is gone when this is left of it, in any coordinate and torque.
 GONE = 1e-12
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
