@@ -1,22 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """config/security/flexarm.policy.xml allows each node what it creates, and nothing else."""
 
+import os
 import re
+import sys
+import tty
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 import rclpy
-from rclpy.lifecycle import TransitionCallbackReturn
+from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
 from flexarm_ros.session import Session
 from flexarm_sim.nodes.simulator import SimulatorNode
-from flexarm_tools.running.processes import own_domain
+from flexarm_tools.running.processes import arguments, own_domain
+
+sys.path.insert(
+    0, str(Path(__file__).resolve().parents[1] / "examples" / "flexarm_driver_template")
+)
+
+from flexarm_driver_template.driver import DriverNode
 
 POLICY = Path(__file__).resolve().parents[1] / "config" / "security" / "flexarm.policy.xml"
-CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
+CLASSES = {
+    "driver": DriverNode,
+    "simulator": SimulatorNode,
+    "observer": ObserverNode,
+    "controller": ControllerNode,
+}
+#: What `flexarm publish` is to the graph: a session of this name that publishes trajectories.
+OPERATOR = "publish_trajectory"
 #: What SROS 2 makes of a list: its elements' name, and the attributes that it may have (policy 0.2.0).
 LISTS = {"topics": {"publish", "subscribe"}, "services": {"request", "reply"}}
 
@@ -64,20 +80,29 @@ def test_the_policy_file_is_of_the_form_that_sros2_reads():
 def created():
     """What each node has created: {node: {kind: names}}, from the graph."""
     with own_domain() as domain, Session("bystander", domain=domain) as session:
-        rclpy.init(domain_id=domain, args=["--ros-args", "-p", "arm:=R", "-p", "fast.type:=none"])
+        line, port = os.openpty()
+        tty.setraw(port)
+        values = {"arm": "R", "port": os.ttyname(port), "lockstep": True, "design_process": False}
+        rclpy.init(domain_id=domain, args=arguments(values))
         nodes = {}
         try:
             for name, node_class in CLASSES.items():
                 nodes[name] = node_class()
-                assert nodes[name].trigger_configure() == TransitionCallbackReturn.SUCCESS
-            session.wait_for(
-                "the graph", lambda: all(is_known(session.node, n) for n in nodes.values())
-            )
-            yield {name: graph(session.node, name) for name in CLASSES}
+                assert nodes[name].autostart()
+            with Session(OPERATOR, domain=domain) as operator:
+                operator.publisher(JointTrajectory, "joint_trajectory")
+                known = [*nodes.values(), operator.node]
+                session.wait_for("the graph", lambda: all(is_known(session.node, n) for n in known))
+                found = {name: graph(session.node, name) for name in CLASSES}
+                yield {**found, "operator": graph(session.node, OPERATOR)}
         finally:
             for node in nodes.values():
+                if node.active:
+                    node.stop()
                 node.destroy_node()
             rclpy.try_shutdown()
+            os.close(line)
+            os.close(port)
 
 
 def is_known(bystander, node):
@@ -112,6 +137,19 @@ def test_each_node_may_do_what_it_does_and_nothing_else(created, name):
         assert sorted(allowed[kind]) == names, f"{kind} of {name} in {POLICY.name}"
 
 
+def test_the_operator_may_do_what_flexarm_publish_does(created):
+    found, allowed = profile("operator")
+    assert found.get("node") == OPERATOR
+    for kind, names in created["operator"].items():
+        assert set(names) <= set(allowed[kind]), f"{kind} of the operator in {POLICY.name}"
+    assert sorted(allowed["reply"]) == created["operator"]["reply"]
+
+
+def test_no_node_has_an_action_for_which_the_policy_has_no_rule(created):
+    for name, kinds in created.items():
+        assert not any("/_action/" in n for names in kinds.values() for n in names), name
+
+
 def test_only_the_controller_may_publish_torque_and_only_the_operator_trajectories():
     for topic, alone in (("/joint_torque", "controller"), ("/joint_trajectory", "operator")):
         who = [e for e in (*CLASSES, "operator") if topic in profile(e)[1]["publish"]]
@@ -121,7 +159,7 @@ def test_only_the_controller_may_publish_torque_and_only_the_operator_trajectori
 def test_the_operator_calls_and_reads_what_the_nodes_offer(created):
     _, allowed = profile("operator")
     offered = {
-        kind: {n for c in created.values() for n in c[kind]} for kind in ("publish", "reply")
+        kind: {n for name in CLASSES for n in created[name][kind]} for kind in ("publish", "reply")
     }
     assert set(allowed["request"]) <= offered["reply"]
     assert set(allowed["subscribe"]) <= offered["publish"]
