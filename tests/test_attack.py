@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lies of `flexarm attack` before the real nodes: the simulator's node tells them, and the instrument is right."""
+
+import re
+
+import pytest
+from harness import PATIENT, Arm, trajectory
+from in_process import InProcess
+from numpy.testing import assert_allclose
+
+from flexarm_msgs.msg import CompositeState, JointTorque
+from flexarm_studies.attack import lies, run
+from flexarm_studies.attack.cases import MOTION, START, Case, arm_of
+
+FAULT = CompositeState.FAULT
+#: The motion is at its fastest [s].
+AT = START + 0.5 * MOTION
+#: Sample at which the loop stands until the trajectory is there; the observer has converged.
+STANDS = 150
+CASE = Case("R", "kalman", False, noise=False)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """The loop on the queue, paused at `STANDS`."""
+    with InProcess() as bench:
+        own = {
+            "lockstep": True,
+            "pause_at": 1e-3 * STANDS,
+            "resend_period": 0.02,
+            "allow_faults": True,
+        }
+        sent = {"publish_joint_velocity": False, "publish_modal_amplitude": False}
+        observer = {"observer.type": "kalman"}
+        # The queue's time is no arm's time: a state that is waited for is no silence.
+        bench.start_loop(
+            {**own, **sent}, observer=observer, controller=PATIENT | {"max_gap": 0.5}, arm="R"
+        )
+        loop = Arm(bench, pauses_at=STANDS)
+        loop.wait_standing()
+        yield loop
+
+
+def moved(arm, lie, until):
+    """The nodes' torques, by sequence, of a motion with a lie, up to a time [s]."""
+    bench = arm.bench
+    assert bench.set("simulator", faults=[])[0].successful
+    arm.reset()
+    lines = list(lie.lines(arm_of("R", False), AT, 1e-3))
+    (result,) = bench.set("simulator", faults=lines)
+    assert result.successful, result.reason
+    start = 1_000_000_000 + round(1e9 * START)
+    arm.offer(trajectory(["joint1"], (MOTION, [1.0], [0.0], [0.0]), stamp=start))
+    for topic in (arm.torques, arm.states, arm.measured):
+        topic.messages.clear()
+    arm.pause(False)
+    last = round(1e3 * until)
+    bench.wait_for(
+        "the end", lambda: arm.measured.newest and arm.measured.newest.sequence >= last, 600.0
+    )
+    arm.pause(True)
+    return arm.torques.messages
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "message repeated for ever",
+        "two drivers in turn",
+        "new session, zero off by 0.5 rad",
+        "clock back by 1 s",
+    ],
+)
+def test_the_nodes_name_a_lie_about_messages_and_take_the_torque_away(arm, name):
+    lie = lies.LIES[name]
+    bench = arm.bench
+    torques = moved(arm, lie, AT - 0.1)
+    torques.clear()
+    arm.pause(False)
+    bench.wait_for("a fault", lambda: arm.state.supervisor_state == FAULT)
+    assert re.search(lie.says, arm.state.rejected_reason.lower()), arm.state.rejected_reason
+    first = next(k for k, m in enumerate(torques) if m.mode == JointTorque.DISABLED)
+    assert {m.mode for m in torques[:first]} == {JointTorque.ENABLED}
+    assert {m.mode for m in torques[first:]} == {JointTorque.DISABLED}
+    bench.wait_for("samples after it", lambda: len(torques) > first + 20)
+
+
+@pytest.mark.parametrize(
+    "name", ["strains of the wrong sign", "encoder jumps by 0.2 rad", "stall of 40 ms"]
+)
+def test_the_nodes_send_the_torques_that_flexarm_attack_computes(arm, name):
+    lie, until = lies.LIES[name], AT + 0.2
+    found = moved(arm, lie, until)
+    driver = run.driver_of(CASE.scenario(), lie.lines(arm_of("R", False), AT, 1e-3), AT)
+    trace = run.drive(driver, until=until)
+    sent = {m.sequence: m.torque[0] for m in found if m.mode == JointTorque.ENABLED}
+    common = sorted(k for k in sent if STANDS < k < trace.time.size)
+    assert len(common) > 900 and common[-1] > 1e3 * AT + 100
+    # The motion's polynomial is another, and with it the last digits.
+    assert_allclose([sent[k] for k in common], trace.torque[common, 0], rtol=0.0, atol=1e-7)
