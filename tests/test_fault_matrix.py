@@ -86,7 +86,10 @@ ROWS = {
         "clock jump by=10.0", reason=r"10\.0 s after the last state", lasting=""
     ),
     "joint encoder stuck": Row(
-        "joint_position stick", reason="tracking error of joint1", lasting="", within=300
+        "joint_position stick",
+        reason="joint_position of joint1 stands still",
+        lasting="",
+        within=50,
     ),
 }
 

@@ -79,6 +79,8 @@ class ObserverNode(ArmNode):
             return
         if known is None:  # older than the last one: useless for the controller
             return
+        if sample.doubt:
+            self.report(f"arm_state: {sample.doubt}")
         writer.head(sample.stamp_ns, sample.session, sample.sequence, sample.controller_id)
         writer.trust(sample.trust, sample.doubt)
         writer.message.clock_stopped = sample.clock_stopped

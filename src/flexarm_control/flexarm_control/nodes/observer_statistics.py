@@ -63,14 +63,17 @@ class ObserverStatistics:
             **self._latency.values(),
             "converged": observer.converged,
             **self._innovations(),
+            **{f"outliers replaced, {name}": n for name, n in core.monitor.bridged.items()},
             **observer.parameters_estimated,
         }
+        doubt = core.monitor.doubts.text if core.settings["plausibility"] else ""
         gauges = "; ".join(core.gauges.warnings()) if core.gauges else ""
         many_lost = lost > MAX_LOST * (rate + lost)
         for wrong, level, message in (
             (not active, OK, "not active"),
             (refused, ERROR, f"{refused} states refused: {self._refusal}"),
             (not rate, ERROR, "no usable arm_state: start the simulator or driver"),
+            (doubt, ERROR, doubt),
             (not observer.converged, WARN, "not converged yet"),
             (gauges, WARN, gauges),
             (not observer.consistent, WARN, "innovations are larger than the noise explains: "

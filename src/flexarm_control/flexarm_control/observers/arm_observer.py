@@ -8,10 +8,11 @@ from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
-from ..loop.samples import ArmSample, SampleOrder
+from ..loop.samples import WRAP, ArmSample, SampleOrder
 from . import gauge_health
 from .base import need_torque
 from .motion import Motion
+from .plausibility import monitor
 
 OBSERVERS = "flexarm.observers"
 
@@ -27,6 +28,7 @@ PARAMETERS = (
         "Use the observer's joint positions, if it estimates them, instead of the encoders'."
     ),
     *gauge_health.PARAMETERS,
+    *monitor.PARAMETERS,
 )
 
 
@@ -74,6 +76,8 @@ class ArmObserver:
         Health of each gauge; None for an arm without gauges.
     calibration : BiasCalibration or None
         The last samples, for `calibrate`.
+    monitor : Monitor
+        Judges whether the readings can be true together, where the settings ask for it.
     calibrated : bool
         Whether the strains are mapped with a bias from `calibrate`. Amplitudes from the source are then ignored,
         since they are made with the arm file's bias.
@@ -100,6 +104,7 @@ class ArmObserver:
                 field="observed_modes",
                 hint="lower `modes` in links[].flexible",
             )
+        self.monitor = monitor.Monitor(model, self.strain_map, self.gauges)
         n, m = model.n_joints, model.n_modes
         self.position, self.velocity = np.zeros(n), np.zeros(n)
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
@@ -114,7 +119,8 @@ class ArmObserver:
         Parameters
         ----------
         sample : ArmSample
-            Its `amplitude` is filled in from the strains if it is None.
+            Its `amplitude` is filled in from the strains if it is None. Readings that can't be true are replaced, and
+            `trust` and `doubt` are set: see `plausibility.monitor`.
 
         Returns
         -------
@@ -133,6 +139,8 @@ class ArmObserver:
         self._check(sample)
         verdict = self._order.judge(sample)
         if verdict == SampleOrder.REPEAT:
+            if self._judges:
+                self.monitor.mark(sample)
             return self.observer.converged
         if verdict == SampleOrder.STALE:
             return None
@@ -141,6 +149,9 @@ class ArmObserver:
         # After a jump of the clock or a long silence the past is useless.
         gap = sample.stamp_ns - last_stamp > MAX_GAP_NS
         restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
+        judges = self._judges
+        if judges and self._judge(sample, restart):
+            restart = True
         self._map_strain(sample, restart)
         if restart:
             self.observer.reset()
@@ -152,11 +163,24 @@ class ArmObserver:
         self._update(sample, dt)
         self._pass_on(sample)
         # Only now, so that a refused sample leaves nothing behind, not even its time step.
+        if judges:
+            self.monitor.take(sample)
         self._order.take(sample)
         self._derivative[:], self._measured[:] = sample.velocity, sample.position
         if sample.strain is not None and self.calibration is not None:
             self.calibration.push(sample)
         return self.observer.converged
+
+    @property
+    def _judges(self):
+        return self.settings["plausibility"]
+
+    def _judge(self, sample, restart):
+        """Have the readings of a new sample judged; whether the observer is to start afresh."""
+        order, last = self._order, self.monitor.stamp_ns
+        afresh = restart or last != order.stamp_ns  # it was off until now
+        dt = 0.0 if afresh else 1e-9 * (sample.stamp_ns - last)
+        return self.monitor.judge(sample, dt, (sample.sequence - order.sequence) % WRAP)
 
     def warm_up(self):
         """Take three samples of an arm at rest, so that compiled code is loaded; discard the observer afterwards."""
@@ -241,7 +265,11 @@ class ArmObserver:
     def _update(self, sample, dt):
         try:
             self.observer.update(sample, dt)
-        except MessageError:
+        except MessageError as error:
+            # What it lacks may have been taken out.
+            doubt = self.monitor.doubts.text if self._judges else ""
+            if doubt:
+                raise MessageError(f"{doubt}; {error}") from error
             raise
         except Exception as error:  # of third-party code: it costs this sample, not the node
             raise MessageError(

@@ -84,6 +84,8 @@ class GaugeHealth:
         `GOOD`, `MISSING`, `STUCK`, `SATURATED` or `SUSPECT`.
     lost : tuple of int
         Gauges left out of the last amplitudes; indices, ascending.
+    doubted : ndarray of bool, shape (gauges,)
+        Gauges that other checks have found wrong: suspect, and left out where the others suffice.
     """
 
     #: A gauge is stuck if it should have moved by this many resolutions; noise spans about as many.
@@ -111,6 +113,7 @@ class GaugeHealth:
         self._redundant = bool(redundant.any())
         self._mapped = np.zeros(len(strain_map.mode_names))
         self.health = np.zeros(len(gauges), np.uint8)
+        self.doubted = np.zeros(len(gauges), bool)
         self.reset()
 
     def reset(self):
@@ -123,6 +126,10 @@ class GaugeHealth:
         self._min_seen, self._max_seen = np.full((2, count, count), np.nan)
         self._square = np.zeros(count)
 
+    def doubt(self, indices):
+        """Leave out the gauges with these `indices`, until `doubted` is cleared."""
+        self.doubted[list(indices)] = True
+
     def update(self, strain):
         """Judge the readings, shape (gauges,), of a new sample, on the control path."""
         self.health[:] = GOOD
@@ -131,6 +138,8 @@ class GaugeHealth:
         if outside.any():
             self.health[outside] = SATURATED
             self.health[~np.isfinite(strain)] = MISSING
+        if self.doubted.any():
+            self.health[self.doubted & (self.health == GOOD)] = SUSPECT
         if self._holding or self.health.any():
             self._hold -= 1
             np.maximum(self._hold, 0, out=self._hold)

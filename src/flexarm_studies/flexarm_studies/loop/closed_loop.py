@@ -120,6 +120,7 @@ class ClosedLoop:
         s.strain = sim.strain if has_gauges else None
         s.amplitude = sim.amplitude if has_gauges and self._publish_amplitude else None
         s.rate = sim.rate if self._publish_rates else None
+        s.trust, s.doubt = s.TRUSTED, ""
         if self.bag is not None:
             self.bag.measured(s)
         return s

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The readings of an arm in one vector, and how fast and how exactly each can change.
+
+The vector is :math:`x = (q, \varepsilon, \delta, \dot q, \dot\delta)`: joint positions, strains, modal amplitudes and
+their rates; what a source does not give is NaN. With H the inverse of the mass matrix (3) and R the rows of the strain
+map, a step :math:`\Delta u` of the torque changes the accelerations by
+
+.. math:: |\Delta\ddot q| \le 2|H_{11}||\Delta u|, \qquad |\Delta\ddot\delta| \le 2|H_{21}||\Delta u|, \qquad
+          |\Delta\ddot\varepsilon| \le 2|R H_{21}||\Delta u| ,
+
+the 2 for what the model has wrong.
+
+Whatever else acts (pushes, gravity, brakes) is taken to change the joints' accelerations by at most
+:math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger, and those of the
+deflections by a twentieth of what that torque would.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+
+#: Rms noise where the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
+#: fraction of full scale [-]. What the first samples show is taken where it is larger.
+UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
+#: And of modal amplitudes of an arm without gauges [m, rad].
+UNSTATED_AMPLITUDE = 1e-5
+#: For a payload, a configuration or a torque between two samples that is not the model's [-].
+MARGIN = 2.0
+#: Configurations at which the largest accelerations are looked for.
+CONFIGURATIONS = 16
+
+
+class Channels:
+    """Names, noise and bounds of the readings.
+
+    Parameters
+    ----------
+    model : ArmModel
+        n joints, m modes; its arm has g gauges.
+    strain_map : StrainMap or None
+        None without gauges.
+
+    Attributes
+    ----------
+    names : tuple of str, length N = 2 n + g + 2 m
+        Field and joint, gauge or mode.
+    position, strain, amplitude, velocity, rate : slice
+        Where each group is in the vector.
+    is_rate : ndarray of bool, shape (N,)
+        Velocities and modal rates.
+    noise : ndarray, shape (N,)
+        Rms.
+    count : ndarray, shape (n,)
+        Steps of the encoders; zero where the arm file states none [rad].
+    gain : ndarray, shape (N, n)
+        Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations.
+    push : ndarray, shape (N,)
+        Change of acceleration by what is not reported; infinite where a joint has no torque limit.
+    strength : ndarray, shape (n,)
+        Largest torque of motor or brake [N m].
+    """
+
+    def __init__(self, model, strain_map):
+        arm = model.arm
+        n, m, g = model.n_joints, model.n_modes, len(arm.gauges)
+        self.model, self.n, self.m, self.g = model, n, m, g
+        ends = np.cumsum([0, n, g, m, n, m])
+        parts = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+        self.position, self.strain, self.amplitude, self.velocity, self.rate = parts
+        self.size = int(ends[-1])
+        fields = ("joint_position", "strain", "modal_amplitude", "joint_velocity", "modal_rate")
+        owners = (
+            arm.joint_names,
+            arm.gauge_names,
+            model.mode_names,
+            arm.joint_names,
+            model.mode_names,
+        )
+        self.names = tuple(
+            f"{f} of {o}" for f, all_ in zip(fields, owners, strict=True) for o in all_
+        )
+        self.units = ("rad",) * n + ("",) * (g + m) + ("rad/s",) * n + ("",) * m
+        self.is_rate = np.arange(self.size) >= ends[3]
+        counts = np.array([j.encoder_counts for j in arm.joints], float)
+        self.count = np.divide(2.0 * np.pi, counts, out=np.zeros(n), where=counts > 0.0)
+        self.strength = np.array([max(j.limits.torque, j.brake_torque or 0.0) for j in arm.joints])
+        self.noise = self._noise(strain_map)
+        self.gain, self.push = self._accelerations(strain_map)
+
+    def _noise(self, strain_map):
+        noise = np.empty(self.size)
+        noise[self.position] = np.where(self.count > 0.0, 0.0, UNSTATED_POSITION)
+        noise[self.velocity] = UNSTATED_VELOCITY
+        gauges = self.model.arm.gauges
+        noise[self.strain] = [g.uncertainty or UNSTATED_STRAIN * g.full_scale for g in gauges]
+        if strain_map is None:
+            noise[self.amplitude] = UNSTATED_AMPLITUDE
+        else:
+            noise[self.amplitude] = np.linalg.norm(strain_map.inverse * noise[self.strain], axis=1)
+        fastest = self.model.frequencies().max(initial=0.0)
+        noise[self.rate] = fastest * noise[self.amplitude]
+        return noise
+
+    def _accelerations(self, strain_map):
+        """`gain` and `push`."""
+        model, n = self.model, self.n
+        joints, bends, rigid = np.zeros((n, n)), np.zeros((self.m, n)), np.zeros((n, n))
+        strains = np.zeros((self.g, n))
+        random = np.random.default_rng(0)
+        for k in range(CONFIGURATIONS):
+            q = random.uniform(-1.5, 1.5, n) if k else np.zeros(n)
+            M = model.terms(q, np.zeros(n)).M
+            H = np.linalg.inv(M)
+            np.maximum(joints, np.abs(H[:n, :n]), out=joints)
+            np.maximum(bends, np.abs(H[n:, :n]), out=bends)
+            np.maximum(rigid, np.abs(np.linalg.inv(M[:n, :n])), out=rigid)
+            if strain_map is not None:
+                np.maximum(strains, np.abs(strain_map.rows @ H[n:, :n]), out=strains)
+        strength = self.strength
+        gain = MARGIN * np.vstack([joints, strains, bends, joints, bends])
+        push = np.full(self.size, np.inf)
+        if np.isfinite(strength).all():
+            soft = [0.05 * part @ strength for part in (strains, bends)]
+            hard = 2.0 * rigid @ strength
+            push = np.concatenate([hard, *soft, hard, soft[1]])
+        return gain, push
+
+    def read(self, sample, out):
+        """The readings of an `ArmSample` into `out`, shape (N,)."""
+        out[self.position] = sample.position
+        out[self.strain] = np.nan if sample.strain is None else sample.strain
+        out[self.amplitude] = np.nan if sample.amplitude is None else sample.amplitude
+        out[self.velocity] = sample.velocity if sample.velocity_known else np.nan
+        out[self.rate] = np.nan if sample.rate is None else sample.rate

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Finds readings that no arm makes: each against the straight line through the ones before it.
+
+With the time h to the last sample and T the baseline of the slope s, :math:`\rho = h/T`,
+
+.. math::
+    r = x_k - (x_{k-1} + s h), \qquad
+    |r| \le 6\sigma\sqrt{1 + (1+\rho)^2 + \rho^2} + (1+\rho)(c + 2J|s|) + S\,(a + G|\Delta u| + 2e)
+
+for the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest deviation of late from the mean
+period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for rates.
+e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so: a motion that has begun may go on. A
+torque that is unknown, or zero on every joint, so that brakes may act, stands for a step of the largest torque; so
+do lost samples, for the links, and for `UNREPORTED` of it for the joints. The
+noise is the larger of what `channels` has and the rms of r so far. The first `LEARNT` samples are not judged.
+
+A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump is real.
+"""
+
+import numpy as np
+
+#: Samples in a row whose reading is replaced; at the next one the jump is taken for lasting.
+BRIDGED = 3
+#: Samples after a start that only show the noise.
+LEARNT = 50
+#: A bound is this many standard deviations [-], and this multiple of the excess [-].
+DEVIATIONS, GROWTH = 6.0, 2.0
+#: Time in which an excess is forgotten, and one bridged reading [s].
+EXCESS_TIME, RARE_TIME = 0.02, 1.0
+#: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
+FREQUENT = 8.0
+#: Over more lost samples in a row the deflections can't be extrapolated.
+MAX_STEPS = 3
+#: Fraction of the largest torque that may have acted on the joints in lost samples, unreported [-].
+UNREPORTED = 0.1
+
+
+class Jumps:
+    """Judges each reading beside the ones before it.
+
+    Parameters
+    ----------
+    channels : Channels
+
+    Attributes
+    ----------
+    bridged : ndarray of int, shape (N,)
+        Number of readings that were replaced, since the observer was made.
+    """
+
+    def __init__(self, channels):
+        self.channels = c = channels
+        # A slope over several samples is worth its delay only where readings are rounded.
+        self.span = 4 if c.count.any() else 1
+        self.bridged = np.zeros(c.size, int)
+        # What is extrapolated over lost samples at any length: joints.
+        self._far = np.zeros(c.size, bool)
+        self._far[c.position] = self._far[c.velocity] = True
+        # The torque of lost samples is unknown; it moves the links soon, the joints later.
+        strength = np.where(np.isfinite(c.strength), c.strength, 0.0)
+        self._unreported = (c.gain @ strength) * np.where(self._far, UNREPORTED, 1.0)
+        self._value, self._line, self._bound, self._residual = np.zeros((4, c.size))
+        self._count = np.zeros(c.size)
+        self._count[c.position] = c.count
+        self._any_count = bool(c.count.any())
+        self.reset()
+
+    def reset(self):
+        """Forget the past: the next sample is the first."""
+        size = self.channels.size
+        self._past = np.full((self.span + 1, size), np.nan)
+        self._times = np.zeros(self.span + 1)
+        self._square, self._excess, self._often = np.zeros((3, size))
+        self._run, self._grace = np.zeros(size, int), np.zeros(size, int)
+        self._seen, self.period, self.jitter = 0, 0.0, 0.0
+        self._unseen = 0.0
+        self._torque, self._change = np.full(self.channels.n, np.nan), self.channels.strength.copy()
+
+    def judge(self, value, torque, dt, steps):
+        """Judge the readings of a new sample; nothing is remembered of it before `take`.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N,)
+            NaN: not given. Replaced readings are written into it.
+        torque : ndarray, shape (n,)
+            Applied until the sample [N m].
+        dt : float
+            Time since the last sample [s].
+        steps : int
+            Samples since then, lost ones included.
+
+        Returns
+        -------
+        outliers : ndarray of int or None
+            Indices of the readings that were replaced.
+        lasting : ndarray of int or None
+            And of those that jumped for good, which stay as they are; None in nearly all samples.
+        """
+        c, past, times = self.channels, self._past, self._times
+        np.copyto(self._value, value)
+        self._dt, self._steps = dt, steps
+        self._late = abs(dt - steps * self.period) if self.period else 0.0
+        self._outliers = self._lasting = None
+        if not torque.any() or not np.isfinite(torque).all():
+            self._new_change = c.strength
+            self._new_torque = None
+        else:
+            change = np.abs(torque - self._torque)
+            change[np.isnan(change)] = c.strength[np.isnan(change)]
+            self._new_change = np.maximum(change, 0.7 * self._change)
+            self._new_torque = torque.copy()
+        self._new_unseen = 0.0
+        if self._seen < 2:
+            return None, None
+        first = max(self.span - self._seen + 1, 0)
+        span = times[-1] - times[first]
+        slope = (past[-1] - past[first]) / span
+        rho = dt / span
+        line = np.multiply(slope, dt, out=self._line)
+        line += past[-1]
+        residual = np.subtract(value, line, out=self._residual)
+        np.abs(residual, out=residual)
+        self._scale = scale = np.where(c.is_rate, 0.5 * (dt + span), 0.5 * dt * (dt + span))
+        self._spread = np.sqrt(1.0 + (1.0 + rho) ** 2 + rho * rho)
+        noise = np.sqrt(self._square)
+        np.maximum(noise, c.noise, out=noise)
+        noise *= DEVIATIONS * self._spread
+        bound = np.dot(c.gain, self._new_change, out=self._bound)
+        self._new_unseen = 1.0 if steps > 1 else 0.5 * self._unseen
+        if self._new_unseen > 0.01:
+            bound += self._new_unseen * self._unreported
+        bound += c.push
+        bound += GROWTH * self._excess
+        bound *= scale
+        bound += noise
+        self._noise = noise
+        # What the residual may be without any acceleration.
+        floor = np.abs(slope, out=slope)
+        floor *= 2.0 * max(self.jitter, self._late) * (1.0 + rho)
+        if self._any_count:
+            floor += (1.0 + rho) * self._count
+            floor[c.velocity] += (1.0 + rho) / dt * c.count
+        bound += floor
+        self._floor = floor
+        if not (residual > bound).any() or self._seen < LEARNT:
+            return None, None
+        return self._sort_out(value, residual > bound)
+
+    def _sort_out(self, value, wrong):
+        wrong &= self._grace == 0
+        if self._steps > MAX_STEPS:
+            wrong &= self._far
+        if not wrong.any():
+            return None, None
+        lasting = wrong & (self._run >= BRIDGED)
+        outliers = np.flatnonzero(wrong & ~lasting)
+        value[outliers] = self._line[outliers]
+        self._outliers, self._lasting = outliers, np.flatnonzero(lasting)
+        return outliers, self._lasting if self._lasting.size else None
+
+    def take(self, value, stamp):
+        """Remember the sample that was judged last.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N,)
+            As `judge` left it.
+        stamp : float
+            Its time, from any origin [s].
+        """
+        dt = self._dt
+        if self._seen >= 2:
+            self._learn(dt)
+        self._past[:-1] = self._past[1:]
+        self._past[-1] = value
+        self._times[:-1] = self._times[1:]
+        self._times[-1] = stamp
+        if self._lasting is not None and self._lasting.size:
+            # The new level is where it goes on from; its slope shows in the next samples.
+            self._past[:, self._lasting] = value[self._lasting]
+            self._grace[self._lasting] = self.span + 2
+            self._excess[self._lasting] = 0.0
+        if self._steps > MAX_STEPS:
+            # The slope over the gap is none of the present motion.
+            self._grace[~self._far] = self.span + 2
+        if self._new_torque is None:
+            self._torque[:] = np.nan
+            self._change = self.channels.strength.copy()
+        else:
+            self._torque[:] = self._new_torque
+            self._change = self._new_change
+        self._unseen = self._new_unseen
+        self._seen += 1
+        each = dt / self._steps
+        if self._seen == 2:
+            self.period = each
+        elif self._seen > 2:
+            self.period += 0.02 * (each - self.period)
+            self.jitter = max(self._late, 0.995 * self.jitter)
+
+    def _learn(self, dt):
+        """Follow noise and excess, from the residuals of readings that were believed."""
+        residual, noise = self._residual, self._noise
+        residual[np.isnan(residual)] = 0.0
+        rms = residual / self._spread
+        if self._seen >= LEARNT:
+            np.minimum(rms, 0.5 * noise / self._spread, out=rms)  # 3 standard deviations
+        if self._outliers is not None:
+            rms[self._outliers] = 0.0
+        rms *= rms
+        rms -= self._square
+        rms *= 1.0 / min(self._seen, 1000)
+        self._square += rms
+        noise *= 0.5
+        noise += self._floor
+        residual -= noise
+        residual /= self._scale
+        if self._outliers is not None:
+            residual[self._outliers] = 0.0
+        self._excess *= np.exp(-dt / EXCESS_TIME)
+        np.maximum(self._excess, residual, out=self._excess)
+        if self._grace.any():
+            self._grace[self._grace > 0] -= 1
+        if self._often.any():
+            self._often *= np.exp(-dt / RARE_TIME)
+        if self._outliers is None:
+            if self._run.any():
+                self._run[:] = 0
+            return
+        run = self._run.copy()
+        self._run[:] = 0
+        self._run[self._outliers] = run[self._outliers] + 1
+        self._often[self._outliers] += 1.0
+        self.bridged[self._outliers] += 1
+
+    @property
+    def rms(self):
+        """Of the readings' noise so far, as the residuals show it, shape (N,)."""
+        return np.sqrt(self._square)
+
+    def line(self, i):
+        """What reading i should have been."""
+        return self._line[i]
+
+    def read(self, i):
+        """What reading i was."""
+        return self._value[i]
+
+    def bound(self, i):
+        """How far reading i may lie from the line."""
+        return self._bound[i]
+
+    @property
+    def frequent(self):
+        """Indices of the readings that were replaced too often of late."""
+        return np.flatnonzero(self._often > FREQUENT) if self._often.any() else ()

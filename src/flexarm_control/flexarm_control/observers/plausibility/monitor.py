@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Runs the checks of an arm's readings, and says what follows from them.
+
+`judge` looks at a sample before the observer sees it. A single outlier is replaced. `take` looks at it afterwards, as
+the past of the next one. What is found:
+
+============================================  =======================================================
+a joint position that jumps or stands still   DISTRUSTED: the loop can't do without it
+a joint velocity that does not fit            STOP; the estimate is used in its place
+a gauge that jumps, or stands still           STOP, without that gauge; DISTRUSTED where the others don't suffice
+strains of wrong sign, exchanged gauges       the same
+modal amplitudes that jump                    STOP, from the strains; DISTRUSTED without them
+modal rates that do not fit                   STOP; they are not used
+more than `jumps.FREQUENT` outliers           STOP
+============================================  =======================================================
+"""
+
+import numpy as np
+
+from flexarm_dynamics.parameters import parameter
+
+from ...loop.samples import ArmSample
+from .agreement import Agreement
+from .channels import Channels
+from .doubts import Doubts
+from .jumps import BRIDGED, LEARNT, Jumps
+from .standstill import Standstill
+from .strain_law import StrainLaw
+
+PARAMETERS = (
+    parameter("plausibility", True).described(
+        "Whether readings are compared with each other, with the last ones and with the model: single outliers are"
+        " replaced, a sensor in doubt is named, and the arm is stopped or its torque switched off."
+    ),
+)
+
+#: The mean interval of the stamps over a short and a long time may differ by this factor.
+RATE_CHANGE = 1.5
+#: Weight of the short mean in the long one, and samples for which they differ.
+SLOWLY, RATE_SAMPLES = 0.002, 100
+
+
+class Monitor:
+    """Judges the readings of an arm, sample by sample.
+
+    Parameters
+    ----------
+    model : ArmModel
+    strain_map : StrainMap or None
+    gauges : GaugeHealth or None
+        It leaves out those in doubt.
+
+    Attributes
+    ----------
+    doubts : Doubts
+    jumps : Jumps
+    stamp_ns : int
+        Of the last sample that was taken [ns].
+    """
+
+    def __init__(self, model, strain_map, gauges):
+        c = self.channels = Channels(model, strain_map)
+        self._map, self._gauges = strain_map, gauges
+        self.doubts, self.jumps = Doubts(), Jumps(c)
+        self._agreement, self._standstill = Agreement(c), Standstill(c)
+        self._law = StrainLaw(c, strain_map) if c.g and c.m else None
+        self._value, self._raw = np.zeros(c.size), np.zeros(2 * c.n + c.g)
+        self._strain, self._amplitude, self._rates = np.zeros(c.g), np.zeros(c.m), np.zeros(c.m)
+        self.stamp_ns = 0
+        self.reset()
+
+    def reset(self):
+        """A new session, or a gap: forget the past, doubts included."""
+        self.doubts.forget()
+        self.jumps.reset()
+        self._agreement.reset()
+        self._standstill.reset()
+        if self._law is not None:
+            self._law.reset()
+        self._long_period, self._off_rate, self._samples = 0.0, 0, 0
+        self._has_strain = False
+        if self._gauges is not None:
+            self._gauges.doubted[:] = False
+
+    @property
+    def bridged(self):
+        """Replaced readings by sensor: those with at least one."""
+        names, counts = self.channels.names, self.jumps.bridged
+        return {names[i]: int(counts[i]) for i in np.flatnonzero(counts)}
+
+    def judge(self, sample, dt, steps):
+        """Judge a new sample; `take` remembers it.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            Readings that can't be are replaced, or taken out.
+        dt : float
+            Time since the last one [s]; 0.0 at a start.
+        steps : int
+            Samples since then.
+
+        Returns
+        -------
+        bool
+            Whether the observer must start afresh: a joint's position has jumped for good.
+        """
+        c, value = self.channels, self._value
+        c.read(sample, value)
+        self._has_strain = sample.strain is not None
+        raw = self._raw
+        raw[: c.n], raw[c.n : c.n + c.g] = value[c.position], value[c.strain]
+        raw[c.n + c.g :] = value[c.velocity]
+        self._dt, self._steps = dt, steps
+        if dt == 0.0:
+            self.reset()
+            self._torque = sample.torque
+            return False
+        outliers, lasting = self.jumps.judge(value, sample.torque, dt, steps)
+        if outliers is not None and outliers.size:
+            self._replace(sample, value)
+        afresh = False
+        if lasting is not None:
+            afresh = self._jumped(sample, lasting)
+        for i in self.jumps.frequent:
+            text = f"{c.names[i]} has many outliers: {self.jumps.bridged[i]} so far"
+            self.doubts.add(c.names[i], ArmSample.STOP, text, sample.stamp_ns)
+        self._take_out(sample)
+        return afresh
+
+    def _replace(self, sample, value):
+        """Write replaced readings into the sample, in arrays of our own."""
+        c = self.channels
+        sample.position[:] = value[c.position]
+        if sample.velocity_known:
+            sample.velocity[:] = value[c.velocity]
+        for name, part, own in (
+            ("strain", c.strain, self._strain),
+            ("amplitude", c.amplitude, self._amplitude),
+            ("rate", c.rate, self._rates),
+        ):
+            if getattr(sample, name) is not None:
+                own[:] = value[part]
+                setattr(sample, name, own)
+
+    def _jumped(self, sample, lasting):
+        """What follows from readings that jumped for good; whether a joint position is one."""
+        c, jumps, stamp = self.channels, self.jumps, sample.stamp_ns
+        strains = [int(i) - c.strain.start for i in lasting if c.strain.start <= i < c.strain.stop]
+        still = self._standstill.still
+        if c.g and (still[: c.n + c.g] >= BRIDGED - 1).all():
+            self._frozen(stamp)
+            return self._afresh(lasting)
+        for i in lasting:
+            name, unit = c.names[i], f" {c.units[i]}".rstrip()
+            by = jumps.read(i) - jumps.line(i)
+            text = f"{name} jumped by {by:.3g}{unit}, {jumps.bound(i):.2g}{unit} are possible"
+            if i < c.n:
+                if still[i] >= BRIDGED - 1:
+                    text = (
+                        f"{name} stands still in the middle of a motion, {abs(by):.2g} rad behind"
+                    )
+                elif not c.count[i]:
+                    text += "; state encoder_counts in the arm file if it is rounded"
+                self.doubts.add(name, ArmSample.DISTRUSTED, text, stamp)
+            elif c.velocity.start <= i < c.velocity.stop:
+                self.doubts.add(name, ArmSample.STOP, text, stamp)
+            elif c.amplitude.start <= i < c.amplitude.stop:
+                degree = ArmSample.STOP if self._has_strain else ArmSample.DISTRUSTED
+                self.doubts.add(name, degree, text, stamp)
+            elif i >= c.rate.start:
+                self.doubts.add(name, ArmSample.STOP, text, stamp)
+        if strains:
+            names = self._named(strains)
+            by = ", ".join(
+                f"{1e6 * (jumps.read(c.strain.start + i) - jumps.line(c.strain.start + i)):.3g}"
+                for i in strains
+            )
+            if (still[c.n + np.array(strains)] >= BRIDGED - 1).all():
+                text = f"strain of {names} stands still in the middle of a motion"
+            else:
+                text = self._wiring(strains) or f"strain of {names} jumped by {by} microstrain"
+            self._without(strains, text, stamp)
+        return self._afresh(lasting)
+
+    def _afresh(self, lasting):
+        """Whether the observer must start afresh after these jumps."""
+        if not (lasting < self.channels.n).any():
+            return False
+        self._agreement.reset()
+        if self._law is not None:
+            self._law.reset()
+        return True
+
+    def _wiring(self, strains):
+        """The wiring that explains strains which jumped, in words; empty if none does."""
+        jumps, first = self.jumps, self.channels.strain.start
+        was = np.array([jumps.line(first + i) for i in strains])
+        now = np.array([jumps.read(first + i) for i in strains])
+        bound = 3.0 * np.array([jumps.bound(first + i) for i in strains]) + 0.1 * np.abs(now - was)
+        names = self._named(strains)
+        if (np.abs(now + was) < bound).all():
+            return f"strain of {names} has the wrong sign since it jumped"
+        if len(strains) == 2 and (np.abs(now - was[::-1]) < bound).all():
+            return f"strain of {names}: the gauges are exchanged since it jumped"
+        return ""
+
+    def _named(self, indices):
+        """Names of gauges."""
+        if len(indices) == self.channels.g > 2:
+            return "all gauges"
+        return " and ".join(self.channels.model.arm.gauge_names[i] for i in indices)
+
+    def _without(self, indices, text, stamp_ns):
+        """Leave gauges out, or distrust the state where the others don't suffice."""
+        self._gauges.doubt(indices)
+        lost = tuple(np.flatnonzero(self._gauges.doubted).tolist())
+        enough = self._map.possible_without(lost)
+        degree = ArmSample.STOP if enough else ArmSample.DISTRUSTED
+        self.doubts.add(f"strain of {self._named(indices)}", degree, text, stamp_ns)
+
+    def _take_out(self, sample):
+        """Take out of the sample what is in doubt and can be done without."""
+        c, doubts = self.channels, self.doubts
+        if doubts.trust == ArmSample.TRUSTED:
+            return
+        if sample.velocity_known and any(doubts.about(c.names[i]) for i in _range(c.velocity)):
+            sample.velocity_known = False
+        if sample.strain is not None and any(doubts.about(c.names[i]) for i in _range(c.amplitude)):
+            sample.amplitude = None
+        if sample.rate is not None and any(doubts.about(c.names[i]) for i in _range(c.rate)):
+            sample.rate = None
+
+    def take(self, sample):
+        """Remember a sample that the observer has taken, and look for what shows over several of them.
+
+        Parameters
+        ----------
+        sample : ArmSample
+            Its `trust` and `doubt` are set; what its source doubts comes first.
+        """
+        stamp = sample.stamp_ns
+        if self._dt > 0.0:
+            self._compare(sample, stamp)
+        self.jumps.take(self._value, 1e-9 * stamp) if self._dt > 0.0 else self._begin(stamp)
+        self._samples += 1
+        self.doubts.expire(stamp)
+        if (
+            self._gauges is not None
+            and self._gauges.doubted.any()
+            and not self.doubts.about_any("strain of")
+        ):
+            self._gauges.doubted[:] = False
+        self.mark(sample)
+        self.stamp_ns = stamp
+
+    def mark(self, sample):
+        """Set `trust` and `doubt` of a sample that was taken, or of its repetition; its source's own come first."""
+        if self.doubts.trust > sample.trust:
+            sample.trust, sample.doubt = self.doubts.trust, self.doubts.text
+
+    def _begin(self, stamp_ns):
+        """Remember the first sample."""
+        self.jumps.judge(self._value, self._torque, 1.0, 1)
+        self.jumps.take(self._value, 1e-9 * stamp_ns)
+        self._agreement.update(self._value, 1.0, 0.0)
+
+    def _compare(self, sample, stamp):
+        c, dt, jumps = self.channels, self._dt, self.jumps
+        noise = jumps.rms[c.strain]
+        joints, gauges, speeds, frame = self._standstill.update(self._raw, sample.torque, noise, dt)
+        pairs = self._agreement.update(self._value, dt, jumps.jitter)
+        wiring = None
+        if self._law is not None and self._has_strain:
+            wiring = self._law.update(sample.position, self._value[c.strain], sample.velocity, dt)
+        self._watch_rate(stamp)
+        if self._samples < LEARNT:
+            return
+        still = self._standstill.still
+        if frame:
+            self._frozen(stamp)
+        for j in joints:
+            text = f"{c.names[j]} does not answer the torque: the same for {still[j]} samples"
+            self.doubts.add(c.names[j], ArmSample.DISTRUSTED, text, stamp)
+        if gauges.size and not frame:
+            count = still[c.n + gauges].min()
+            text = f"strain of {self._named(gauges)} stands still for {count} samples"
+            self._without(gauges, text, stamp)
+        for j in speeds:
+            name, count = c.names[c.velocity.start + j], still[c.n + c.g + j]
+            text = f"{name} stands still for {count} samples in the middle of a motion"
+            self.doubts.add(name, ArmSample.STOP, text, stamp)
+        if pairs is not None:
+            self._disagree(pairs, stamp)
+        if wiring is not None:
+            words, members, _ = self._law.hypotheses[wiring]
+            before, after = self._law.misfits
+            text = f"{words}; misfit to the motion {before:.2g}, so read {after:.2g}"
+            self._without(members, text, stamp)
+
+    def _frozen(self, stamp_ns):
+        text = "the frame is frozen: joint positions and strains stand still together"
+        self.doubts.add("frame", ArmSample.DISTRUSTED, text, stamp_ns)
+
+    def _disagree(self, pairs, stamp):
+        """Rates that do not fit their values."""
+        c, agreement = self.channels, self._agreement
+        for j in pairs:
+            value, rate = (c.names[i] for i in agreement.pairs[:, j])
+            if agreement.stands(j) or (j < c.n and self._standstill.still[j] >= BRIDGED):
+                text = f"{value} stands still, {rate} is not zero"
+                spare = j >= c.n and self._has_strain
+                degree = ArmSample.STOP if spare else ArmSample.DISTRUSTED
+                self.doubts.add(value, degree, text, stamp)
+            else:
+                text = f"{rate} {agreement.words(j)}"
+                self.doubts.add(rate, ArmSample.STOP, text, stamp, for_good=True)
+
+    def _watch_rate(self, stamp_ns):
+        period = self.jumps.period
+        if self._samples < LEARNT:
+            self._long_period = period
+            return
+        if 1.0 / RATE_CHANGE < period / self._long_period < RATE_CHANGE:
+            self._long_period += SLOWLY * (period - self._long_period)
+            self._off_rate = 0
+            return
+        self._off_rate += 1
+        if self._off_rate < RATE_SAMPLES:
+            return
+        text = (
+            f"header.stamp: samples are {1e3 * period:.3g} ms apart,"
+            f" and were {1e3 * self._long_period:.3g} ms"
+        )
+        self.doubts.add("header.stamp", ArmSample.STOP, text, stamp_ns)
+        self._long_period, self._off_rate = period, 0
+
+
+def _range(part):
+    return range(part.start, part.stop)
