@@ -26,6 +26,8 @@ UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
 UNSTATED_AMPLITUDE = 1e-5
 #: For a payload, a configuration or a torque between two samples that is not the model's [-].
 MARGIN = 2.0
+#: A joint with a larger ratio of these accelerations turns hardly anything but the end of a link that bends [-].
+LIGHT = 3.0
 #: Configurations at which the largest accelerations are looked for.
 CONFIGURATIONS = 16
 
@@ -56,6 +58,8 @@ class Channels:
         Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations.
     push : ndarray, shape (N,)
         Change of acceleration by what is not reported; infinite where a joint has no torque limit.
+    heavy : bool
+        Whether no joint accelerates more than `LIGHT` times faster than if the links were rigid.
     strength : ndarray, shape (n,)
         Largest torque of motor or brake [N m].
     """
@@ -116,6 +120,7 @@ class Channels:
             np.maximum(rigid, np.abs(np.linalg.inv(M[:n, :n])), out=rigid)
             if strain_map is not None:
                 np.maximum(strains, np.abs(strain_map.rows @ H[n:, :n]), out=strains)
+        self.heavy = bool((np.diag(joints) <= LIGHT * np.diag(rigid)).all())
         strength = self.strength
         gain = MARGIN * np.vstack([joints, strains, bends, joints, bends])
         push = np.full(self.size, np.inf)

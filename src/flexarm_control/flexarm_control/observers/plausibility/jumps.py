@@ -7,12 +7,12 @@ With the time h to the last sample and T the baseline of the slope s, :math:`\rh
     r = x_k - (x_{k-1} + s h), \qquad
     |r| \le 6\sigma\sqrt{1 + (1+\rho)^2 + \rho^2} + (1+\rho)(c + 2J|s|) + S\,(a + G|\Delta u| + 2e)
 
-for the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest deviation of late from the mean
-period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for rates.
-e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so: a motion that has begun may go on. A
-torque that is unknown, or zero on every joint, so that brakes may act, stands for a step of the largest torque; so
-do lost samples, for the links, and for `UNREPORTED` of it for the joints. The
-noise is the larger of what `channels` has and the rms of r so far. The first `LEARNT` samples are not judged.
+for the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest deviation of late from the
+mean period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for
+rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so: a motion that has begun may
+go on. A torque that is unknown, or zero on every joint, so that brakes may act, stands for a step of the largest
+torque; so do lost samples, for the links, and for `UNREPORTED` of it for the joints. The noise is the larger of
+what `channels` has and the rms of r so far. The first `LEARNT` samples are not judged.
 
 A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump is real.
 """

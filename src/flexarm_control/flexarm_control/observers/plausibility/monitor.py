@@ -63,7 +63,7 @@ class Monitor:
         self._map, self._gauges = strain_map, gauges
         self.doubts, self.jumps = Doubts(), Jumps(c)
         self._agreement, self._standstill = Agreement(c), Standstill(c)
-        self._law = StrainLaw(c, strain_map) if c.g and c.m else None
+        self._law = StrainLaw(c, strain_map) if c.g and c.m and c.heavy else None
         self._value, self._raw = np.zeros(c.size), np.zeros(2 * c.n + c.g)
         self._strain, self._amplitude, self._rates = np.zeros(c.g), np.zeros(c.m), np.zeros(c.m)
         self.stamp_ns = 0

@@ -17,7 +17,8 @@ is 0 where they fit, 1 where they have nothing in common, 2 where the sign is wr
 makes 0.03. When r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are
 judged under each hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the
 smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their own
-noise, or beside what a free oscillation moves, are not judged.
+noise, or beside what a free oscillation moves, are not judged. Nor are arms with light joints (`Channels.heavy`):
+there large inertias cancel in z and p, and a payload that is 30 % off can turn their signs.
 """
 
 from itertools import combinations
@@ -27,7 +28,7 @@ import numpy as np
 #: Corner of the low pass as a multiple of the lowest frequency with free joints, and its limits [rad/s].
 CORNER, MIN_CORNER, MAX_CORNER = 2.0, 15.0, 60.0
 #: Corner of the high pass as a fraction of that of the low pass [-].
-WASHOUT = 0.1
+WASHOUT = 0.5
 #: Time between two comparisons, over which they are averaged, and between new mass matrices [s].
 INTERVAL, MEMORY, RENEWAL = 0.004, 0.12, 0.02
 #: Misfit that raises the question [-], and for how many comparisons.
@@ -35,7 +36,9 @@ MISFIT, PERSISTENT = 0.12, 5
 #: The hypothesis that wins has a misfit below the first, and smaller by the second [-].
 FIT, RATIO = 0.2, 5.0
 #: Strains are judged when z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
-CLEAR, DRIVEN = 8.0, 0.3
+CLEAR, DRIVEN = 8.0, 0.5
+#: And the strains are at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
+STRAINED = 0.2
 
 
 class StrainLaw:
@@ -145,16 +148,15 @@ class StrainLaw:
         self._sums += (1.0 - keep) * np.stack([(z + p) ** 2, z * z + p * p, strain**2, moved**2])
         # Sums over the gauges of one link and direction.
         misfit, total, still, swing = self._sums @ self._groups
-        clear = self._clear(total) & (total > DRIVEN**2 * (still + swing))
-        doubtful = clear & (misfit > MISFIT * total)
+        doubtful = self._judged(total, still, swing) & (misfit > MISFIT * total)
         self._run[~doubtful] = 0
         self._run[doubtful] += 1
         if self._number < self._kept or not (self._run >= PERSISTENT).any():
             return None
         return self._decide()
 
-    def _clear(self, total):
-        """Whether z and p are larger than noise makes them, by gauge."""
+    def _judged(self, total, still, swing):
+        """Whether z and p are larger than noise and wrong frequencies make them, by gauge."""
         c, w = self.channels, self.corner
         gauge = c.noise[c.strain]
         encoder = np.maximum(c.count / np.sqrt(12.0), c.noise[c.position])
@@ -162,20 +164,25 @@ class StrainLaw:
         noise = gauge**2 + (0.3 * w * w) ** 2 * (
             self._load**2 @ gauge**2 + self._drive**2 @ encoder**2
         )
-        return total > CLEAR**2 * (noise @ self._groups)
+        driven = (total > DRIVEN**2 * (still + swing)) & (still > STRAINED**2 * total)
+        return driven & (total > CLEAR**2 * (noise @ self._groups))
 
     def _decide(self):
         """The hypothesis that fits much better, if there is one."""
         strain, acceleration, p = np.moveaxis(self._history, 1, 0)  # each (kept, g)
-        z = strain @ self._project.T + acceleration @ self._load.T
-        misfit, total = ((z + p) ** 2).sum(axis=0), (z * z + p * p).sum(axis=0)
+        moved = acceleration @ self._load.T
+        z = strain @ self._project.T + moved
+        misfit, total = ((z + p) ** 2).mean(axis=0), (z * z + p * p).mean(axis=0)
+        still, swing = (strain**2).mean(axis=0), (moved**2).mean(axis=0)
+        judged = self._judged(*(sums @ self._groups for sums in (total, still, swing)))
+        misfit, total = misfit * judged, total * judged + ~judged
         T = self._hypothesis
         z = np.einsum("ij,hjk,tk->hti", self._project, T, strain, optimize=True)
         z += np.einsum("ij,hjk,tk->hti", self._load, T, acceleration, optimize=True)
-        others, totals = ((z + p) ** 2).sum(axis=1), (z * z).sum(axis=1) + (p * p).sum(axis=0)
+        others, totals = ((z + p) ** 2).mean(axis=1), (z * z).mean(axis=1) + (p * p).mean(axis=0)
         nominal = self._concerned @ misfit / (self._concerned @ total)
         other = (self._concerned * others).sum(axis=1) / (self._concerned * totals).sum(axis=1)
-        doubtful = self._concerned[:, self._run >= PERSISTENT].any(axis=1)
+        doubtful = self._concerned[:, judged & (self._run >= PERSISTENT)].any(axis=1)
         gain = np.where(doubtful & (other < FIT) & (nominal > MISFIT), nominal / other, 0.0)
         best = int(np.argmax(gain))
         self.misfits = float(nominal[best]), float(other[best])
