@@ -5,7 +5,7 @@ import re
 from dataclasses import replace
 
 import pytest
-from harness import PATIENT, Arm, trajectory
+from harness import PATIENT, Arm, Bench, trajectory
 from in_process import InProcess
 
 from flexarm_msgs.msg import CompositeState, JointTorque
@@ -104,3 +104,36 @@ def test_the_nodes_send_the_torques_that_flexarm_attack_computes(arm, name):
     common = sorted(k for k in sent if STANDS < k < trace.time.size)
     assert len(common) > 900 and common[-1] > 1e3 * AT + 100
     assert [sent[k] for k in common] == [trace.torque[k, 0] for k in common]
+
+
+@pytest.fixture
+def real_time(tmp_path):
+    """The three nodes as processes, in real time, the arm at its fastest in a motion of 1 rad."""
+    with Bench(tmp_path) as bench:
+        bench.start_loop(
+            {"rate": 200.0, "allow_faults": True}, controller={"fast.type": "none"}, arm="R"
+        )
+        arm = Arm(bench)
+        arm.wait_ready()
+        arm.offer(trajectory(["joint1"], (MOTION, [1.0], [0.0], [0.0])))
+        bench.wait_for("half of the motion", lambda: arm.measured.newest.joint_position[0] > 0.4)
+        yield arm
+
+
+@pytest.mark.real_time
+def test_in_real_time_a_message_repeated_for_ever_ends_the_torque_and_the_arm_rests_on_its_path(
+    real_time,
+):
+    bench = real_time.bench
+    # From now on: a time that has passed.
+    assert bench.set("simulator", faults=["state repeat"])[0].successful
+    bench.wait_for("a fault", lambda: real_time.state.supervisor_state == FAULT)
+    says = lies.LIES["message repeated for ever"].says
+    assert re.search(says, real_time.state.rejected_reason.lower()), real_time.state.rejected_reason
+    assert real_time.torques.newest.mode == JointTorque.DISABLED
+    assert bench.set("simulator", faults=[])[0].successful
+    old = real_time.measured.newest.sequence
+    bench.wait_for("new samples", lambda: real_time.measured.newest.sequence > old + 200)
+    assert 0.0 < real_time.measured.newest.joint_position[0] < 1.0
+    assert abs(real_time.measured.newest.joint_velocity[0]) < 0.05
+    assert {m.mode for m in real_time.torques.messages[-50:]} == {JointTorque.DISABLED}

@@ -283,4 +283,10 @@ def test_the_command_runs_in_processes_and_its_exit_code_reports(tmp_path, capsy
         (v, m) for v in (False, True) for m in (0.5, 1.15)
     ]
     assert code == int(any(r["failed"] for r in rows))
-    assert "| clock back by 1 s |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| clock back by 1 s |" in printed
+    assert command.attack(options("--from", str(out))) == code
+    assert capsys.readouterr().out == printed
+    out.write_text('{"a": 1}')
+    with pytest.raises(FlexarmError, match="was not written by --json"):
+        command.attack(options("--from", str(out)))

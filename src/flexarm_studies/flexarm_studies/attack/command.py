@@ -37,6 +37,13 @@ def add_arguments(parser):
     add("--seed", type=int, default=0, help="of random lies and healthy runs (0)")
     add("--workers", type=int, metavar="N", help="processes (one per core)")
     add("--json", metavar="FILE", help="write every run")
+    add(
+        "--from",
+        dest="stored",
+        nargs="+",
+        metavar="FILE",
+        help="take runs that --json wrote, of one study or several; run nothing",
+    )
     add("--write", metavar="FILE", help="write the table between the markers of this file")
     add("--note", metavar="FILE", help="write the table, worst on top, and the worst runs to FILE")
 
@@ -50,12 +57,28 @@ def attack(options):
     if options.list:
         print("\n".join(f"{lie.kind:13}{lie.name}" for lie in wanted.values()))
         return 0
+    if options.stored:
+        return _report(options, [row for file in options.stored for row in _stored(file)])
     cases = chosen(_split(options.arms), _split(options.observers))
     if options.healthy:
         from .healthy import healthy
 
         return healthy(options, cases)
-    rows = study(cases, wanted, options.workers)
+    return _report(options, study(cases, wanted, options.workers))
+
+
+def _stored(file):
+    """Rows that `--json` wrote."""
+    try:
+        rows = json.loads(Path(file).read_text(encoding="utf-8"))
+        report.summary(rows)
+        return rows
+    except (ValueError, LookupError, TypeError) as error:
+        raise FlexarmError(f"was not written by --json: {error}", field=file) from None
+
+
+def _report(options, rows):
+    """Write and print what the runs show; the exit code."""
     entries = report.summary(rows)
     if options.json:
         Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
