@@ -354,8 +354,13 @@ class Source:
         return self.bench.call(Trigger, "controller/recover").success
 
     def restart(self):
-        """A new session from rest, without a fault."""
+        """A new session from rest, its first state answered, without a fault."""
+        self.begin_session()
+        self.step()
         self.recover()
+
+    def begin_session(self):
+        """A new session from rest."""
         self.sim.reset()
         self.session, self.sequence = (self.session + 1) % 2**32, 0
 

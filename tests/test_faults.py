@@ -243,21 +243,22 @@ def test_a_gap_in_the_sequence_is_bridged(source):
     assert np.isfinite(state.torque).all()
 
 
-def test_a_new_session_holds_where_the_arm_is_and_forgets_the_trajectory(source):
+def test_a_new_session_in_motion_waits_for_recover_then_holds_where_the_arm_is(source):
     arm = Arm(source.bench)
     arm.publish_trajectory(trajectory(J, (5.0, [1.0])))
     source.bench.wait_for(
         "tracking", lambda: source.step()[1].supervisor_state == CompositeState.TRACKING
     )
-    source.restart()
+    source.begin_session()
     source.sim.reset([0.4])
-    torque, state = source.step()
-    assert torque.mode == JointTorque.DISABLED
-    assert state.supervisor_state == CompositeState.FAULT
-    assert "restarted during a motion" in state.rejected_reason
+    for _ in range(10):
+        torque, state = source.step()
+        assert torque.mode == JointTorque.DISABLED
+        assert state.supervisor_state == CompositeState.FAULT
+    assert "the source of the states has restarted during a motion" in state.rejected_reason
     assert source.recover()
     torque, state = source.until_enabled(most=10)
-    assert source.sim.sequence < 12, "the new session was taken for an old one"
+    assert source.sim.sequence < 22, "the new session was taken for an old one"
     assert state.supervisor_state == CompositeState.READY
     assert list(state.reference_position) == [0.4]
     assert torque.session == source.session

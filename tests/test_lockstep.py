@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm import arm_file
+from flexarm_msgs.msg import CompositeState
 from flexarm_studies.case_study import runs as case_study
 from flexarm_studies.loop import closed_loop
 from flexarm_tools.case_study import nodes
@@ -35,9 +36,18 @@ def record(directory, duration, run=RUN, repeats=1):
         for repeat in range(repeats):
             with lockstep.LockstepRun(processes) as line:
                 if repeat:
-                    assert line.call(Trigger, "simulator/reset").success
+                    restart(line)
                 found.append(line.run(message, duration))
     return found
+
+
+def restart(line):
+    """Reset the simulator, and recover: an arm that is elsewhere all at once is a fault."""
+    assert line.call(Trigger, "simulator/reset").success
+    line.wait_for(
+        "the fault", lambda: line.controller_state().supervisor_state == CompositeState.FAULT
+    )
+    assert line.call(Trigger, "controller/recover").success
 
 
 def in_this_process(duration, run=RUN):
@@ -49,8 +59,8 @@ def in_this_process(duration, run=RUN):
         return bench.record(message, duration)
 
 
-#: What tells one run from another, or is a wall-clock time.
-IDENTITY = {"session", "controller_id", "accepted_trajectory_id", "compute_time"}
+#: What tells one run from another, or depends on the wall clock: how long it took, and whether a state was sent again.
+IDENTITY = {"session", "controller_id", "accepted_trajectory_id", "compute_time", "clock_stopped"}
 
 
 def without_identity(samples):

@@ -38,6 +38,7 @@ KEYS = {
 JAZZY = {"builtin_interfaces", "diagnostic_msgs", "launch", "launch_ros", "rcl_interfaces", "rclpy"}
 JAZZY |= {
     "geometry_msgs",
+    "lifecycle_msgs",
     "sensor_msgs",
     "std_msgs",
     "std_srvs",

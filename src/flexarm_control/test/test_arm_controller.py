@@ -450,6 +450,23 @@ def test_a_gap_beyond_resume_gap_gives_the_motion_up_and_torque_returns_in_a_ram
     assert not core.reference.active
 
 
+def test_a_moving_arm_is_taken_over_as_it_moves_and_brought_to_rest(arm_r):
+    core = controller(arm_r, return_time=0.065)
+    positions, speeds, torques = [], [], []
+    for k in range(2000):
+        place, speed = (
+            (0.2, 0.5) if k == 0 else (positions[-1], speeds[-1])
+        )  # it follows the reference
+        assert core.step(sample(k, place, velocity=[speed]))
+        positions.append(core.reference.position[0])
+        speeds.append(core.reference.velocity[0])
+        torques.append(core.torque[0])
+    assert (positions[0], speeds[0]) == (0.2, 0.5)
+    assert core.state == State.HOLDING and speeds[-1] == 0.0
+    assert 0.25 < positions[-1] < 0.5
+    assert np.abs(torques[:21]).max() <= 0.1 * FILE_LIMIT
+
+
 def test_at_a_low_rate_a_period_is_no_gap(arm_r):
     core = started(arm_r)
     for k in range(1, 10):

@@ -29,6 +29,8 @@ SLOW = {"type": "linear_model_following"}
 NONE = {"type": "none"}
 TRUE_RATES = {"type": "true_rates"}
 PUBLISH = {"publish_rates": True}
+#: The laws' torque as it is, however fast it changes.
+UNBOUNDED = {"torque_rate_limit": [1e9]}
 TRUE = [run for run in RUNS if run.rates == "true"]
 
 
@@ -209,7 +211,7 @@ def test_without_joint_velocities_the_loop_reconstructs_them():
 
 
 def test_luenberger_in_the_loop_finds_the_true_rates_from_the_torque_that_was_applied():
-    loop = ClosedLoop("R", SLOW, NONE, {"type": "luenberger"})
+    loop = ClosedLoop("R", SLOW, NONE, {"type": "luenberger"}, controller=UNBOUNDED)
     for _ in range(200):
         loop.step()
     assert loop.controller.offer(motion(loop)).accepted

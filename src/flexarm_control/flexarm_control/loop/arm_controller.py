@@ -3,10 +3,11 @@
 
 import numpy as np
 
-from flexarm_dynamics.errors import FlexarmError, MessageError
+from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
 from ..trajectory import ReferenceGenerator, Verdict, validate
+from ..trajectory.reference import GENTLE
 from . import applied, authority, supervisor
 from .applied import Applied
 from .authority import Authority
@@ -446,12 +447,23 @@ class ArmController:
     def _return(self, sample, keeps=False):
         """Torque returns in a ramp; the reference begins where the arm is, and brakes it where it moves."""
         if not keeps:
-            self.reference.start(sample.position, sample.stamp_ns)
+            self._take_over(sample)
         self._waiting, self._repeats = False, 0
         self.supervisor.begin()
         self._authority.begin(sample.position)
         self._applied.begin(self.torque)
         self.law.reset()
+
+    def _take_over(self, sample):
+        """The reference begins where the arm is, and brakes it from how it moves."""
+        position, stamp, velocity = sample.position, sample.stamp_ns, None
+        if np.abs(sample.velocity).max() > AT_REST:
+            velocity = sample.velocity
+        deceleration = np.minimum(GENTLE, self.supervisor.deceleration)
+        try:
+            self.reference.start(position, stamp, velocity, deceleration)
+        except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
+            self.reference.start(position, stamp)
 
     def _interrupted(self, sample, gap):
         """States were missing for `gap` [s], in which the driver took its safe action."""
