@@ -64,7 +64,10 @@ def attack(options):
         from .healthy import healthy
 
         return healthy(options, cases)
-    return _report(options, study(cases, wanted, options.workers))
+    # After every few runs, so that an interrupted study loses nothing.
+    return _report(
+        options, study(cases, wanted, options.workers, lambda rows: _store(options, rows))
+    )
 
 
 def _stored(file):
@@ -77,15 +80,20 @@ def _stored(file):
         raise FlexarmError(f"was not written by --json: {error}", field=file) from None
 
 
+def _store(options, rows):
+    """Write the files that are asked for, of all runs or of those that there are."""
+    if options.json:
+        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if options.note:
+        report.note(options.note, rows)
+
+
 def _report(options, rows):
     """Write and print what the runs show; the exit code."""
     entries = report.summary(rows)
-    if options.json:
-        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    _store(options, rows)
     if options.write:
         report.write(options.write, entries)
-    if options.note:
-        report.note(options.note, rows)
     print("\n".join([*report.table(entries), "", *report.worst_runs(rows)]))
     return int(any(row["failed"] for row in rows))
 
@@ -123,8 +131,11 @@ def _case_of(lie, case):
     return case_of(lie, case)
 
 
-def study(cases, wanted, workers=None):
-    """Run all, in several processes; the rows, in the order of `jobs`."""
+def study(cases, wanted, workers=None, store=lambda rows: None):
+    """Run the `wanted` lies in all `cases`, in processes, `workers` or one per core; the rows, in the order of `jobs`.
+
+    Those that there are go to `store` each time some are added.
+    """
     todo, progress = jobs(cases, wanted), Progress()
     parts = _parts(todo)
     rows = {}
@@ -135,12 +146,13 @@ def study(cases, wanted, workers=None):
         for future in as_completed(running):
             rows |= dict(zip(running[future], future.result(), strict=True))
             progress.step(str(running[future][0][0]), len(rows), total)
+            store([rows[job] for job in todo if job in rows])
     progress.done()
     return [rows[job] for job in todo]
 
 
 #: Runs that go to a process at once: each process runs the honest motion of a case but once.
-AT_ONCE = 12
+AT_ONCE = 6
 
 
 def _parts(todo):
