@@ -315,8 +315,16 @@ LAWS = [
     *of(
         "flexarm_control",
         "feedforward",
-        TESTS + "test_look_ahead.py flexarm_studies/test/test_beyond_the_paper.py",
+        TESTS
+        + "test_look_ahead.py flexarm_control/test/test_model_feedforward.py"
+        + " flexarm_studies/test/test_beyond_the_paper.py",
         ("model", "the regulator's gain: sign", "    return B.T @ P\n", "    return -B.T @ P\n"),
+        (
+            "model",
+            "jumps of the manifold: not faded",
+            "fading.jump(self._continued(before, dt) - now)",
+            "fading.clear()",
+        ),
         (
             "preview",
             "torque of the coming period",

@@ -40,6 +40,8 @@ def torques(model, kind, ahead, gaps, count=None):
             verdict = reference.offer(data)
             assert verdict.accepted
             control.feedforward.take(plan, verdict.trajectory_id)
+        if k == 80:
+            reference.stop(stamp, 1.0, given=False)
         stamp += gap
         reference.sample(stamp)
         before = len(calls)
@@ -71,9 +73,9 @@ def test_looking_ahead_leaves_the_manifold_of_the_motion_out_of_the_step(arm_r):
     alone, helped = [], []
     torques(arm_r, "model", False, [MS] * 120, alone)
     torques(arm_r, "model", True, [MS] * 120, helped)
-    # Where the second motion takes over, the first one's continuation is worked out, too.
-    assert sum(alone[10:90]) == 80 + 1
-    assert sum(helped[10:90]) == 2
+    # Where the second motion takes over, and where it stops, what was before is continued, too.
+    assert sum(alone[10:90]) == 80 + 2
+    assert sum(helped[10:90]) == 2 + 2
 
 
 def test_the_slow_torque_is_that_about_the_motion_as_it_is_now(arm_r):

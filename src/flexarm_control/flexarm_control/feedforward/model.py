@@ -166,18 +166,17 @@ class Fading:
         Of the signal that jumps.
     rate : float
         lambda [1/s].
-
-    Attributes
-    ----------
-    left : ndarray, shape (size,)
-        What is left of them all.
     """
 
     def __init__(self, size, rate):
         self.rate = rate
         # (c0 + c1 t + c2 t^2) e^{-lambda t} from now on: jumps add up in it, however many there were.
-        self._c = np.zeros((3, size))
-        self.left, self._active = self._c[0], False
+        self._c, self._active = np.zeros((3, size)), False
+
+    @property
+    def left(self):
+        """What is left of all jumps, shape (size,)."""
+        return self._c[0]
 
     def clear(self):
         """Forget all jumps."""

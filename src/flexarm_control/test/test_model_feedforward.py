@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The feed-forward that simulates the nominal arm: no step of its torque, whatever the reference's jerk does."""
+
+import pickle
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexarm_control import trajectory
+from flexarm_control.composite.design import design
+from flexarm_control.feedforward.model import Fading
+from flexarm_control.trajectory import ReferenceGenerator
+
+MS = 1_000_000
+SLOW, FAST, CORRECTED = {"type": "linear_model_following"}, {"type": "lqr"}, {"type": "corrected"}
+
+
+def faded(time, rate):
+    """phi of the module, from 0 on."""
+    x = rate * np.maximum(time, 0.0)
+    return np.where(time < 0.0, 0.0, (1.0 + x + 0.5 * x * x) * np.exp(-x))
+
+
+def test_jumps_add_up_and_fade_whatever_the_samples():
+    fading, rng, now = Fading(2, 20.0), np.random.default_rng(0), 0.0
+    jumps = {0.0: [1.0, -2.0], 0.1: [0.5, 3.0]}
+    for time in sorted([*rng.uniform(0.0, 0.4, 30), *jumps]):
+        fading.advance(time - now)
+        now = time
+        if time in jumps:
+            fading.jump(np.array(jumps[time]))
+        wanted = sum(faded(time - t, 20.0) * np.array(j) for t, j in jumps.items() if t <= time)
+        assert_allclose(fading.left, wanted, rtol=1e-9)
+    again = pickle.loads(pickle.dumps(fading))
+    again.advance(0.1)
+    fading.advance(0.1)
+    assert_allclose(again.left, fading.left, rtol=0.0, atol=0.0)
+    fading.advance(10.0)
+    assert not fading.left.any()
+
+
+def torques(model, fields, stop=None, until=2.6):
+    """Feed-forward torque (k, 1) of a motion of 1 rad in 2 s, sampled at 1 kHz from before its start; the motion."""
+    names = model.joint_names
+    motion = design(model, SLOW, FAST, CORRECTED, {"feedforward": "model"}).feedforward
+    reference = ReferenceGenerator(names, period=0.5)
+    reference.start(np.zeros(1), 0)
+    point = (2000 * MS, *([1.0], [0.0], [0.0])[:fields], *([[]] * (4 - fields)))
+    data, out = trajectory.validate(names, names, 0, [point]), []
+    for k in range(-5, round(1000 * until)):
+        if k == 0:
+            assert reference.offer(data).accepted
+        if stop is not None and k == round(1000 * stop):
+            reference.stop((k + 4) * MS, 10.0, given=False)
+        reference.sample((k + 5) * MS)
+        motion.update(reference, 1e-3 if out else 0.0)
+        out.append(motion.torque.copy())
+    return np.array(out), motion
+
+
+@pytest.mark.parametrize("fields", [1, 2, 3])
+def test_a_motion_begins_and_ends_without_a_step_of_torque(arm_r, fields):
+    """Linear points jump in velocity, cubic ones in acceleration, quintic ones in jerk."""
+    u, motion = torques(arm_r, fields)
+    steps = np.abs(np.diff(u, axis=0)).max(axis=1)
+    assert steps.max() < {1: 1.6, 2: 0.32, 3: 0.045}[fields]  # without fading: 45, 7.3 and 1.75
+    assert_allclose(motion.position, 1.0, atol=5e-3)
+
+
+@pytest.mark.parametrize("stop", [0.0, 0.002, 0.3, 1.0, 1.6, 1.99])
+def test_a_stop_takes_no_step_of_torque(arm_r, stop):
+    u, motion = torques(arm_r, 3, stop, 4.0)
+    assert np.abs(np.diff(u, axis=0)).max() < 0.05
+    assert np.abs(motion.velocity).max() < 1e-4
+    assert np.abs(u[-1]).max() < 1e-3
