@@ -23,8 +23,12 @@ from .values import (
 
 #: Deceleration from a measured velocity, where none is given [rad/s^2].
 GENTLE = 2.0
+#: A stop's acceleration and jerk over the motion's own largest.
+MORE = 1.15, 1.3
 #: A motion that is slower than this fraction of what the joint could do is stopped faster than it would stop itself.
 SLOW_FRACTION = 0.2
+#: Least duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
+PERIODS = 1.2, 1.5
 #: Ratio of the times that are tried for a stop, and the time law at the places where each is judged.
 LONGER, _TABLE = 1.1, Slowing.table(33)[:, :, None]
 
@@ -58,7 +62,7 @@ class ReferenceGenerator:
     velocity_max : (n,) array_like, optional
         Limit of the mean speed between the reference at the start and the first point [rad/s].
     period : float
-        Least duration of a stop [s]: about a period of the lowest bending mode, which it then hardly excites.
+        Of the lowest bending mode [s]; a stop takes longer, and so hardly excites it. 0: none.
 
     Attributes
     ----------
@@ -311,11 +315,11 @@ class ReferenceGenerator:
     def stop(self, stamp_ns, deceleration, given=True):
         """Bring the reference to rest along its path, then hold; cancel all trajectories.
 
-        The trajectory's own time is slowed down (module `path`), over a time T which is at least `period`, and
-        the first of a geometric sequence in which on all of the way
+        The trajectory's own time is slowed down (module `path`), over a time T which is at least `PERIODS` of the
+        lowest bending mode, and the first of a geometric sequence in which on all of the way
 
         - where the deceleration D is given: slowing down takes at most D,
-        - otherwise: acceleration is at most 1.25 times the motion's own largest, jerk 1.5 times, or, for a slow motion,
+        - otherwise: acceleration and jerk are at most `MORE` times the motion's own largest, or, for a slow motion,
           what slowing down with `SLOW_FRACTION` D takes.
 
         The bounds hold for every joint. If the path ends before, the reference ends with it. A stop within a stop
@@ -398,14 +402,15 @@ def _limits(path, deceleration, given, period):
     slow = SLOW_FRACTION * deceleration
     # How fast the motion itself changes.
     scale = np.divide(speed, acceleration, out=np.zeros_like(speed), where=acceleration > 0.0).max()
-    shortest = max(min(max(period, 1.2 * scale or np.inf), 1.5 * period), BRAKING_STEP)
+    low, high = (factor * period for factor in PERIODS)
+    shortest = max(min(max(low, 1.2 * scale or np.inf), high), BRAKING_STEP)
     # What it takes to stop with that deceleration in the shortest time.
     with np.errstate(over="ignore"):  # infinite is no bound
         quick = slow * Slowing.MAX_BEND / (Slowing.MAX_SLOPE * shortest)
     bounds = (
         np.where(given, deceleration, np.inf),
-        np.where(given, np.inf, np.maximum(1.15 * acceleration, slow)),
-        np.where(given, np.inf, np.maximum(1.3 * jerk, quick)),
+        np.where(given, np.inf, np.maximum(MORE[0] * acceleration, slow)),
+        np.where(given, np.inf, np.maximum(MORE[1] * jerk, quick)),
     )
     return bounds, shortest
 
