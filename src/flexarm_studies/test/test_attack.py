@@ -262,7 +262,8 @@ def test_the_table_has_the_worst_of_all_runs_and_the_worst_lie_on_top(tmp_path):
     ]
     first, second = report.summary(rows)
     assert (first["lie"], first["runs"], first["held"], first["failed"]) == ("a", 1, 1, {})
-    assert (second["speed"], second["named"], second["held"]) == (3.0, 0.1, 0)
+    assert (second["speed"], second["named"], second["held"]) == (3.0, report.NEVER, 0)
+    assert (first["named"], first["safe"]) == (0.1, 0.2)
     assert second["failed"] == {"speed": 2, "named": 1}
     report.note(tmp_path / "note.md", rows)
     lines = (tmp_path / "note.md").read_text().splitlines()

@@ -7,6 +7,8 @@ from .. import markdown
 from .run import CRITERIA
 
 MARKERS = "<!-- attack table: begin -->", "<!-- attack table: end -->"
+#: In place of a time: it did not happen before the run's end.
+NEVER = "never"
 COLUMNS = (
     "lie", "speed", "strain", "excursion [rad]", "step", "outlier [%]", "returning [%]", "safe after [s]",
     "named after [s]", "runs", "held", "what fails, in how many runs",
@@ -21,6 +23,10 @@ def summary(rows):
         failed = [what for row in own for what in row["failed"]]
         worst = {k: _worst(own, k) for k in ("speed", "strain", "excursion", "step")}
         worst |= {k: _worst(own, k) for k in ("outlier", "returning", "safe", "named")}
+        if any(row["safe"] is None for row in own):
+            worst["safe"] = NEVER
+        if any(row["named"] is None and "named" in row["failed"] for row in own):
+            worst["named"] = NEVER
         counts = {what: failed.count(what) for what in dict.fromkeys(failed)}
         held = sum(not row["failed"] for row in own)
         found.append(

@@ -376,7 +376,9 @@ def judged(row, lie):
         failed.append(f"alarm: {row['text']}")
     if lie.kind == lies.STOP and row["state"] == "FAULT":
         failed.append("ends in FAULT")
-    row = {k: round(v, 9) if isinstance(v, float) and v != np.inf else v for k, v in row.items()}
+    row = {
+        k: round(v, 9) + 0.0 if isinstance(v, float) and v != np.inf else v for k, v in row.items()
+    }
     row = {k: None if v == np.inf else v for k, v in row.items()}
     return row | {"failed": failed}
 
