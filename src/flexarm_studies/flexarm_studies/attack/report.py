@@ -4,6 +4,7 @@
 from pathlib import Path
 
 from .. import markdown
+from .lies import LASTING
 from .run import CRITERIA
 
 MARKERS = "<!-- attack table: begin -->", "<!-- attack table: end -->"
@@ -23,7 +24,7 @@ def summary(rows):
         failed = [what for row in own for what in row["failed"]]
         worst = {k: _worst(own, k) for k in ("speed", "strain", "excursion", "step")}
         worst |= {k: _worst(own, k) for k in ("outlier", "returning", "safe", "named")}
-        if any(row["safe"] is None for row in own):
+        if own[0]["kind"] == LASTING and any(row["safe"] is None for row in own):
             worst["safe"] = NEVER
         if any(row["named"] is None and "named" in row["failed"] for row in own):
             worst["named"] = NEVER
