@@ -5,8 +5,8 @@ A loop is the shipped nodes in the shipped control, on the moving arm: simulator
 processes, or observer and controller in one. The relay (`flexarm_tools.running.relay`) is three plain nodes that answer
 each message with a ready-made one of the same type, size and quality of service; the same simulator, with the same
 plant, is at its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's
-publish to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that what
-slows the machine slows all of them, and the result is the ratio of each round's medians.
+publish to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that
+what slows the machine slows all of them, and the result is the ratio of each round's medians.
 """
 
 import contextlib

@@ -29,8 +29,8 @@ MAX_BEHIND = 200
 class Watchdog:
     """The device's own timer: it takes the safe action when the driver is silent, killed, stopped or cut off.
 
-    The driver's rules need a driver that runs. **Your device needs such a timer, too**: in the drives' firmware, or in a
-    circuit between this computer and the drives' enable input, which each torque line retriggers.
+    The driver's rules need a driver that runs. **Your device needs such a timer, too**: in the drives' firmware, or in
+    a circuit between this computer and the drives' enable input, which each torque line retriggers.
 
     Parameters
     ----------
