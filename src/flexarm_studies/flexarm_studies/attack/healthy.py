@@ -14,6 +14,7 @@ import numpy as np
 
 from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.errors import FlexarmError
 
 from ..progress import Progress
 from ..workers import processes
@@ -49,7 +50,12 @@ def healthy_run(case, seed):
         f"state jitter by={JITTER / own.rate} seed={seed}",
     )
     driver = driver_of(own, faults, START)
-    trace = drive(driver, until=LASTS)
+    try:
+        trace = drive(driver, until=LASTS)
+    except (
+        FlexarmError
+    ) as error:  # the motion is refused: a finding about this arm, not the end of the study
+        return round(START / driver.period), str(error)
     alarms = [text for time, text in trace.texts if text and time > START]
     if trace.lost or trace.state != State.HOLDING:
         alarms.append(trace.lost or f"ends in {trace.state.name}")
