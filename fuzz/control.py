@@ -230,7 +230,8 @@ class Controllers(_Path):
 
     def good(self, key, k):
         core, _ = self.built[key]
-        if k == 0:
+        if k == 0:  # a source that restarts elsewhere is a fault
+            core.fail("for a new session")
             core.recover()
         enabled = core.step(sample_of(self.data(key)[k], self.session))
         return [float(enabled), *core.torque]

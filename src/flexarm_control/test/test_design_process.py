@@ -28,6 +28,7 @@ def torques(control, n, m):
             velocity=state[1],
             acceleration=state[2],
             path=None,
+            stamp_ns=10**9 + 10**6 * k,
             near=lambda _, s=state: s.copy(),
         )
         draw = [1e-3 * rng.standard_normal(size) for size in (n, n, m, m)]

@@ -333,7 +333,7 @@ def controllers_state_is_written_in_place():
     sample.session, sample.rate = 1, np.array([0.01, -0.02])
     for k in range(3):
         sample.sequence, sample.stamp_ns = k, 10**9 + 10**6 * k
-        sample.position[:], sample.velocity[:] = 0.1 * k, 0.2
+        sample.position[:], sample.velocity[:] = 0.1 * k, 0.02  # at rest, for the controller
         sample.amplitude[:] = [1e-3, -1e-4 * k]
         assert core.step(sample)
         got = over_the_wire(writer.fill(sample, core, np.float64(1e-4)))
@@ -343,7 +343,7 @@ def controllers_state_is_written_in_place():
         assert list(got.fast_torque) == law.fast_torque.tolist() != [0.0], got
         assert list(got.fast_deviation) == law.deviation.tolist(), got
         assert list(got.quasi_steady_amplitude) == law.quasi_steady.tolist(), got
-        assert list(got.position_error) == [-0.1 * k] and list(got.velocity_error) == [-0.2], got
+        assert list(got.position_error) == [-0.1 * k] and list(got.velocity_error) == [-0.02], got
         assert got.supervisor_state == int(core.state) and got.compute_time == 1e-4, got
     # A newer law has answered nothing yet; and without a torque nothing is left of an earlier sample.
     core.law = design(MODEL, {"type": "none"}, {"type": "none"})

@@ -570,7 +570,7 @@ def test_a_lost_arm_is_exit_code_1_with_the_reason_and_the_figures(flexarm, chan
     code, out, err = flexarm("simulate", changed_arm("R", without_limits), *words)
     assert code == 1
     assert json.loads(out)["metrics"]["lost"] is True
-    assert "the arm was lost: strain of root is" in err
+    assert "the arm was lost: tracking error of joint1 is" in err
 
 
 def test_noise_that_the_arm_file_does_not_state_is_a_warning(flexarm):

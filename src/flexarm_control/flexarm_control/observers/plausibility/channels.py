@@ -88,6 +88,8 @@ class Channels:
         counts = np.array([j.encoder_counts for j in arm.joints], float)
         self.count = np.divide(2.0 * np.pi, counts, out=np.zeros(n), where=counts > 0.0)
         self.strength = np.array([max(j.limits.torque, j.brake_torque or 0.0) for j in arm.joints])
+        ends = np.array([g.range for g in arm.gauges]).reshape(-1, 2)
+        self._middle, self._half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
         self.noise = self._noise(strain_map)
         self.gain, self.push = self._accelerations(strain_map)
 
@@ -129,6 +131,10 @@ class Channels:
             hard = 2.0 * rigid @ strength
             push = np.concatenate([hard, *soft, hard, soft[1]])
         return gain, push
+
+    def at_end(self, strain):
+        """Which of the gauges' readings, (g,), are at an end of their range; not those that are NaN."""
+        return np.abs(strain - self._middle) >= self._half
 
     def read(self, sample, out):
         """The readings of an `ArmSample` into `out`, shape (N,)."""

@@ -272,7 +272,11 @@ class Monitor:
         pairs = self._agreement.update(self._value, dt, jumps.jitter)
         wiring = None
         if self._law is not None and self._has_strain:
-            wiring = self._law.update(sample.position, self._value[c.strain], sample.velocity, dt)
+            strain = self._value[c.strain]
+            if c.at_end(strain).any():  # cut off, it follows no law
+                self._law.reset()
+            else:
+                wiring = self._law.update(sample.position, strain, sample.velocity, dt)
         self._watch_rate(stamp)
         if self._samples < LEARNT:
             return

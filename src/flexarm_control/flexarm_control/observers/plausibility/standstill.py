@@ -61,6 +61,7 @@ class Standstill:
         self._friction = 1.5 * coulomb + FRICTION * limits
         self._travel = TRAVEL * np.maximum(c.count, c.noise[c.position])
         self._gravity = any(model.arm.gravity)
+        self._gauges = slice(c.n, c.n + c.g)
         self.reset()
 
     def reset(self):
@@ -105,6 +106,8 @@ class Standstill:
         change = np.abs(readings - self._last)
         self._last[:] = readings
         same = change == 0.0
+        # A gauge at the end of its range stands still, too: `GaugeHealth` says what it is.
+        same[self._gauges] &= ~self.channels.at_end(readings[self._gauges])
         if not same.any():
             self.still[:] = 0
             self._smallest = np.fmin(self._smallest, change)

@@ -29,6 +29,8 @@ import numpy as np
 CORNER, MIN_CORNER, MAX_CORNER = 2.0, 15.0, 60.0
 #: Corner of the high pass as a fraction of that of the low pass [-].
 WASHOUT = 0.5
+#: Time constants of the low pass after which its start is forgotten [-].
+SETTLED = 7.0
 #: Time between two comparisons, over which they are averaged, and between new mass matrices [s].
 INTERVAL, MEMORY, RENEWAL = 0.004, 0.12, 0.02
 #: Misfit that raises the question [-], and for how many comparisons.
@@ -96,9 +98,11 @@ class StrainLaw:
             self._renew(position, velocity)
         now = np.concatenate([strain, position, self._force])
         if self._low is None:
-            self._low = np.tile(now, (3, 1))
+            # As if it had stood still until now: an arm that moves looks as if it had been hit.
+            self._low, self._settling = np.tile(now, (3, 1)), SETTLED / self.corner
             return None
         self._age += dt
+        self._settling -= dt
         self._since += dt
         y, k = self._low, 1.0 - np.exp(-self.corner * dt)
         y[0] += k * (now - y[0])
@@ -107,6 +111,8 @@ class StrainLaw:
         if self._since < INTERVAL:
             return None
         since, self._since = self._since, 0.0
+        if self._settling > 0.0:
+            return None
         return self._compare(since)
 
     def _renew(self, position, velocity):
