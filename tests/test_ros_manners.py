@@ -118,4 +118,6 @@ def test_one_arm_whose_observer_is_killed_stands_and_the_other_goes_on(arms):
     assert {m.mode for m in b.torques.messages if m.sequence >= 100} == {JointTorque.ENABLED}
     assert len({m.session for m in b.measured.messages}) == 1
     numbers = [m.sequence for m in b.torques.messages]
-    assert set(range(300)) <= set(numbers)
+    assert set(range(b.pauses_at, 300)) <= set(
+        numbers
+    )  # those before, this reader may not have found in time
