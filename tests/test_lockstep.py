@@ -113,7 +113,8 @@ def test_six_runs_give_the_same_samples_bit_for_bit_with_one_cpu_loaded(tmp_path
 
 
 @pytest.mark.real_time
-def test_lockstep_costs_at_most_1_6_of_a_bare_relay(tmp_path):
+def test_lockstep_costs_at_most_2_2_of_a_bare_relay(tmp_path):
+    # It was 1.6 before the observer checked its readings, which costs as much as an update of `kalman`.
     # Interleaved, medians; a noisy machine gets three chances, a slow product none.
     ratios = []
     for _ in range(3):
@@ -121,6 +122,6 @@ def test_lockstep_costs_at_most_1_6_of_a_bare_relay(tmp_path):
         loop = record(tmp_path / "loop", 1.0)[0][1].seconds_per_sample
         bare.append(relay.measure("R", tmp_path / "relay", 1000, lockstep.LockstepRun))
         ratios.append(loop / (sum(bare) / 2.0))
-        if ratios[-1] <= 1.6:
+        if ratios[-1] <= 2.2:
             return
     pytest.fail(f"lockstep wall time is {ratios} of a bare relay's")
