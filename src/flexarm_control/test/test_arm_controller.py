@@ -486,11 +486,11 @@ def applying(core, numbers, torque=None, controller_id=0):
     return found
 
 
-def test_a_driver_that_reports_another_torque_for_50_ms_is_a_fault(arm_r):
-    core = started(arm_r, Scripted(*[5.0] * 300))
+def test_a_driver_that_reports_another_torque_for_a_quarter_of_a_second_is_a_fault(arm_r):
+    core = started(arm_r, Scripted(*[5.0] * 500))
     assert all(applying(core, range(1, 100)))
-    assert all(applying(core, range(100, 149), 0.0))
-    assert not any(applying(core, range(151, 160), 0.0))
+    assert all(applying(core, range(100, 349), 0.0))
+    assert not any(applying(core, range(352, 360), 0.0))
     assert core.state == State.FAULT
     assert core.reason.startswith("the driver reports 0 N m at joint1, sent were 5: it does not")
 
@@ -506,7 +506,7 @@ def test_a_late_torque_is_the_one_that_was_sent(arm_r):
 
 def test_the_comparison_can_be_switched_off(arm_r):
     core = started(arm_r, Scripted(*[5.0] * 300), torque_mismatch=0.0)
-    assert all(applying(core, range(1, 200), 0.0))
+    assert all(applying(core, range(1, 299), 0.0))
 
 
 def test_a_driver_that_confirms_no_longer_or_another_controller_is_a_fault(arm_r):
@@ -515,8 +515,8 @@ def test_a_driver_that_confirms_no_longer_or_another_controller_is_a_fault(arm_r
         core.controller_id = 7
         assert all(applying(core, range(1, 50), controller_id=0))
         assert all(applying(core, range(50, 100), controller_id=7))
-        assert all(applying(core, range(100, 149), controller_id=later))
-        assert not any(applying(core, range(151, 155), controller_id=later))
+        assert all(applying(core, range(100, 349), controller_id=later))
+        assert not any(applying(core, range(352, 355), controller_id=later))
         assert core.state == State.FAULT and text in core.reason
 
 

@@ -13,15 +13,16 @@ from flexarm_dynamics.parameters import parameter
 
 #: Answers that the reported torque may belong to.
 SENT = 64
-#: A contradiction that lasts for this long is a refusal [s].
-PATIENCE = 0.05
+#: A contradiction that lasts for this long is a refusal [s]: several of the driver's timeouts, since a machine that is
+#: busy for a moment is none.
+PATIENCE = 0.25
 #: A driver that confirms controllers has this long to confirm one, after its first torque [s].
 CONFIRMED_WITHIN = 0.25
 
 PARAMETERS = (
     parameter("torque_mismatch", 0.1, "-", 0.0, 10.0).described(
         "Largest difference between the torque sent and what the driver reports to apply, over the torque limit, for"
-        " 50 ms; beyond it a fault. 0.0: not compared."
+        " 0.25 s; beyond it a fault. 0.0: not compared."
     ),
 )
 
