@@ -3,6 +3,11 @@
 
 A compiled module is a file of its own in the cache directory, named by a hash of its source: numba's cache
 beside it can't be stale, and right-hand side and integrator are one unit for its optimiser.
+
+numba names the compiled code of a function by the types of its arguments, but a record by a number that it counts up
+in each process, and a nested array without its shape. Code that two processes have put into the cache, for two arms,
+then has one name for two layouts of memory; a third process that loads both runs one for the other, and reads and
+writes beside the arrays. So `named_by_layout` gives both types a name that is made from their whole layout.
 """
 
 import hashlib
@@ -16,6 +21,31 @@ from pathlib import Path
 
 #: a*b + c in one rounding where the machine has it; nothing that would hide a NaN.
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+
+
+#: Part of each module's name: what numba made under other symbols is not read again.
+SYMBOLS = "by layout"
+
+
+def named_by_layout():
+    """Let the symbols of compiled code tell all layouts of records and nested arrays apart, in every process.
+
+    It overrides `mangling_args`, which numba has its types override for this; it can go when numba's own are unique.
+
+    Returns
+    -------
+    module
+        numba's `types`.
+    """
+    from numba import types
+
+    for kind in (types.Record, types.NestedArray):
+        kind.mangling_args = property(_layout)
+    return types
+
+
+def _layout(kind):
+    return type(kind).__name__, (hashlib.sha256(kind.name.encode()).hexdigest()[:16],)
 
 
 def cache_directory():
@@ -55,7 +85,7 @@ def joined(name, sources, compiled=True, inline=()):
     """
     text = "\n\n".join(sources)
     # How it is compiled is part of what numba's cache must not mix up.
-    text += f"\n\n# inline: {', '.join(inline)}\n"
+    text += f"\n\n# inline: {', '.join(inline)}\n# symbols: {SYMBOLS}\n"
     full = f"flexarm_{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     key = full if compiled else f"{full}_plain"
     if key in sys.modules:
@@ -75,6 +105,7 @@ def joined(name, sources, compiled=True, inline=()):
     if compiled:
         from numba import njit
 
+        named_by_layout()
         for attribute, value in list(vars(module).items()):
             if isinstance(value, types.FunctionType) and value.__module__ == key:
                 always = "always" if attribute in inline else "never"
