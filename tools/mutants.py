@@ -448,7 +448,13 @@ LIMITS = [
         (
             "arm_controller",
             "a gap: the motion goes on",
-            "elif dt > self._resume_gap and dt > PERIODS_OF_GAP * self._period:",
+            "if gap > self._resume_gap and gap > PERIODS_OF_GAP * known:",
+            "if False:",
+        ),
+        (
+            "arm_controller",
+            "a driver that applied nothing for a while: torque at once",
+            "elif away > self._resume_gap:",
             "elif False:",
         ),
         (
@@ -484,8 +490,8 @@ LIMITS = [
         (
             "applied",
             "a driver that confirms no longer",
-            "return self._confirmed or (self.tells and self._elapsed > CONFIRMED_WITHIN)",
-            "return False",
+            "return not confirmed and (self._confirms or sample.controller_id != 0)",
+            "return not confirmed and sample.controller_id != 0",
         ),
         (
             "arm_controller",

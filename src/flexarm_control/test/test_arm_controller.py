@@ -526,6 +526,27 @@ def test_a_driver_that_never_confirms_is_not_asked(arm_r):
     assert all(applying(core, range(1, 600), controller_id=0))
 
 
+def test_after_a_time_on_the_safe_action_torque_returns_in_a_ramp_and_the_motion_is_given_up(arm_r):
+    core = started(arm_r, Scripted(*[5.0] * 400), return_time=0.065)
+    core.controller_id = 7
+    core.offer(motion(end=5.0, duration=9.0))
+    assert all(applying(core, range(1, 50), controller_id=7))
+    assert all(applying(core, range(50, 150), controller_id=0))
+    assert core.torque[0] == 5.0
+    assert all(applying(core, range(150, 170), controller_id=7))
+    assert 0.0 < core.torque[0] < 0.5
+    assert core.interruptions == 1 and not core.reference.active
+    assert core.reason.startswith("the driver has applied no torque for 0.1 s: torque returns")
+
+
+def test_another_driver_that_confirms_nobody_may_follow_one_that_does(arm_r):
+    core = started(arm_r)
+    core.controller_id = 7
+    assert all(applying(core, range(1, 50), controller_id=7))
+    for k in range(500):
+        assert core.step(sample(k, stamp_ns=stamp(60 + k), session=2)) is True
+
+
 def test_while_a_sensor_is_in_doubt_no_motion_is_accepted(arm_r):
     core = started(arm_r)
     core.step(sample(1, trust=ArmSample.STOP, doubt="strain of root: lost"))

@@ -202,7 +202,7 @@ class Driver(ArmNode):
         begin one by themselves, and so does each activation.
         """
         with self._lock:
-            self._first = None
+            self._first = None  # stamps begin anew with the next sample
             self.gate.begin(new_session())
 
     # Device to topics --------------------------------------------------------------------------

@@ -16,8 +16,6 @@ SENT = 64
 #: A contradiction that lasts for this long is a refusal [s]: several of the driver's timeouts, since a machine that is
 #: busy for a moment is none.
 PATIENCE = 0.25
-#: A driver that confirms controllers has this long to confirm one, after its first torque [s].
-CONFIRMED_WITHIN = 0.25
 
 PARAMETERS = (
     parameter("torque_mismatch", 0.1, "-", 0.0, 10.0).described(
@@ -42,9 +40,8 @@ class Applied:
     def __init__(self, model, settings, limit):
         self._names = model.joint_names
         self._sent = np.zeros((SENT, model.n_joints))
-        #: Whether the driver has confirmed any controller in this session.
-        self.tells = False
         self.configure(settings, limit)
+        self.forget()
         self.begin(np.zeros(model.n_joints))
 
     def configure(self, settings, limit):
@@ -52,12 +49,15 @@ class Applied:
         share = settings["torque_mismatch"]
         self._tolerance = np.where(np.isfinite(limit), share * limit, np.inf) if share else None
 
+    def forget(self):
+        """Another driver, perhaps: whether it confirms controllers is not known."""
+        self._confirms = False
+
     def begin(self, torque):
         """The first torque (n,) [N m] after an interruption."""
         self._sent[:] = torque
-        self._at, self._elapsed = 0, 0.0
+        self._at = 0
         self._other_for = self._wrong_for = 0.0
-        self._confirmed = False
 
     def note(self, torque):
         """Remember a torque (n,) [N m] that is sent."""
@@ -75,7 +75,6 @@ class Applied:
         dt : float
             Time since the last sample [s].
         """
-        self._elapsed += dt
         self._other_for = self._other_for + dt if self._is_other(sample, controller_id) else 0.0
         if self._other_for > PATIENCE:
             if sample.controller_id:
@@ -97,12 +96,13 @@ class Applied:
         """Whether the driver's report of its controller names none, or another."""
         if not controller_id:
             return False
-        if sample.controller_id == controller_id:
-            self._confirmed = self.tells = True
-            return False
-        if sample.controller_id:
-            return True
-        return self._confirmed or (self.tells and self._elapsed > CONFIRMED_WITHIN)
+        confirmed = sample.controller_id == controller_id
+        self._confirms |= confirmed
+        return not confirmed and (self._confirms or sample.controller_id != 0)
+
+    def back_after(self, sample, controller_id):
+        """How long the driver applied none of this controller's torque, if it applies it again by this sample [s]."""
+        return self._other_for if controller_id and sample.controller_id == controller_id else 0.0
 
     def _mismatch(self, reported):
         """The joint whose reported torque is none of those sent; None where all are, or are unknown."""

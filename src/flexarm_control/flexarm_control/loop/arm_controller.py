@@ -92,11 +92,8 @@ class ArmController:
         self._waiting = False  # joints known, deflections not yet
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
-        self._last_ns, self._period, self._count = (
-            0,
-            0.0,
-            1,
-        )  # [ns], [s], and states since the last one
+        self._last_ns, self._period = 0, 0.0  # [ns], [s]
+        self._count = 1  # states since the last one, with those that were missed
         self._doubt = ""  # of the last sample
         self._foreign = self.interruptions = 0
         self._position = np.zeros(n)  # at the last sample
@@ -265,13 +262,15 @@ class ArmController:
         dt = 1e-9 * (sample.stamp_ns - self._last_ns)
         if verdict == SampleOrder.RESTART or not self.supervisor.running:
             self._begin(sample, verdict)
+            return self._control(sample, 0.0)
+        gap, away = dt, self._applied.back_after(sample, self.controller_id)
+        known, self._period = self._period, dt / self._count
+        if gap > self._resume_gap and gap > PERIODS_OF_GAP * known:
+            self._interrupted(sample, f"no state for {gap:.3g} s")
             dt = 0.0
-        elif dt > self._resume_gap and dt > PERIODS_OF_GAP * self._period:
-            self._period = dt / self._count
-            self._interrupted(sample, dt)
+        elif away > self._resume_gap:
+            self._interrupted(sample, f"the driver has applied no torque for {away:.3g} s")
             dt = 0.0
-        else:
-            self._period = dt / self._count
         return self._control(sample, dt)
 
     def _control(self, sample, dt):
@@ -438,6 +437,8 @@ class ArmController:
 
     def _begin(self, sample, verdict):
         """First torque of a session, or after a time without: from the position that is found."""
+        if verdict == SampleOrder.RESTART:
+            self._applied.forget()
         keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
         if keeps and (given_up := self._left_behind(sample)):
             self._trajectory_reason = given_up
@@ -465,11 +466,11 @@ class ArmController:
         except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
             self.reference.start(position, stamp)
 
-    def _interrupted(self, sample, gap):
-        """States were missing for `gap` [s], in which the driver took its safe action."""
+    def _interrupted(self, sample, what):
+        """The driver took its safe action for a time, for the reason `what`."""
         moved = self.reference.active or self.reference.pending
         self.interruptions += 1
-        self._trajectory_reason = f"no state for {gap:.3g} s: torque returns in a ramp" + (
+        self._trajectory_reason = f"{what}: torque returns in a ramp" + (
             ", the motion was given up: send it again" if moved else ""
         )
         self._return(sample)
@@ -521,7 +522,7 @@ def _longest_period(model):
     """Period of the lowest bending mode with straight, locked joints [s]; 0 for a rigid arm."""
     if not model.n_modes:
         return 0.0
-    return 2.0 * np.pi / float(model.frequencies(np.zeros(model.n_joints), locked=True)[0])
+    return 2.0 * np.pi / float(model.frequencies(locked=True)[0])
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):

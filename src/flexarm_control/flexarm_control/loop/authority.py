@@ -49,7 +49,7 @@ def torque_rates(model):
     stated = arm.torque_rates
     if not np.isinf(stated).any() or not model.n_modes:
         return stated
-    omega = float(model.frequencies(np.zeros(model.n_joints), locked=True)[0])
+    omega = float(model.frequencies(locked=True)[0])
     return np.where(np.isinf(stated), BUDGET * omega * arm.torque_limits, stated)
 
 
