@@ -125,6 +125,11 @@ COMMANDS = {
         "compare",
         "composite control beside joint PID, input shaping, LQR and rigid adaptive control, all tuned alike",
     ),
+    "arms": Command(
+        "flexarm_studies.random_arms.command",
+        "arms",
+        "random arms under several controllers, on plants that are not their models: how many settle, and when",
+    ),
     "publish": Command(
         "flexarm_tools.publish_trajectory",
         "publish",

@@ -13,7 +13,12 @@ Any motion convolved with the train leaves the same fraction of its own vibratio
 
 - ZV (zero vibration), half a period long: A = (1, K) / (1 + K), V = 0 at the design frequency;
 - ZVD (and zero derivative), one period: A = (1, 2K, K^2) / (1 + K)^2, dV/domega = 0 there as well. It is
-  ZV convolved with itself.
+  ZV convolved with itself;
+- EI (extra insensitive, Singhose, Seering & Singer 1994), one period: at the design frequency V = `EI_RESIDUAL`, and
+  zero at one frequency on either side. In ZV, -K is the zero of the train's polynomial; here the two zeros
+  :math:`-Ke^{\pm j\varphi}` make A proportional to (1, 2K cos phi, K^2), with
+  :math:`\cos\varphi = (2K^2 - V(1+K^2))/(2K^2 + 2KV)`. Without damping these are the published
+  ((1 + V)/4, (1 - V)/2, (1 + V)/4).
 
 For several modes the trains are convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
 subsystem (11), whose input is the slow torque of the motion. While mass matrix and configuration do not change,
@@ -33,6 +38,8 @@ from .profiles import Motion
 
 #: A longer train is refused: every sample of a shaped motion evaluates the motion once per impulse.
 MAX_IMPULSES = 1000
+#: Fraction of the vibration that EI leaves at the design frequency [-].
+EI_RESIDUAL = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +146,18 @@ def zvd(omega, zeta) -> Shaper:
     )
 
 
-SHAPERS = {"zv": zv, "zvd": zvd}
+def ei(omega, zeta) -> Shaper:
+    """Return the extra-insensitive shaper of a mode; parameters as for `zv`."""
+    single = zv(omega, zeta)
+    K, V, half = single.amplitudes[1] / single.amplitudes[0], EI_RESIDUAL, single.duration
+    # Where so much damping leaves less than V by itself, the middle impulse vanishes.
+    cosine = max((2.0 * K**2 - V * (1.0 + K**2)) / (2.0 * K**2 + 2.0 * K * V), 0.0)
+    train = np.array([1.0, 2.0 * K * cosine, K**2])
+    kept = train > 0.0
+    return Shaper(half * np.arange(3.0)[kept], train[kept] / train.sum())
+
+
+SHAPERS = {"zv": zv, "zvd": zvd, "ei": ei}
 
 
 def for_modes(kind, omega, zeta) -> Shaper:
@@ -148,7 +166,7 @@ def for_modes(kind, omega, zeta) -> Shaper:
     Parameters
     ----------
     kind : str
-        ``zv`` or ``zvd``.
+        ``zv``, ``zvd`` or ``ei``.
     omega, zeta : (k,) array_like
         Natural frequencies [rad/s] and damping ratios [-].
 
@@ -194,7 +212,7 @@ def for_arm(model, q, kind, modes=2) -> Shaper:
     q : (n,) array_like
         Where the motion ends: the vibration that is left is the one there [rad].
     kind : str
-        ``zv`` or ``zvd``.
+        ``zv``, ``zvd`` or ``ei``.
     modes : int
         How many of the lowest; at most as many as the arm has.
 

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm arms``: random arms under several controllers, on plants that are not their models."""
+
+from pathlib import Path
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..progress import Progress
+from . import generator, report, study
+from .controllers import CONTROLLERS
+from .trial import VARIANTS
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Draws arms that nobody tuned for, runs controllers on plants that are not their models, and writes a table: "
+        "how many arms work, are refused, are lost, settle, and when."
+    )
+    parser.epilog = (
+        "examples:\n"
+        "  flexarm arms --count 8 --controllers default,pid_zvd --variants 'exact,payload x1.3'\n"
+        "  flexarm arms --count 16 --files results/arms"
+    )
+    add = parser.add_argument
+    add("--count", type=int, default=100, help="arms (100)")
+    add("--seed", type=int, default=0, help="of the arms and of the noise (0)")
+    add("--workers", type=int, metavar="N", help="processes (one per core)")
+    names = ",".join(CONTROLLERS)
+    add("--controllers", default=names, help=f"controllers, separated by commas ({names})")
+    names = ",".join(VARIANTS)
+    add("--variants", default=names, help=f"plants, separated by commas ({names})")
+    add(
+        "--out",
+        metavar="FILE.jsonl",
+        help="write every run; runs that are in it are not run again, so an interrupted command goes on",
+    )
+    add("--fresh", action="store_true", help="remove that file first: after a change of the code")
+    add("--write", metavar="FILE.md", help="write the table between the markers of this file")
+    add(
+        "--files",
+        metavar="FOLDER",
+        help="only write the arm files, with their motions; run nothing",
+    )
+
+
+def arms(options):
+    """Run the sub-command."""
+    if options.files:
+        _write_files(options)
+        return
+    controllers = _chosen("--controllers", options.controllers, CONTROLLERS)
+    variants = _chosen("--variants", options.variants, VARIANTS)
+    if options.out and options.fresh:
+        Path(options.out).unlink(missing_ok=True)
+    progress = Progress()
+    rows = study.run(
+        options.seed, options.count, controllers, variants, options.out, options.workers, progress
+    )
+    progress.done()
+    if options.write:
+        report.write(rows, options.seed, options.write)
+    print(report.text(rows, options.seed))
+
+
+def _write_files(options):
+    folder = Path(options.files)
+    folder.mkdir(parents=True, exist_ok=True)
+    for arm in generator.arms(options.count, options.seed):
+        path = folder / f"{arm.name}.yaml"
+        path.write_text(f"# --trajectory {arm.motion}\n{arm.text}", encoding="utf-8")
+        print(path)
+
+
+def _chosen(option, text, known):
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise FlexarmError("is unknown", field=option, value=name, limit=", ".join(known))
+    return names
