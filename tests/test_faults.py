@@ -487,9 +487,10 @@ def test_the_safe_action_of_arm_r_brakes_more_than_no_torque_does(drive):
     free = Source.simulator("R")
     for _ in range(10):
         free.advance(np.array([3.0]))
-    free.advance(np.zeros(1))
-    drive.step(1.0, mode=JointTorque.DISABLED)
-    assert abs(drive.state.joint_velocity[0]) < 0.999 * abs(free.velocity[0])
+    for _ in range(20):  # softly begun
+        free.advance(np.zeros(1))
+        drive.step(1.0, mode=JointTorque.DISABLED)
+    assert abs(drive.state.joint_velocity[0]) < 0.98 * abs(free.velocity[0])
 
 
 # Processes that die, in real time ---------------------------------------------------------------

@@ -539,7 +539,7 @@ def test_after_a_time_on_the_safe_action_torque_returns_in_a_ramp_and_the_motion
     assert core.reason.startswith("the driver has applied no torque for 0.1 s: torque returns")
 
 
-def test_another_driver_that_confirms_nobody_may_follow_one_that_does(arm_r):
+def test_another_driver_that_confirms_no_controller_may_follow_one_that_does(arm_r):
     core = started(arm_r)
     core.controller_id = 7
     assert all(applying(core, range(1, 50), controller_id=7))

@@ -42,6 +42,8 @@ joints:
     safe_action: brake
     brake_torque: 20.0
     damp_coefficient: 0.7
+    damp_torque: 2.5
+    damp_time: 0.2
     encoder_counts: 4096
   - name: elbow
 links:
@@ -138,6 +140,7 @@ def test_every_field_is_read():
     assert joint.limits.position == (-2.0, 1.0)
     assert (joint.limits.velocity, joint.limits.torque) == (3.0, 12.0)
     assert (joint.safe_action, joint.brake_torque, joint.damp_coefficient) == ("brake", 20.0, 0.7)
+    assert (joint.damp_torque, joint.damp_time) == (2.5, 0.2)
     assert joint.encoder_counts == 4096
     upper, fore = arm.links
     assert upper.stiffness == {"y": 11.0, "z": 12.0, "twist": 5.0}
@@ -165,7 +168,7 @@ def test_what_is_left_out_takes_its_default():
     assert joint.limits.position == (-math.inf, math.inf)
     assert joint.limits.torque == math.inf
     assert joint.safe_action == "damp"
-    assert joint.brake_torque is None
+    assert joint.brake_torque is joint.damp_torque is joint.damp_time is None
     assert arm.payload.mass == 0.0
     assert arm.modes == () and arm.observed_modes == () and arm.gauges == ()
     assert (arm.foreshortening, arm.finite_slope, arm.model) == (False, False, "chain")

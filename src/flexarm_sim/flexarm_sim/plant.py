@@ -9,12 +9,8 @@ from flexarm_dynamics.errors import ModelError, check_shape
 
 from . import integrators
 from .brakes import Brakes
+from .damping import DAMP_SPEED, Damping
 
-#: Without a `damp_coefficient` in the arm file, `damp` is the drive's velocity loop within the joint's torque limit
-#: T: -T tanh(qd / DAMP_SPEED) [rad/s]. Links that continue to vibrate move the joint at a fraction of that speed.
-DAMP_SPEED = 0.05
-#: Without a torque limit, it stops the rigid arm at this rate [1/s].
-DAMP_RATE = 10.0
 #: The safe action is integrated in more substeps if rate * substep of its damping exceeds this [-].
 DAMP_RATE_PER_STEP = 2.0
 
@@ -45,7 +41,9 @@ class Plant:
         self.substeps = integrators.substeps(model, period, integrator)
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
-        self._safe, brake = self._damped(), self._brake_torques()
+        self._damping = Damping(model)
+        self._safe = self._damped(np.inf, np.inf)
+        brake = self._brake_torques()
         refinement = self._refinement(integrator)
         self._safe_substeps = self.substeps * refinement
         self._no_torque = np.zeros(n)
@@ -60,15 +58,20 @@ class Plant:
         position = np.zeros(n) if position is None else np.asarray(position, float)
         check_shape(position, (n,), "initial position")
         self.state[:] = 0.0
+        self._damping.begin()
         self.q[:] = position
         self.delta[:] = self.model.static_deflection(position) if delta is None else delta
 
     def advance(self, torque, fraction=1.0):
         """Advance by one period, or a fraction of it, under constant torque, shape (n,) [N m]."""
+        self._damping.release(fraction * self.period)
         self._run(torque, self._friction, fraction, self.substeps)
 
     def advance_safely(self, fraction=1.0):
         """Advance by one period, or a fraction of it, without drive torque, under each joint's safe action."""
+        damping = self._damping
+        damping.act(fraction * self.period, self.qd)
+        self._safe[:] = self._damped(damping.elapsed, damping.speed)
         if self._brakes is None:
             self._run(self._no_torque, self._safe, fraction, self._safe_substeps)
             return
@@ -88,21 +91,16 @@ class Plant:
                 hint="reset the simulator",
             )
 
-    def _damped(self):
-        """Friction table, shape (n, 3), with the safe action `damp` added.
+    def _damped(self, elapsed, speed):
+        """Friction table, shape (n, 3), with the safe action `damp` added; arguments as for `Damping.torque`.
 
         A joint's own Coulomb friction takes over the smoothing of the velocity loop.
         """
-        table = self._friction.copy()
-        for joint, inertia, row in zip(self.model.arm.joints, self._inertia(), table, strict=True):
-            if joint.safe_action != "damp":
-                continue
-            if joint.damp_coefficient is not None:
-                row[0] += joint.damp_coefficient
-            elif np.isfinite(joint.limits.torque):
-                row[1:] = row[1] + joint.limits.torque, DAMP_SPEED
-            else:
-                row[0] += DAMP_RATE * inertia
+        table, where = self._friction.copy(), self._damping.active
+        torque = self._damping.torque(elapsed, speed)
+        table[where, 0] += self._damping.viscous(elapsed)[where]
+        table[where, 1] += torque[where]
+        table[where & (torque > 0.0), 2] = DAMP_SPEED
         return table
 
     def _brake_torques(self):

@@ -118,7 +118,7 @@ def test_damp_brings_the_joint_from_2_rad_s_below_1_deg_s_within_1_s_though_the_
 
 
 def test_damp_stays_within_the_torque_limit():
-    arm = built(joint={"safe_action": "damp"})
+    arm = built(joint={"safe_action": "damp", "damp_torque": 1e6, "damp_time": 0.0})
     limit, inertia = arm.arm.joints[0].limits.torque, 1.0 / arm._terms_at_rest.H[0, 0]
     speeds, _ = coasting(arm, 0.001)
     assert_allclose(-np.diff([2.0, *speeds]), limit / inertia * 1e-3, rtol=0.01)
@@ -131,11 +131,12 @@ def test_a_damp_coefficient_takes_the_swing_out_of_a_flexible_arm():
     assert energies[-1] < 0.01 * energies[0]
 
 
-def test_without_a_torque_limit_damp_stops_the_rigid_arm_with_10_1_s():
+def test_without_torque_limit_and_gauges_damp_stops_the_rigid_arm_with_10_1_s():
     link = arm_file.load("R").links[0]
     stiff = replace(link, stiffness={"y": 100.0 * link.stiffness["y"]})
     limits = replace(arm_file.load("R").joints[0].limits, torque=np.inf)
-    speeds, _ = coasting(built(links=(stiff,), joint={"safe_action": "damp", "limits": limits}))
+    joint = {"safe_action": "damp", "limits": limits, "damp_time": 0.0}
+    speeds, _ = coasting(built(links=(stiff,), gauges=(), joint=joint))
     assert speeds[-100:].max() < 1.0 * DEGREE
     assert_allclose(speeds[199], 2.0 * np.exp(-2.0), rtol=0.05)
 
@@ -160,7 +161,8 @@ def test_the_files_damping_and_braking_are_used_where_it_states_them():
     speeds, _ = coasting(built(joint={"safe_action": "damp", "damp_coefficient": 0.0}), 0.1)
     assert_allclose(speeds, 2.0, rtol=1e-3)
     H11 = built()._terms_at_rest.H[0, 0]
-    speeds, _ = coasting(built(joint={"safe_action": "damp", "damp_coefficient": 3.0}), 0.002)
+    joint = {"safe_action": "damp", "damp_coefficient": 3.0, "damp_time": 0.0}
+    speeds, _ = coasting(built(joint=joint), 0.002)
     assert_allclose(speeds[0], 2.0 * np.exp(-3.0 * H11 * 1e-3), rtol=1e-5)
     weak, _ = coasting(built(joint={"safe_action": "brake", "brake_torque": 0.0}), 0.1)
     strong, _ = coasting(built(joint={"safe_action": "brake", "brake_torque": 50.0}), 0.1)
@@ -209,7 +211,8 @@ def test_reset_puts_the_arm_at_rest_at_the_given_position(arm_r):
 @pytest.mark.parametrize(("rate", "method"), [(100, "dop853"), (100, "rk4"), (1000, "rk4")])
 def test_the_safe_action_is_stable_where_a_joint_alone_is_light(rate, method):
     # The elbow's velocity loop: 40 N m s/rad on 0.23 g m^2, faster than any mode that substeps are chosen for.
-    arm = model.build(arm_file.load("two_link"))
+    arm = arm_file.load("two_link")
+    arm = model.build(replace(arm, joints=tuple(replace(j, damp_time=0.0) for j in arm.joints)))
     plant = Plant(arm, 1.0 / rate, method)
     plant.qd[:] = 0.1
     energies = [arm.energy(plant.state)]

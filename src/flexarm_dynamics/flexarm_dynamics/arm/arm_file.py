@@ -259,6 +259,15 @@ def _limits(joint):
     return out
 
 
+#: Optional numbers of a joint's safe action, and their dimensions.
+SAFE_NUMBERS = {
+    "brake_torque": "torque",
+    "damp_coefficient": "viscous",
+    "damp_torque": "torque",
+    "damp_time": "time",
+}
+
+
 def _joint(s):
     axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
     norm = math.hypot(*axis)
@@ -274,7 +283,7 @@ def _joint(s):
         o.done()
     optional = {
         key: s.number(key, dimension, low=0.0)
-        for key, dimension in (("brake_torque", "torque"), ("damp_coefficient", "viscous"))
+        for key, dimension in SAFE_NUMBERS.items()
         if s.has(key)
     }
     joint = Joint(

@@ -56,7 +56,9 @@ class Joint:
     limits: Limits = Limits()
     safe_action: str = "damp"
     brake_torque: float | None = None  # [N m] holding capacity; None: the torque limit
-    damp_coefficient: float | None = None  # [N m s/rad]; None: chosen by the plant
+    damp_coefficient: float | None = None  # [N m s/rad], without a bound; None: a bounded torque
+    damp_torque: float | None = None  # [N m] largest of damp; None: from limits, gauges and weight
+    damp_time: float | None = None  # [s] of its soft start; None: half a period, at most 0.25
     encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
 
     @property

@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from flexarm_dynamics.errors import MessageError, ParameterError
+from flexarm_dynamics.models.model import build
 from flexarm_dynamics.parameters import parameter
 from flexarm_ros import qos
 from flexarm_ros.driver import SILENT, TORQUE_TIMEOUT, Driver, Sample
@@ -22,6 +23,7 @@ from flexarm_ros.messages import stamp_ns
 from flexarm_ros.node import ARM, run
 from flexarm_ros.start import leave
 from flexarm_ros.torque_gate import WRAP
+from flexarm_sim.damping import Damping
 
 #: Timeout for delivering the last efforts, which are zero.
 LAST_EFFORTS = Duration(seconds=0.2)
@@ -60,7 +62,7 @@ PARAMETERS = (
         "Efforts without a fresh torque: damp, against the joint velocity; zero."
     ),
     _fixed("safe_damping", [1.0], "N m s/rad", 0.0, 1e6, length="joints").described(
-        "Effort per joint velocity of the safe action damp, within the torque limits."
+        "Effort per joint velocity of the safe action damp, with torque and soft start of the arm file's damp."
     ),
 )
 
@@ -176,6 +178,7 @@ class AdapterNode(Driver):
         )
         self._damping = np.array(p["safe_damping"]) * (p["safe_action"] == "damp")
         self._limit = self.arm.torque_limits
+        self._soft, self._damps, self._settled = Damping(build(self.arm)), False, None
         self._velocity, self._moved_at = np.zeros(n), -math.inf
         self._applied, self._sequence = np.zeros(n), 0
         self._position = self._stamp = self._arrived = None
@@ -254,13 +257,32 @@ class AdapterNode(Driver):
     # Torque to efforts -------------------------------------------------------------------------
 
     def apply(self, torque):
-        self._applied[:] = torque
-        self._efforts.publish(Float64MultiArray(data=torque[self._effort_order].tolist()))
+        self._settle(False)
+        self._send(torque)
 
     def make_safe(self):
         """Damp each joint; zero efforts where its velocity is no longer known."""
-        damping = self._damping * (self.now() - self._moved_at <= self.gate.timeout)
-        self.apply(np.clip(-damping * self._velocity, -self._limit, self._limit))
+        self._settle(True)
+        known, soft = self.now() - self._moved_at <= self.gate.timeout, self._soft
+        damping, velocity = self._damping * known, self._velocity
+        soft.act(0.0, velocity * known)
+        bound = soft.torque(soft.elapsed, soft.speed)
+        bound = np.where(soft.coefficient > 0.0, self._limit, bound)
+        self._send(np.clip(-damping * velocity, -bound, bound))
+
+    def _settle(self, damps):
+        """Note what acted until now, and whether the joints are damped from now on."""
+        now, before = self.now(), self._settled
+        time = 0.0 if before is None else now - before
+        if self._damps:
+            self._soft.act(time, np.zeros(self._limit.size))
+        else:
+            self._soft.release(time)
+        self._damps, self._settled = damps, now
+
+    def _send(self, torque):
+        self._applied[:] = torque
+        self._efforts.publish(Float64MultiArray(data=torque[self._effort_order].tolist()))
 
     def stop(self):
         self._forget()
