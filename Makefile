@@ -7,6 +7,10 @@ FUZZ_ARGS ?= --inputs 1000000 --dds 10000
 SOAK_ARGS ?= --minutes 30
 ATTACK_ARGS ?=
 LATENCY_ARGS ?=
+COUNT ?= 100
+SEED ?= 0
+WORKERS ?=
+CONTROLLERS ?=
 MUTANTS_ARGS ?=
 
 # A Python that was asked for decides; the default only starts the set-up, which keeps the one in .venv.
@@ -17,7 +21,7 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo check test mutants docs bench compare latency fuzz soak attack lint release-check clean distclean
+.PHONY: help build demo check test mutants docs bench compare arms latency fuzz soak attack lint release-check clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -29,6 +33,7 @@ help:
 	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
+	@echo 'make arms       build, then random arms under every controller; again: only what is missing; COUNT=8 WORKERS=1'
 	@echo 'make latency    build, then time measurement to torque beside a bare relay; LATENCY_ARGS=--quick'
 	@echo 'make fuzz       build, then malformed input for every reader and node; FUZZ_ARGS="--inputs 10000"'
 	@echo 'make attack     build, then a driver that lies, on every arm; ATTACK_ARGS="--arms R --observers kalman"'
@@ -87,6 +92,14 @@ bench: build
 COMPARE_OUT := --json docs/comparison.json --write docs/comparison.md
 compare: build
 	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
+
+# The table of docs/random_arms.md, of a whole run alone. results/random_arms_*.jsonl keeps every run: after a change of
+# the code `make arms FRESH=1` starts it anew. CONTROLLERS=default,designed runs some alone.
+ARMS_WHOLE := $(filter 100-0-,$(COUNT)-$(SEED)-$(CONTROLLERS))
+arms: build
+	@mkdir -p results && . tools/env.sh && python -m flexarm_bringup.cli arms --count $(COUNT) --seed $(SEED) \
+	--out results/random_arms_$(SEED).jsonl $(if $(FRESH),--fresh) $(if $(WORKERS),--workers $(WORKERS)) \
+	$(if $(CONTROLLERS),--controllers $(CONTROLLERS)) $(if $(ARMS_WHOLE),--write docs/random_arms.md)
 
 # The table of docs/latency.md, of a whole run alone.
 LATENCY_OUT := --redesign --write docs/latency.md

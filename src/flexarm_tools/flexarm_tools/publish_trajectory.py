@@ -53,7 +53,7 @@ def add_arguments(parser):
         "--velocity-limit",
         help=f"least-exciting: largest speed, {each} [rad/s] (default: the arm file's)",
     )
-    add("--shaper", choices=("zv", "zvd"), help="shape the motion; it gets longer")
+    add("--shaper", choices=("zv", "zvd", "ei"), help="shape the motion; it gets longer")
     add(
         "--shape-modes",
         type=int,

@@ -16,7 +16,7 @@ line           tip, duration, smoothness      the tip on a straight line, `tip_p
 arc            tip, via, duration, smoothness the tip on a circle through a point on the way
 ============== ============================== ==========================================================
 
-All families take ``from`` (joint angles at the start), ``shaper`` (zv, zvd), ``shape-modes`` (for how many of the
+All families take ``from`` (joint angles at the start), ``shaper`` (zv, zvd, ei), ``shape-modes`` (for how many of the
 arm's lowest modes) and ``points``.
 """
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arms that nobody tuned for: a seeded generator, trials on plants that are not the model, and the table of both."""
+"""Random arms: a seeded generator, trials on plants that are not the model, and the table of both."""

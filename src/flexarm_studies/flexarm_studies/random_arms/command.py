@@ -14,7 +14,7 @@ from .trial import VARIANTS
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
-        "Draws arms that nobody tuned for, runs controllers on plants that are not their models, and writes a table: "
+        "Draws arms at random, runs controllers on plants that are not their models, and writes a table: "
         "how many arms work, are refused, are lost, settle, and when."
     )
     parser.epilog = (

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random arms: what is drawn, how a run is judged, what the baselines are tuned for, and the table."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from numpy.testing import assert_allclose
+
+from flexarm_control.trajectory import specs
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models import model
+from flexarm_studies.random_arms import baselines, generator, report, study, trial
+from flexarm_studies.random_arms.controllers import CONTROLLERS
+
+#: One of each layout, with and without gravity.
+COUNT = 2 * len(generator.LAYOUTS)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return list(generator.arms(COUNT, seed=5))
+
+
+# --------------------------------------------------------------------------- the generator
+
+
+def test_seed_and_number_decide_an_arm(drawn):
+    assert generator.arm(3, seed=5) == drawn[3]
+    assert list(generator.arms(2, seed=5, start=7)) == drawn[7:9]
+    assert generator.arm(3, seed=6).arm != drawn[3].arm
+
+
+def test_every_layout_is_drawn_with_and_without_gravity(drawn):
+    found = {
+        (len(d.arm["links"]), "z" in d.arm["links"][0]["flexible"], any(d.arm["gravity"]))
+        for d in drawn
+    }
+    assert found == {(n, s, g) for n in (1, 2, 3, 4) for s in (False, True) for g in (False, True)}
+
+
+def test_arms_survive_yaml(drawn):
+    for case in drawn:
+        assert yaml.safe_load(case.text) == case.arm
+        assert case.read() == arm_file.parse(yaml.safe_dump(case.arm))
+
+
+def test_arms_are_within_the_bounds(drawn):
+    for case in drawn:
+        arm, data = case.read(), case.arm
+        reach = sum(link.length for link in arm.links)
+        assert 0.999 * generator.REACH[0] < reach < 1.001 * generator.REACH[1]
+        mass = sum(link.mass for link in arm.links)
+        assert 0.0 < arm.payload.mass < 1.01 * generator.PAYLOAD[1] * mass
+        damping = {z for link in arm.links for f in link.flexible.values() for z in f.damping}
+        assert all(0.999e-3 < z < 1.001e-2 for z in damping)
+        assert len(arm.gauges) == len(arm.modes)
+        assert all("motor_mass" in joint for joint in data["joints"][1:])
+
+
+def test_motions_are_two_locked_periods_of_60_to_90_degrees_within_the_limits(drawn):
+    for case in drawn:
+        arm_model = model.build(case.read())
+        motion = specs.from_spec(case.motion, arm_model)  # refused beyond the limits
+        turn = np.degrees(np.abs(np.array(motion.positions[-1]) - motion.positions[0]))
+        assert np.all((turn > 59.9) & (turn < 90.1))
+        ends = motion.positions[0], motion.positions[-1]
+        slowest = min(arm_model.frequencies(np.array(q), locked=True)[0] for q in ends)
+        assert_allclose(case.period, 2.0 * np.pi / slowest, rtol=1e-6)
+        assert 0.49 < 1.0 / case.period < 15.1
+        assert_allclose(1e-9 * motion.times_ns[-1], 2.0 * case.period, atol=1e-3)
+
+
+def test_torque_limits_are_what_the_motion_needs_and_a_half_to_twice(drawn):
+    for case in drawn:
+        arm_model = model.build(case.read())
+        family, settings = specs.parse(case.motion)
+        profile = specs.motion(family, settings, arm_model, np.zeros(arm_model.n_joints))
+        need = np.zeros(arm_model.n_joints)
+        for t in np.linspace(0.0, profile.duration, 61):
+            q, qd, qdd = (profile.derivative(k, t) for k in range(3))
+            terms = arm_model.terms(q, qd)
+            torque = terms.M[: q.size, : q.size] @ qdd + terms.f1
+            need = np.maximum(need, np.abs(torque))
+        ratio = arm_model.arm.torque_limits / need
+        assert np.all((ratio > 1.49) & (ratio < 2.01)), case.name
+
+
+# --------------------------------------------------------------------------- a run, judged
+
+
+def arm_like_r():
+    """A planar arm of one link, as R."""
+    return generator.arm(0, seed=5)
+
+
+def record_of(make_record, case, plant, rest):
+    """A record of the motion whose joints come to rest at an angle `rest` (n,) [rad] off its end."""
+    wanted = specs.from_spec(case.motion, plant)
+    end = 1e-9 * wanted.times_ns[-1]
+    time = np.arange(0.0, end + trial.window_of(case) + 1e-3, 2e-3)
+    reference = trial.positions(wanted, time)
+    bent = plant.static_deflection(reference[-1])
+    late = np.exp(-np.maximum(time - end, 0.0) / (0.5 * case.period))[:, None]
+    record = make_record(
+        plant,
+        time,
+        reference=0.0,
+        plant_amplitude=bent,
+    )
+    return replace(record, reference=reference, plant_position=reference + rest + 0.1 * late), end
+
+
+def test_a_run_is_judged_by_where_the_plant_itself_would_rest(make_record):
+    case = arm_like_r()
+    plant = model.build(trial.plant_of(case.read(), trial.VARIANTS["payload x1.3"]))
+    record, end = record_of(make_record, case, plant, 0.0)
+    found = trial.judged(case, plant, record, end)
+    # 0.1 rad e^(-t/half a period) moves the tip by 0.1 % of the reach after ln(100) half periods.
+    assert_allclose(found["settling_periods"], 0.5 * np.log(100.0), rtol=0.02)
+    assert found["settled"] and found["at_rest"] and found["rest_tip"] < 1e-4
+    assert_allclose(found["peak_joint_error_deg"], np.degrees(0.1), rtol=1e-6)
+    record, end = record_of(make_record, case, plant, np.radians(0.2))
+    found = trial.judged(case, plant, record, end)
+    assert not found["settled"] and found["settling_s"] is None and not found["at_rest"]
+    assert_allclose(found["rest_joint_deg"], 0.2, rtol=0.01)
+
+
+def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
+    arm = arm_like_r().read()
+    plant = trial.plant_of(arm, trial.VARIANTS["payload x0.7"])
+    assert plant.finite_slope and plant.foreshortening
+    assert len(plant.modes) == len(arm.modes) + 1
+    assert_allclose(plant.payload.mass, 0.7 * arm.payload.mass)
+    assert not any(g.bits for g in plant.gauges) and not any(j.encoder_counts for j in plant.joints)
+    noisy = trial.plant_of(arm, trial.VARIANTS["noisy"])
+    assert noisy.gauges == arm.gauges and noisy.joints == arm.joints
+
+
+def test_a_baseline_that_is_tuned_for_the_arm_settles_on_it_and_the_same_every_time():
+    case = arm_like_r()
+    setup = CONTROLLERS["lqr"](case)
+    found = trial.run(case, setup, trial.VARIANTS["exact"])
+    assert "lost" not in found and found["settled"] and found["settling_periods"] < 3.0
+    again = trial.run(case, CONTROLLERS["lqr"](case), trial.VARIANTS["exact"])
+    assert again == found
+
+
+def test_a_design_that_is_refused_is_a_result():
+    case = generator.arm(1, seed=5)  # a yaw joint reaches no vertical bending
+    found = trial.run(case, CONTROLLERS["default"](case), trial.VARIANTS["exact"])
+    assert list(found) == ["refused"] and "can't reach" in found["refused"]
+
+
+# --------------------------------------------------------------------------- baselines
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_baselines_are_stable_on_what_they_are_tuned_for(number):
+    task = baselines.Task(generator.arm(number, seed=5))
+    gains, slowest = task.pid
+    K = np.zeros((task.model.n_joints, task.plants[0].X.shape[0]))
+    n, half = task.model.n_joints, K.shape[1] // 2
+    K[:, :n], K[:, half : half + n] = np.diag(gains["p"]), np.diag(gains["d"])
+    worst = max(baselines.poles(p, K, gains["i"]).real.max() for p in task.plants)
+    assert worst < 0.0
+    assert_allclose(worst / task.omega, slowest, rtol=1e-9)
+    # With thirty times the gains it is not: the judge can fail.
+    wild = max(baselines.poles(p, 30.0 * K, gains["i"]).real.max() for p in task.plants)
+    assert wild > 0.0
+
+
+def test_what_no_torque_reaches_is_left_out():
+    task = baselines.Task(generator.arm(1, seed=5))  # yaw alone: bending along z is out of reach
+    states = 2 * (task.model.n_joints + task.model.n_modes)
+    assert task.nominal[1].X.shape == (states, states - task.model.n_modes)
+
+
+# --------------------------------------------------------------------------- many runs, and the table
+
+
+def test_runs_are_kept_and_not_run_again(tmp_path, monkeypatch):
+    calls = []
+
+    def run(case, setup, variant, seed):
+        calls.append(case.name)
+        return {"refused": "why not"}
+
+    monkeypatch.setattr(trial, "run", run)
+    path = tmp_path / "runs.jsonl"
+    args = (5, 2, ["default"], ["exact", "noisy"], path, 1)
+    rows = study.run(*args)
+    assert len(calls) == 4 and len(path.read_text().splitlines()) == 5
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    assert [r["sample"] for r in study.run(*args)] == [r["sample"] for r in rows]
+    assert len(calls) == 5
+    with pytest.raises(FlexarmError, match="another specification"):
+        study.run(6, *args[1:])
+
+
+def row(number, controller, settling, **more):
+    found = {
+        "number": number,
+        "controller": controller,
+        "variant": "exact",
+        "peak_joint_error_deg": 1.0 + number,
+        "settling_s": settling,
+        "settling_periods": settling,
+        "settled": settling is not None,
+        "at_rest": True,
+        "residual_tip": 1e-4,
+    }
+    return json.loads(json.dumps(found | more))
+
+
+def test_the_table_counts():
+    rows = [
+        row(0, "default", 1.0),
+        row(1, "default", 4.0),
+        row(2, "default", None, lost="joint2 is 3.1 rad off its reference"),
+        {"number": 3, "controller": "default", "variant": "exact", "refused": "no gains hold"},
+        row(0, "lqr", 2.0),
+        row(0, "pid_ei", 1.5),
+        row(1, "lqr", 2.0),
+    ]
+    table = dict(zip(("default", "lqr", "pid_ei"), report.rows_of(rows), strict=True))
+    # works, refused, lost, settled, within 3 periods, at rest, no later than the best baseline
+    assert table["default"][2:9] == (2, 1, 1, 2, 1, 2, 1)
+    assert table["default"][9] == "1.5° (2°)"
+    assert table["lqr"][8] is None
+    assert any("lost in 1 runs: joint is … rad off" in line for line in report.reasons(rows))
