@@ -314,6 +314,40 @@ LAWS = [
     ),
     *of(
         "flexarm_control",
+        "composite",
+        TESTS + "test_composite.py",
+        (
+            "law",
+            "a law that is replaced: not faded",
+            "fading.jump(old - self.torque)",
+            "fading.clear()",
+        ),
+        (
+            "law",
+            "the manifold without a feed-forward: not faded",
+            "fading.jump(old - np.concatenate([u, amplitude, rate]))",
+            "fading.clear()",
+        ),
+    ),
+    *of(
+        "flexarm_sim",
+        ".",
+        "flexarm_sim/test/test_damping.py",
+        (
+            "damping",
+            "the soft start",
+            "at_once + self._grown(elapsed) * (full - at_once)",
+            "full",
+        ),
+        (
+            "damping",
+            "the torque of the first speed",
+            "np.maximum(self.speed, np.abs(velocity), out=self.speed)",
+            "self.speed[:] = np.abs(velocity)",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "feedforward",
         TESTS
         + "test_look_ahead.py flexarm_control/test/test_model_feedforward.py"

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import FAST, SLOW, design, design_law
 from flexarm_control.observers.arm_observer import design_observer
-from flexarm_control.trajectory import validate
+from flexarm_control.trajectory import ReferenceGenerator, validate
 from flexarm_dynamics.errors import (
     NOT_GIVEN,
     DesignError,
@@ -219,3 +219,94 @@ def test_a_motion_beyond_all_bounds_has_no_preview_and_says_why(arm_r, far):
     motion = validate(names, names, 0, [(10**9, [far], [0.0], [0.0], [])])
     with pytest.raises(DesignError, match="preview: the arm does not stand this motion"):
         control.feedforward.prepare(motion, np.zeros((3, 1)))
+
+
+# --------------------------------------------------------------------------- exchanges without a step
+
+
+class Reference(SimpleNamespace):
+    """A reference of constant acceleration."""
+
+    def near(self, offset):
+        v, a = self.velocity, self.acceleration
+        return np.array(
+            [self.position + offset * v + 0.5 * offset**2 * a, v + offset * a, a + 0.0 * v]
+        )
+
+
+MOVING = Reference(**vars(REFERENCE))
+
+
+PAPERS = {"type": "quasi_steady"}
+
+
+def controls(model, limit=100.0):
+    """A control that has had a sample, and one with another manifold that is to take its place."""
+    old, new = (design(model, SLOW_LAW, FAST_LAW, m) for m in ({"type": "corrected"}, PAPERS))
+    old.step(Q, QD, DELTA, DELTA_D, MOVING)
+    new.limit = old.limit = np.array([limit])
+    return old, new
+
+
+@pytest.mark.parametrize("limit", [100.0, 13.0])
+def test_a_control_that_takes_anothers_place_begins_with_its_torque_and_soon_gives_its_own(
+    arm_r, limit
+):
+    old, new = controls(arm_r, limit)
+    alone = design(arm_r, SLOW_LAW, FAST_LAW, PAPERS)
+    new.resume(old)
+    sample, given = (Q, QD, DELTA, DELTA_D, MOVING, 1e-3), []
+    for _ in range(200):
+        given.append(float(new.step(*sample)[0] - alone.step(*sample)[0]))
+        assert_array_equal(new.torque, new.slow_torque + new.fast_torque)
+    wanted = np.clip(old.step(*sample), -limit, limit) - alone.torque
+    assert abs(given[0]) > 0.1 and given[0] == pytest.approx(float(wanted[0]), rel=1e-9)
+    assert np.abs(np.diff(given)).max() < 0.05 * abs(given[0])  # lambda is 155 1/s
+    assert abs(given[100]) < 1e-3 * abs(given[0])  # a fifth of the lowest mode's period
+
+
+def test_controls_that_are_exchanged_between_two_samples_go_on_from_the_last_that_had_one(arm_r):
+    old, new = controls(arm_r)
+    between = design(arm_r, SLOW_LAW, NONE)
+    between.resume(old)
+    new.resume(between)
+    assert new._before is old
+    wanted = old.step(Q, QD, DELTA, DELTA_D, MOVING, 1e-3).copy()
+    assert_allclose(new.step(Q, QD, DELTA, DELTA_D, MOVING, 1e-3), wanted, rtol=1e-12)
+    assert abs(new._exchanged.left) > 0.1
+    assert new._before is None  # nothing keeps the old ones
+
+
+def test_a_new_session_begins_without_what_was_to_fade(arm_r):
+    old, new = controls(arm_r)
+    alone = design(arm_r, SLOW_LAW, FAST_LAW, PAPERS)
+    for exchange_first in (True, False):
+        new.resume(old)
+        if exchange_first:
+            new.step(Q, QD, DELTA, DELTA_D, MOVING, 1e-3)
+        new.reset()
+        assert new._before is None
+        wanted = alone.step(Q, QD, DELTA, DELTA_D, MOVING)
+        assert_array_equal(new.step(Q, QD, DELTA, DELTA_D, MOVING), wanted)
+        assert_array_equal(new.step(Q, QD, DELTA, DELTA_D, MOVING, 1e-3), wanted)
+
+
+def test_without_a_feedforward_a_motion_begins_ends_and_stops_without_a_step(arm_r):
+    """The corrected manifold jumps with the jerk at the ends of a quintic: 1.4 N m of torque."""
+    names, steps = arm_r.joint_names, {}
+    for stop in (None, 0.7):
+        law = design(arm_r, SLOW_LAW, {"type": "lqr"}, {"type": "corrected"})
+        reference, torque = ReferenceGenerator(names, period=0.5), []
+        reference.start(np.zeros(1), 0)
+        for k in range(1, 2600):
+            if k == 100:
+                point = (2_000_000_000, [1.0], [0.0], [0.0], [])
+                assert reference.offer(validate(names, names, 0, [point])).accepted
+            if stop is not None and k == 100 + round(1000 * stop):
+                reference.stop(k * 1_000_000, 10.0, given=False)
+            reference.sample(k * 1_000_000)
+            q, qd = reference.position.copy(), reference.velocity.copy()
+            torque.append(law.step(q, qd, np.zeros(2), np.zeros(2), reference, 1e-3).copy())
+        steps[stop] = np.abs(np.diff(torque, axis=0)).max()
+        assert np.abs(torque[-1]).max() < 1e-6
+    assert max(steps.values()) < 0.08

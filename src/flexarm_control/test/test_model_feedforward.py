@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_control import trajectory
 from flexarm_control.composite.design import design
-from flexarm_control.feedforward.model import Fading
+from flexarm_control.fading import Fading
 from flexarm_control.trajectory import ReferenceGenerator
 
 MS = 1_000_000

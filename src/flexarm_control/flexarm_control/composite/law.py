@@ -3,10 +3,21 @@ r"""Composite control, (12) of Siciliano & Book (1986): u = u_slow(x) + u_fast(x
 
 The deflections that go with the slow motion, z_bar, are what the fast control holds on to: z_f = z - z_bar. The
 paper takes their quasi-steady state (9); `manifold` has it and better ones. On the manifold z_f = 0 and u_fast = 0.
+
+Two things would jump, and fade instead (module `fading`):
+
+- A control that takes another one's place adds to its slow torque what the old one would have given more at that
+  sample.
+- Without a feed-forward, slow torque and manifold jump where the reference goes over to another polynomial, with its
+  jerk and snap: what the polynomial before, continued, gives more is added. A feed-forward has that in its own motion.
 """
 
 import numpy as np
 
+from ..arrays import clip
+from ..component import at_rest
+from ..fading import Fading, fading_rate
+from ..feedforward.model import At
 from ..manifold.quasi_steady import QuasiSteady
 
 
@@ -39,6 +50,12 @@ class CompositeControl:
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_fraction = 1.0
         self._last = None  # reference and interval of the last step
+        n, rate = model.n_joints, fading_rate(model)
+        self._limit = np.full(n, np.inf)
+        # Of the torque, from the control `_before` that this one replaces until its first step.
+        self._exchanged, self._before = Fading(n, rate), None
+        # Of (slow torque, delta_bar, its rate), since path, piece and stamp of the last step.
+        self._pieces, self._source = Fading(n + 2 * model.n_modes, rate), None
         # Of what motion, and the slow law's torque on it.
         self._nominal = b"", np.zeros(model.n_joints)
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
@@ -52,11 +69,12 @@ class CompositeControl:
 
     @property
     def limit(self):
-        """Torque limit that the feed-forward keeps to, shape (n,) [N m]."""
-        return None if self.feedforward is None else self.feedforward.limit
+        """Torque limit, which the feed-forward keeps to, shape (n,) [N m]; infinite: none."""
+        return self._limit
 
     @limit.setter
     def limit(self, value):
+        self._limit = value
         if self.feedforward is not None:
             self.feedforward.limit = value
 
@@ -69,12 +87,16 @@ class CompositeControl:
         return [part for part in parts if part is not None]
 
     def resume(self, other):
-        """Go on from another control's states: a redesign does not begin anew."""
+        """Go on from another control's states and torque: a redesign does not begin anew."""
         self.slow.resume(other.slow)
         self.fast.resume(other.fast)
         if self.feedforward is not None and other.feedforward is not None:
             self.feedforward.resume(other.feedforward)
         self.limit, self.fast_fraction = other.limit, other.fast_fraction
+        self._pieces.take(other._pieces)
+        self._source = other._source
+        # One that has not had a sample has nothing to go on from.
+        self._before = other if other._last is not None else other._before
 
     @property
     def needs_rates(self):
@@ -90,6 +112,9 @@ class CompositeControl:
         """A new session begins: the laws forget their own states."""
         for part in self._parts():
             part.reset()
+        self._exchanged.clear()
+        self._pieces.clear()
+        self._last = self._before = self._source = None
 
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample; the control path.
@@ -110,15 +135,30 @@ class CompositeControl:
         ndarray, shape (n,)
             u of (12) [N m]; before any limit. Overwritten by the next step.
         """
+        before, self._before = self._before, None
         self._advance(reference, dt)
         terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
         if self.feedforward is None:
-            u_slow, delta_bar, rate_bar = self._slow_on_manifold(q, qd, reference, terms)
+            u_slow, delta_bar, rate_bar = self._slow_on_manifold(q, qd, reference, terms, dt)
         else:
             u_slow, delta_bar, rate_bar = self._slow_about_motion(q, qd, terms)
         z_f = self._deviation(delta, delta_d, delta_bar, rate_bar)  # z - z_bar
         u_fast = np.multiply(self.fast.torque(z_f, q), self.fast_fraction, out=self.fast_torque)
-        return np.add(u_slow, u_fast, out=self.torque)  # (12)
+        np.add(u_slow, u_fast, out=self.torque)  # (12)
+        if self._goes_over(before, (q, qd, delta, delta_d, reference, dt)):
+            u_slow += self._exchanged.left
+            np.add(u_slow, u_fast, out=self.torque)
+        return self.torque
+
+    def _goes_over(self, before, sample):
+        """Whether some of the torque of the control `before`, None if there was none at this `sample`, is left."""
+        fading = self._exchanged
+        fading.advance(sample[-1])
+        if before is not None and sample[-1] > 0.0:
+            old = before.step(*sample).copy()
+            clip(old, -self._limit, self._limit)  # as it was sent
+            fading.jump(old - self.torque)
+        return fading.left.any()
 
     def _advance(self, reference, dt):
         """Advance the states of the laws, and the feed-forward's motion, to this sample."""
@@ -129,13 +169,38 @@ class CompositeControl:
         if self.feedforward is not None:
             self.feedforward.update(reference, dt)
 
-    def _slow_on_manifold(self, q, qd, reference, terms):
+    def _slow_on_manifold(self, q, qd, reference, terms, dt):
         """Slow torque towards the reference, and the manifold's z_bar with the torque that belongs to it."""
+        fading, source = self._pieces, self._source
+        fading.advance(dt)
+        path, stamp_ns = getattr(reference, "path", None), getattr(reference, "stamp_ns", 0)
+        piece = None if path is None else path.piece(stamp_ns)
+        self._source = path, piece, stamp_ns, reference.position.copy()
+        old = None
+        if source is not None and dt > 0.0 and (path, piece) != source[:2]:
+            old = np.concatenate(self._towards(q, qd, self._continued(source, dt), terms))
+        u, amplitude, rate = self._towards(q, qd, reference, terms)
+        if old is not None:
+            fading.jump(old - np.concatenate([u, amplitude, rate]))
+        if not fading.left.any():
+            return u, amplitude, rate
+        n, m = self.model.n_joints, self.model.n_modes
+        more = np.split(fading.left, [n, n + m])
+        u += more[0]
+        return u, amplitude + more[1], rate + more[2]
+
+    def _towards(self, q, qd, reference, terms):
+        """Slow torque towards a reference with the manifold's, (n,), delta_bar and its rate, (m,)."""
         u, manifold = self.slow_torque, self.manifold
         u[:] = self.slow.torque(q, qd, reference, terms)
         manifold.update(q, qd, reference, terms, u)
         u += manifold.feedforward
         return u, manifold.amplitude, manifold.rate
+
+    def _continued(self, source, dt):
+        """The reference that the last step's polynomial gives now, `dt` [s] after it."""
+        path, _, stamp_ns, position = source
+        return at_rest(position) if path is None else At(path, stamp_ns, dt)
 
     def _slow_about_motion(self, q, qd, terms):
         """Slow torque about the feed-forward's motion, and that motion's deflections moved by the tracking error.

@@ -21,14 +21,8 @@ inertia changes with its joints, gains are designed along each trajectory when i
 trajectory that arrives while the arm moves is then followed on the slow manifold alone.
 
 The manifold jumps wherever the reference's jerk or snap does: between the polynomials of a trajectory, at its start and
-end. The regulator's torque must not. So the jump is added to what the regulator tracks, and fades:
-
-.. math::
-    s_{ref}(t) + \sum_i J_i\,\phi(t - t_i), \qquad
-    \phi(t) = \bigl(1 + \lambda t + \tfrac{1}{2}\lambda^2t^2\bigr)\,e^{-\lambda t},
-
-likewise u_ref. J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives. Its
-first two derivatives are zero at t_i; lambda = `FADING` omega_1.
+end. The regulator's torque must not. So the jump is added to what the regulator tracks, and fades (module `fading`):
+J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives; likewise for u_ref.
 """
 
 from dataclasses import dataclass
@@ -44,6 +38,7 @@ from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import build
 
 from ..arrays import clip
+from ..fading import Fading, fading_rate, lowest
 from ..trajectory.path import Path
 from ..trajectory.values import SECOND
 from .base import Feedforward
@@ -58,22 +53,13 @@ APART = 0.12
 NEGLIGIBLE = 1e-6
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
-#: Rate at which a jump of the motion that the regulator tracks fades, over the lowest bending frequency.
-FADING = 12.0
-#: A jump is gone when this is left of it, in any coordinate and torque.
-GONE = 1e-12
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
 SAME_START = 1e-6
 
 
-def _lowest(model, q):
-    """Lowest bending frequency with the joints locked, omega_1 [rad/s]; 10 for a rigid arm."""
-    return float(model.frequencies(q, locked=True)[0]) if model.n_modes else 10.0
-
-
 def regulator(model, q):
     """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module."""
-    n, omega = model.n_joints, _lowest(model, q)
+    n, omega = model.n_joints, lowest(model, q)
     A, B = linear_plant(model, q, coulomb=False)
     Q = np.zeros(A.shape)
     inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
@@ -155,53 +141,6 @@ def gains_along(model, path, period):
                 field="feedforward",
             )
     return Gains(grid[at], gains)
-
-
-class Fading:
-    """Jumps that fade; see the module.
-
-    Parameters
-    ----------
-    size : int
-        Of the signal that jumps.
-    rate : float
-        lambda [1/s].
-    """
-
-    def __init__(self, size, rate):
-        self.rate = rate
-        # (c0 + c1 t + c2 t^2) e^{-lambda t} from now on: jumps add up in it, however many there were.
-        self._c, self._active = np.zeros((3, size)), False
-
-    @property
-    def left(self):
-        """What is left of all jumps, shape (size,)."""
-        return self._c[0]
-
-    def clear(self):
-        """Forget all jumps."""
-        self._c[:], self._active = 0.0, False
-
-    def take(self, other):
-        """Take the jumps of another of the same size."""
-        self._c[:], self._active = other._c, other._active
-
-    def advance(self, dt):
-        """Go on by a time [s]."""
-        if not self._active:
-            return
-        c0, c1, c2 = self._c
-        c0 += dt * (c1 + dt * c2)
-        c1 += 2.0 * dt * c2
-        self._c *= np.exp(-self.rate * dt)
-        if np.abs(self._c).max() < GONE:
-            self.clear()
-
-    def jump(self, by):
-        """Add a jump, (size,)."""
-        for c, factor in zip(self._c, (1.0, self.rate, 0.5 * self.rate**2), strict=True):
-            c += factor * by
-        self._active = True
 
 
 class _Source(NamedTuple):
@@ -295,7 +234,7 @@ class ModelFeedforward(Feedforward):
         self._make_stepper()
         self._substeps = substeps(model, settings.period, "rk4")
         self._error = np.zeros(2 * (n + m))
-        self._run = _Run(2 * (n + m), n, FADING * _lowest(model, settings.configuration))
+        self._run = _Run(2 * (n + m), n, fading_rate(model, settings.configuration))
         self._name_parts()
         #: The gain, if it does not depend on the joints; else None.
         self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
