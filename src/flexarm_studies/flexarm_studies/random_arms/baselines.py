@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Baselines for a random arm, tuned on the same information that a design has: arm file, uncertain set, rate, delay.
 
-The uncertain set is the arm at both ends of its motion with `PAYLOADS` times its payload and one mode more,
-linearised, sampled at `RATE`, its torque one sample late. A gain is judged by the poles of all these loops at once, of
-the part of the arm that torque reaches. With poles :math:`p` per second and the first locked frequency
-:math:`\omega_1` it minimises
+The uncertain set is the arm at start, middle and end of its motion with `PAYLOADS` times its payload and one mode more,
+linearised, sampled at `RATE`, its torque at once and one sample late; of it the part that torque reaches.
+
+- Joint PID, with the weight and friction of the rigid arm along the reference, and each joint's own inertia times its
+  acceleration. The integral is there without gravity, too: a PD alone sticks where friction lets it. Its reference is
+  shaped (ZVD or EI) for the modes that ring under it at the motion's end. Gains must be stable on the whole set, and
+  have the shortest settling time of the linear arm on the shaped motion, worst of all payloads: by its poles alone a
+  PID would be so soft that it leaves the modes' own damping as it is.
+- Full-state LQR: `comparison.baselines.FullStateLqr`, with the Kalman filter that gives it the state, tuned together by
+  the poles :math:`p` of all these loops at once. With the first locked frequency :math:`\omega_1` it minimises
 
 .. math:: \max_{cases,\,p} d(p) + c\,\overline{\max(d(p),\,-1)}, \qquad
     d(p) = \frac{\mathrm{Re}\,p}{\omega_1}\max\Bigl(1, \frac{|p|}{b\,\omega_1}\Bigr).
 
 Poles beyond b = `BAND` count less: no gain moves the decay of the highest modes, but the others' it may. The second
 term is a tie-break (c = `TIE`): of two gains with the same slowest pole, the one that damps the others better.
-
-- Joint PID, with the weight and friction of the rigid arm along the reference, and each joint's own inertia times its
-  acceleration. The integral is there without gravity, too: a PD alone sticks where friction lets it. Its reference is
-  shaped (ZVD or EI) for the modes that ring under it at the motion's end.
-- Full-state LQR: `comparison.baselines.FullStateLqr`, with the Kalman filter that gives it the state, tuned together.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, null_space, solve_discrete_are
+from scipy.signal import lfilter
 
 from flexarm_control.motions import shapers
 from flexarm_control.observers.kalman import measurement_covariance
@@ -30,14 +32,14 @@ from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.errors import DesignError
-from flexarm_dynamics.linear import linear_plant, sampled, sampled_noise
+from flexarm_dynamics.linear import jacobian, linear_plant, sampled, sampled_noise, static_torque
 from flexarm_dynamics.models import model
 from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 
 from ..comparison.baselines import Baseline, FullStateLqr, JointPid
 from ..comparison.controllers import DAMPED, IDLE, MAX_INTEGRAL, SHAPED, UNWATCHED
 from ..comparison.tuning import Free, tune
-from .trial import Setup
+from .trial import TOLERANCE, Setup
 
 #: Factors of the payload in the uncertain set [-].
 PAYLOADS = (0.7, 1.0, 1.3)
@@ -45,8 +47,10 @@ PAYLOADS = (0.7, 1.0, 1.3)
 RATE = 500.0
 #: Of flexarm's supervision they have none: a false alarm is not theirs. `trial.MAX_ERROR` ends a run.
 WATCH = UNWATCHED | {"observer.plausibility": False, "strain_limit": 1.0}
-#: Evaluations of poles per tuning.
-BUDGET = 400
+#: Evaluations per tuning: of poles, and of settling times.
+BUDGET, PID_BUDGET = 150, 120
+#: Slowest pole that counts as stable, in first locked frequencies [-]; settling times end here [periods].
+MARGIN, NEVER = 2e-3, 8.0
 #: Weight of the tie-break [-].
 TIE = 0.05
 #: Poles beyond so many times the first locked frequency count less [-].
@@ -95,8 +99,8 @@ class Task:
     ----------
     model : ArmModel
     profile : Motion
-    ends : tuple
-        Start and end of the motion, each (n,) [rad].
+    places, ends : tuple
+        Start, middle and end of the motion, and start and end, each (n,) [rad].
     omega : float
         First frequency with joints locked [rad/s].
     reach : float
@@ -113,23 +117,30 @@ class Task:
         self.ends = self.profile.position(0.0), self.profile.position(self.profile.duration)
         self.omega = 2.0 * np.pi / case.period
         self.reach = sum(link.length for link in self.model.arm.links)
+        self.places = tuple(
+            self.profile.position(x * self.profile.duration) for x in (0.0, 0.5, 1.0)
+        )
         masses = [np.diag(self.model.terms(q, still).M)[: still.size] for q in self.ends]
         self.inertia = np.mean(masses, axis=0)
 
     @cached_property
-    def plants(self):
-        """The uncertain set, with one mode more in every direction: `Linear`, of start and end in turn."""
+    def models(self):
+        """The arm with each payload and one mode more in every direction."""
         arm = self.model.arm
         more = arm.with_modes(
             1 + max(f.modes for link in arm.links for f in link.flexible.values())
         )
-        models = [model.build(scaled(more, payload)) for payload in PAYLOADS]
-        return [linear(each, q) for each in models for q in self.ends]
+        return [model.build(scaled(more, payload)) for payload in PAYLOADS]
+
+    @cached_property
+    def plants(self):
+        """The uncertain set: `Linear`, of the places in turn."""
+        return [linear(each, q) for each in self.models for q in self.places]
 
     @cached_property
     def nominal(self):
-        """The `Linear` of the arm itself at start and end."""
-        return [linear(self.model, q) for q in self.ends]
+        """The `Linear` of the arm itself at each place."""
+        return [linear(self.model, q) for q in self.places]
 
     @cached_property
     def strain_map(self):
@@ -139,17 +150,25 @@ class Task:
     @cached_property
     def seen(self):
         """What the observer sees of a plant with one mode more: (n + m, n + modes of that), of its q and delta."""
-        arm, n = self.model.arm, self.model.n_joints
-        more = arm.with_modes(
-            1 + max(f.modes for link in arm.links for f in link.flexible.values())
-        )
-        rows = gauge_rows(model.build(more), arm.gauges)
+        n, rows = self.model.n_joints, gauge_rows(self.models[1], self.model.arm.gauges)
         return block_diag(np.eye(n), self.strain_map.inverse_without(()) @ rows)
 
     @cached_property
-    def pid(self):
-        """Tuned gains of the joints' PID, and its slowest pole."""
-        return pid(self)
+    def loaded(self):
+        """Of each payload, at the end: the `Linear`, the tip by the state (3, ...), and what torque is missing.
+
+        That is what holds this payload, beyond the weight of the rigid arm that the controller knows, (n,) [N m].
+        """
+        found, q = [], self.ends[1]
+        n = q.size
+        own = self.model.terms(q, 0.0 * q).f1
+        for arm_model, plant in zip(self.models, self.plants[2::3], strict=True):
+            bent = arm_model.static_deflection(q)
+            place = np.concatenate([q, bent])
+            tip = jacobian(lambda x, m=arm_model: m.tip_position(x[:n], x[n:]), place)
+            tip = np.hstack([tip, np.zeros_like(tip)])
+            found.append((plant, tip, static_torque(arm_model, q) - own))
+        return found
 
     def worst(self, found):
         """What is minimised, of the poles of all cases; and their largest real part; both in omega [-]."""
@@ -159,24 +178,34 @@ class Task:
 
 
 def poles(plant, K, integral):
-    """Poles of a `plant`, a `Linear`, under PID, one sample late, in continuous time [1/s].
+    """Poles of a `plant`, a `Linear`, under PID, in continuous time [1/s]: with and without delay.
 
-    u = -`K` x - the sum of `integral` (n,) times the joint angles and the period.
+    `K` and `integral` are those of `pid_loop`.
+    """
+    return np.concatenate([_continuous(pid_loop(plant, K, integral, late)) for late in (0, 1)])
+
+
+def pid_loop(plant, K, integral, late=1):
+    """Sampled loop of a `plant` under PID: of the part, the last torque, the integral's torque.
+
+    u = -`K` x - the sum of `integral` (n,) times the joint angles and the period; it acts `late` samples late, 0 or 1.
     """
     Phi, Gamma, X = plant.Phi, plant.Gamma, plant.X
     N, n = Gamma.shape
-    # The part, the torque that acts, the integral's torque.
     loop = np.zeros((N + 2 * n,) * 2)
-    loop[:N, :N], loop[:N, N : N + n], loop[N : N + n, :N] = Phi, Gamma, -K @ X
+    loop[N : N + n, :N] = -K @ X
     loop[N + n :, :N] = -np.diag(integral) @ X[:n] / RATE
     loop[N + n :, N + n :] = np.eye(n)
     loop[N : N + n] += loop[N + n :]
-    return _continuous(np.linalg.eigvals(loop))
+    acting = np.eye(N + 2 * n)[N : N + n] if late else loop[N : N + n]
+    loop[:N] = Gamma @ acting
+    loop[:N, :N] += Phi
+    return loop
 
 
-def _continuous(z):
-    """Poles in continuous time, of sampled ones."""
-    z = z.astype(complex)
+def _continuous(loop):
+    """Poles in continuous time of a sampled `loop` [1/s]."""
+    z = np.linalg.eigvals(loop).astype(complex)
     return RATE * np.log(np.where(np.abs(z) > 1e-12, z, 1e-12))
 
 
@@ -220,55 +249,113 @@ def pid_gains(task, values):
     }
 
 
-def pid(task):
-    """Tuned gains of the joints' PID; refused where none are stable on the whole uncertain set."""
+def pid(task, kind):
+    """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind`, and its worst settling time in locked periods.
 
-    def judged(values):
-        law, modes = Pid(task.model, pid_gains(task, values)), task.plants[0].X.shape[0] // 2
-        return task.worst(
-            [poles(plant, _widened(law, modes), law.gains["i"]) for plant in task.plants]
-        )
+    Refused where no gains are stable on the whole uncertain set.
+    """
 
-    values, _, _ = tune(
-        lambda v: judged(v)[0], _pid_free(task), BUDGET, screen=lambda v: judged(v)[0]
-    )
-    slowest = judged(values)[1]
-    if slowest >= 0.0:
-        raise DesignError(
-            "no gains of the joints' PID are stable on the whole uncertain set",
-            field=task.case.name,
-        )
-    return pid_gains(task, values), slowest
+    def unstable(values):
+        gains = pid_gains(task, values)
+        K = pid_feedback(gains, task.plants[0].X.shape[0])
+        worst = max(poles(plant, K, gains["i"]).real.max() for plant in task.plants) / task.omega
+        return max(worst, -MARGIN)
+
+    def cost(values):
+        worst = unstable(values)
+        if worst > -MARGIN:
+            return NEVER * (2.0 + worst)
+        gains = pid_gains(task, values)
+        return settling(task, gains, train_of(task, gains, kind))
+
+    values, periods, _ = tune(cost, _pid_free(task), PID_BUDGET, screen=unstable)
+    if periods >= 1.5 * NEVER:
+        problem = "no gains of the joints' PID are stable on the whole uncertain set"
+        raise DesignError(problem, field=task.case.name)
+    return pid_gains(task, values), periods
 
 
-def _widened(law, half):
-    """Feedback of a PID for a state (q, delta, qd, delta_d) of 2 `half` numbers, with more modes than the law's."""
-    n = law.model.n_joints
-    K = np.zeros((n, 2 * half))
-    K[:, :n], K[:, half : half + n] = np.diag(law.gains["p"]), np.diag(law.gains["d"])
+def pid_feedback(gains, size):
+    """Feedback of a PID, without the integral, of a state (q, delta, qd, delta_d) of `size` numbers."""
+    n = gains["p"].size
+    K = np.zeros((n, size))
+    K[:, :n], K[:, size // 2 : size // 2 + n] = np.diag(gains["p"]), np.diag(gains["d"])
     return K
 
 
-def shaped(task, gains, kind):
-    """The motion, shaped for the modes that ring under PID `gains` at its end; as it is where none rings."""
-    law = Pid(task.model, gains)
-    found = poles(task.nominal[1], law.K, gains["i"])
-    omega, zeta = frequencies_and_damping(found)
+def train_of(task, gains, kind):
+    """The `Shaper` of the modes that ring under PID `gains` at the motion's end; None where none rings."""
+    K = pid_feedback(gains, task.nominal[-1].X.shape[0])
+    omega, zeta = frequencies_and_damping(poles(task.nominal[-1], K, gains["i"]))
     rings = (zeta < DAMPED) & (omega < 0.5 * np.pi * RATE)
+    if not rings.any():
+        return None
+    return shapers.for_modes(kind, omega[rings][:SHAPED], np.maximum(zeta[rings][:SHAPED], 0.0))
+
+
+def _reference(task, train, times):
+    """The quintic, shaped, at `times` (k,): position from the start, velocity, acceleration, each (k, n)."""
     profile = task.profile
-    if rings.any():
-        train = shapers.for_modes(
-            kind, omega[rings][:SHAPED], np.maximum(zeta[rings][:SHAPED], 0.0)
-        )
-        profile = train.apply(profile)
-    return specs.sampled(profile, task.model)
+    delays, amplitudes = ([0.0], [1.0]) if train is None else (train.times, train.amplitudes)
+    s = np.clip((times[:, None] - delays) / profile.duration, 0.0, 1.0)
+    orders = ((profile.shape[k](s) @ amplitudes) / profile.duration**k for k in range(3))
+    return [np.outer(order, profile.angle) for order in orders]
+
+
+def settling(task, gains, train):
+    """Settling time of a PID on the motion of a `task`, shaped by a `train`, after the end of the unshaped one, in periods [-].
+
+    The arm is the linear one at the motion's end, the worst of `PAYLOADS`; the tip is as in `trial`. Beyond `NEVER`
+    periods: how often the tolerance it is still away, as a logarithm, is added.
+    """
+    times = np.arange(0.0, task.profile.duration + NEVER * task.case.period, 1.0 / RATE)
+    r, rd, rdd = _reference(task, train, times)
+    r = r + task.ends[0] - task.ends[1]
+    push = gains["p"] * r + gains["d"] * rd + gains["acceleration"] * rdd
+    worst = 0.0
+    for plant, tip, load in task.loaded:
+        Gamma, X = plant.Gamma, plant.X
+        N, n = Gamma.shape
+        loop = pid_loop(plant, pid_feedback(gains, len(X)), gains["i"])
+        # What comes in: the reference, late as the feedback; its integral; the load that the weight does not carry.
+        inputs = np.zeros((len(times), N + 2 * n))
+        inputs[:, :N] = -Gamma @ load
+        inputs[:, N : N + n] = push + gains["i"] * r / RATE
+        inputs[:, N + n :] = gains["i"] * r / RATE
+        start = np.zeros(N + 2 * n)
+        start[:N] = X[:n].T @ r[0]
+        away = _response(loop, inputs, start, np.hstack([tip @ X, np.zeros((3, 2 * n))]))
+        distance = np.linalg.norm(away, axis=1) / task.reach
+        after = times >= task.profile.duration
+        outside = np.flatnonzero(distance[after] > TOLERANCE)
+        late = 0.0 if not outside.size else (outside[-1] + 1) / RATE / task.case.period
+        if outside.size and outside[-1] >= after.sum() - 2:
+            rest = distance[times > times[-1] - task.case.period].max()
+            late = NEVER + min(np.log10(max(rest / TOLERANCE, 1.0)), 0.4 * NEVER)
+        worst = max(worst, float(late))
+    return worst
+
+
+def _response(loop, inputs, start, outputs):
+    """Outputs (k, 3) of s' = loop s + input from a `start`, mode by mode."""
+    values, vectors = np.linalg.eig(loop)
+    drive = np.linalg.solve(vectors, inputs.T.astype(complex))
+    first = np.linalg.solve(vectors, start.astype(complex))
+    seen = outputs @ vectors
+    out = np.zeros((outputs.shape[0], len(inputs)))
+    for value, column, z, row in zip(values, drive, first, seen.T, strict=True):
+        moved = np.concatenate([[z], column[:-1]])
+        out += np.outer(row, lfilter([1.0], [1.0, -value], moved)).real
+    return out.T
 
 
 def shaped_pid(case, kind):
-    """`Setup` of the joints' PID with a shaper."""
+    """`Setup` of the joints' PID with a shaper of a `kind`."""
     task = task_of(case)
-    gains = task.pid[0]
-    motion = shaped(task, gains, kind)
+    gains, _ = pid(task, kind)
+    train = train_of(task, gains, kind)
+    profile = task.profile if train is None else train.apply(task.profile)
+    motion = specs.sampled(profile, task.model)
     given = IDLE | WATCH | {"observer.type": "filtered_derivative", "rate": RATE}
     return Setup(given, lambda arm: Pid(arm, gains), lambda arm: motion)
 
@@ -302,7 +389,7 @@ def lqr_gain(task, values):
     *sizes, decay = values[:4]
     n, m = task.model.n_joints, task.model.n_modes
     grown = np.exp(decay / RATE)
-    part = task.nominal[1]
+    part = task.nominal[-1]
     Phi, Gamma, X = grown * part.Phi, grown * part.Gamma, part.X
     joint, speed, modal = (1.0 / size**2 for size in sizes)
     Q = X.T @ np.diag(np.repeat([joint, 0.0, speed, modal], [n, m, n, m])) @ X
@@ -327,12 +414,12 @@ def kalman_parameters(task, values):
     }
 
 
-def kalman_gain(task, end, parameters):
-    """Steady gain L (N, n + m) of the observer at one end of the motion, for the part that torque reaches."""
-    part, m = task.nominal[end], task.model.n_modes
+def kalman_gain(task, place, parameters):
+    """Steady gain L (N, n + m) of the observer at one of the places, for the part that torque reaches."""
+    part, m = task.nominal[place], task.model.n_modes
     n = task.model.n_joints
     # Unknown forces act through the mass matrix.
-    M = task.model.terms(task.ends[end], np.zeros(n)).M
+    M = task.model.terms(task.places[place], np.zeros(n)).M
     force = np.square([*parameters["torque_noise"], *[parameters["modal_force_noise"]] * m])
     density = np.zeros((2 * (n + m),) * 2)
     H = np.linalg.inv(M)
@@ -346,24 +433,32 @@ def kalman_gain(task, end, parameters):
 
 
 def lqg_poles(task, K, parameters):
-    """Poles of the uncertain set under LQR `K` and the Kalman filter, one sample late, in continuous time [1/s]."""
-    n, m = task.model.n_joints, task.model.n_modes
-    gains = [kalman_gain(task, end, parameters) for end in (0, 1)]
+    """Poles of the uncertain set of a `task` under LQR `K` and the Kalman filter, in continuous time [1/s]: as `poles`.
+
+    `parameters` are those of the filter.
+    """
+    gains = [kalman_gain(task, place, parameters) for place in range(len(task.places))]
     found = []
     for k, plant in enumerate(task.plants):
-        own, L = task.nominal[k % 2], gains[k % 2]
-        N, M = len(plant.Phi), len(own.Phi)
-        seen = task.seen @ plant.X[: task.seen.shape[1]]
-        keep = np.eye(M) - L @ own.X[: n + m]
-        # The plant, the estimate, the torque that acts: it was computed one sample ago.
-        loop = np.zeros((N + M + n,) * 2)
-        loop[:N, :N], loop[:N, N + M :] = plant.Phi, plant.Gamma
-        loop[N : N + M, :N] = L @ seen @ plant.Phi
-        loop[N : N + M, N : N + M] = keep @ own.Phi
-        loop[N : N + M, N + M :] = keep @ own.Gamma + L @ seen @ plant.Gamma
-        loop[N + M :, N : N + M] = -K @ own.X
-        found.append(_continuous(np.linalg.eigvals(loop)))
+        own, L = task.nominal[k % len(gains)], gains[k % len(gains)]
+        found += [_continuous(_lqg_loop(task, plant, own, L, K, late)) for late in (0, 1)]
     return found
+
+
+def _lqg_loop(task, plant, own, L, K, late):
+    """Sampled loop of a plant under LQG: of the part, the estimate, the last torque; as `pid_loop`."""
+    N, M, n = len(plant.Phi), len(own.Phi), task.model.n_joints
+    seen = L @ task.seen @ plant.X[: task.seen.shape[1]]
+    loop = np.zeros((N + M + n,) * 2)
+    loop[N + M :, N : N + M] = -K @ own.X
+    acting = np.eye(N + M + n)[N + M :] if late else loop[N + M :]
+    loop[:N] = plant.Gamma @ acting
+    loop[:N, :N] += plant.Phi
+    predicted = own.Gamma @ acting
+    predicted[:, N : N + M] += own.Phi
+    C = own.X[: n + task.model.n_modes]
+    loop[N : N + M] = predicted - L @ C @ predicted + seen @ loop[:N]
+    return loop
 
 
 def lqr(task):
@@ -376,7 +471,7 @@ def lqr(task):
         except DesignError:
             return None, None, 1e3, 1e3
 
-    values, _, _ = tune(lambda v: judged(v)[2], _lqr_free(task), BUDGET // 2)
+    values, _, _ = tune(lambda v: judged(v)[2], _lqr_free(task), BUDGET)
     K, filtered, _, slowest = judged(values)
     if slowest >= 0.0:
         problem = "no weights of the LQR are stable on the whole uncertain set"
