@@ -5,12 +5,12 @@ Over a window that began at sample 0, with the trapezoidal rule,
 
 .. math::
     D = \sum_k \tfrac12(v_k + v_{k-1})\,h_k, \qquad
-    |x - x_0 - D| \le 0.3\max(|x - x_0|, |D|) + 6\sqrt2\,\sigma + c + 2J|v| + \tfrac12\sum_k|v_k - v_{k-1}|\,h_k
-    + 6\sigma_v\sqrt{t\,h}
+    |x - x_0 - D| \le 0.1\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
+    + \tfrac12\sum_k|v_k - v_{k-1}|\,h_k + 6\sigma_v\sqrt{t\,h}
 
-with :math:`\sigma`, c and J as in `jumps`. The sum is what the rule can miss. Windows of `WINDOWS` samples run at
-the same time; `PERSISTENT` samples in a row beyond the bound are evidence: a sign is wrong, a scale by more than 30
-%, or one of the two stands still.
+with :math:`\sigma`, c and J as in `jumps`, and :math:`\tau` by which a filtered rate may be late. The sum is what the
+rule can miss. Windows of `WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are
+evidence: a sign is wrong, a scale by more than 10 %, one of the two stands still, or the value drifts.
 """
 
 import numpy as np
@@ -20,7 +20,9 @@ WINDOWS = (20, 200)
 #: Samples in a row beyond the bound.
 PERSISTENT = 4
 #: Ratio by which a rate may be wrong [-].
-SCALE = 0.3
+SCALE = 0.1
+#: Delay of a rate that its source has filtered [s].
+LATE = 0.005
 #: Standard deviations that noise may reach.
 DEVIATIONS = 6.0
 
@@ -51,7 +53,7 @@ class Agreement:
         self._rate_noise = DEVIATIONS * c.noise[rates]
         size = values.size
         self.changed, self.driven, self._missed = np.zeros((3, len(WINDOWS), size))
-        self._start = np.zeros((len(WINDOWS), size))
+        self._start, self._first = np.zeros((2, len(WINDOWS), size))
         self.reset()
 
     def reset(self):
@@ -77,7 +79,7 @@ class Agreement:
         at = value[self.pairs[0]]
         if self._last is None:
             self._last = at
-            self._start[:] = at
+            self._start[:], self._first[:] = at, rate
             self.driven[:] = self._missed[:] = 0.0
             self._age[:], self._time[:] = 0, 0.0
             self._rate = rate
@@ -90,6 +92,7 @@ class Agreement:
         bound = np.maximum(np.abs(self.changed), np.abs(self.driven))
         bound *= SCALE
         bound += self._missed
+        bound += LATE * np.abs(rate - self._first)
         bound += self._noise
         if jitter > 0.0:
             bound += 2.0 * jitter * np.abs(rate)
@@ -103,16 +106,20 @@ class Agreement:
         if wrong.any():
             found = np.flatnonzero(self._run >= PERSISTENT)
             self._evidence = self.changed.copy(), self.driven.copy()
-        self._renew(at)
+        self._renew(at, rate)
         return found if found is not None and found.size else None
 
-    def _renew(self, at):
+    def _renew(self, at, rate):
+        # A rate that comes again starts anew: its window began with NaN. The other pairs' windows go on.
+        unknown = np.isnan(self.driven[0])
+        if unknown.any():
+            self._start[:, unknown], self._first[:, unknown] = at[unknown], rate[unknown]
+            self.driven[:, unknown] = self._missed[:, unknown] = 0.0
         for i, length in enumerate(WINDOWS):
             self._age[i] += 1
-            # A rate that comes again starts anew: its window began with NaN.
-            if self._age[i] >= length or np.isnan(self.driven[i]).any():
+            if self._age[i] >= length:
                 self._age[i], self._time[i] = 0, 0.0
-                self._start[i] = at
+                self._start[i], self._first[i] = at, rate
                 self.driven[i] = self._missed[i] = 0.0
 
     def stands(self, j):
