@@ -102,6 +102,16 @@ def stuck(*fields):
     return lie
 
 
+def noisy(name):
+    """The shipped arm with noise of its gauges and a coarse encoder, both stated."""
+    known = arm_file.load(name)
+    return replace(
+        known,
+        gauges=tuple(replace(g, noise=5e-7) for g in known.gauges),
+        joints=tuple(replace(j, encoder_counts=65536) for j in known.joints),
+    )
+
+
 def exchanged(values):
     return values[::-1].copy()
 
@@ -184,8 +194,10 @@ def test_wrong_wiring_from_the_start_is_named_by_the_motion(change, words):
         return sample
 
     loop.measure = measure
-    loop.move(0.6)
-    assert words in loop.named[1]
+    loop.move(0.7)
+    # That they do not fit is noticed before it is known why.
+    assert "strain" in loop.named[1]
+    assert words in loop.observer.monitor.doubts.text
 
 
 def test_a_wrong_velocity_that_does_not_jump_is_named():
@@ -231,18 +243,36 @@ def test_without_plausibility_everything_is_believed():
 @pytest.mark.parametrize("payload", [0.7, 1.3])
 def test_an_honest_arm_is_not_doubted(arm, payload):
     """Noise, a coarse encoder, friction and another payload than in the arm file."""
-    known = arm_file.load(arm)
-    known = replace(
-        known,
-        gauges=tuple(replace(g, noise=5e-7) for g in known.gauges),
-        joints=tuple(replace(j, encoder_counts=65536) for j in known.joints),
-    )
+    known = noisy(arm)
     rough = tuple(replace(j, friction=Friction(0.02, 0.02, 0.02)) for j in known.joints)
     plant = replace(scaled(known, payload), joints=rough)
     loop = LyingLoop(arm, "kalman", known=known, plant_arm=plant, simulator={"noise": True})
     loop.move(0.8)
     assert loop.named is None
     assert not loop.observer.monitor.bridged
+
+
+def test_a_gauge_that_drifts_stops_the_arm_and_hardly_moves_it():
+    """The strain that the motion explains takes its place, for as long as it drifts."""
+    loop = LyingLoop(observer="kalman", known=noisy("R"), simulator={"noise": True})
+
+    def lie(sample, k, memory):
+        sample.strain[0] += 1e-4 * 1e-3 * min(max(k - 1000, 0), 1000)
+
+    loop.lie = lie
+    loop.move(4.0)
+    time, doubt, degree = loop.named
+    assert doubt.startswith("strain of root drifts")
+    assert 1.0 < time < 1.4
+    assert degree == STOP
+    assert loop.controller.state == State.HOLDING
+    assert loop.simulator.position[0] < 0.5 + 0.1
+    assert abs(loop.controller.position_error[0]) < 0.1
+    assert loop.observer.monitor.doubts.trust == STOP  # as long as its zero is wrong
+    loop.observer.calibrate()
+    while loop.simulator.time < 5.5:
+        loop.step()
+    assert loop.observer.monitor.doubts.trust == ArmSample.TRUSTED
 
 
 # --------------------------------------------------------------------------- what follows

@@ -204,6 +204,10 @@ class ArmObserver:
             sample.amplitude = self.gauges.amplitudes(sample.strain, out=self._mapped)
             if self.gauges.lost != self.observer.gauges_lost:
                 self.observer.leave_out(self.gauges.lost)
+            if self._judges:
+                self.monitor.correct(
+                    sample.amplitude, self.strain_map.inverse_without(self.gauges.lost)
+                )
 
     def calibrate(self):
         """Set the gauges' bias from the last samples, of an arm at rest; not on the control path.
@@ -225,6 +229,7 @@ class ArmObserver:
         old, new = self.strain_map.bias, self.calibration.bias()
         self.strain_map.bias = new
         self.calibrated = True
+        self.monitor.calibrated()
         self.observer.rest_at(self.strain_map.amplitudes(self.calibration.last))
         return old, new
 

@@ -9,6 +9,8 @@ a joint position that jumps or stands still   DISTRUSTED: the loop can't do with
 a joint velocity that does not fit            STOP; the estimate is used in its place
 a gauge that jumps, or stands still           STOP, without that gauge; DISTRUSTED where the others don't suffice
 strains of wrong sign, exchanged gauges       the same
+a gauge whose zero drifts                     STOP, without that gauge, or with its drift taken out
+strains and a joint that contradict           STOP
 modal amplitudes that jump                    STOP, from the strains; DISTRUSTED without them
 modal rates that do not fit                   STOP; they are not used
 more than `jumps.FREQUENT` outliers           STOP
@@ -36,6 +38,8 @@ PARAMETERS = (
 
 #: The mean interval of the stamps over a short and a long time may differ by this factor.
 RATE_CHANGE = 1.5
+#: Doubt about gauges whose zero drifts.
+DRIFT = "strain of drifting gauges"
 #: Weight of the short mean in the long one, and samples for which they differ.
 SLOWLY, RATE_SAMPLES = 0.002, 100
 
@@ -63,7 +67,7 @@ class Monitor:
         self._map, self._gauges = strain_map, gauges
         self.doubts, self.jumps = Doubts(), Jumps(c)
         self._agreement, self._standstill = Agreement(c), Standstill(c)
-        self._law = StrainLaw(c, strain_map) if c.g and c.m and c.heavy else None
+        self._law = StrainLaw(c, strain_map) if c.g and c.m else None
         self._value, self._raw = np.zeros(c.size), np.zeros(2 * c.n + c.g)
         self._strain, self._amplitude, self._rates = np.zeros(c.g), np.zeros(c.m), np.zeros(c.m)
         self.stamp_ns = 0
@@ -270,13 +274,13 @@ class Monitor:
         noise = jumps.rms[c.strain]
         joints, gauges, speeds, frame = self._standstill.update(self._raw, sample.torque, noise, dt)
         pairs = self._agreement.update(self._value, dt, jumps.jitter)
-        wiring = None
+        compared, wiring = False, None
         if self._law is not None and self._has_strain:
             strain = self._value[c.strain]
             if c.at_end(strain).any():  # cut off, it follows no law
                 self._law.reset()
             else:
-                wiring = self._law.update(sample.position, strain, sample.velocity, dt)
+                compared, wiring = self._law.update(sample.position, strain, sample.velocity, dt)
         self._watch_rate(stamp)
         if self._samples < LEARNT:
             return
@@ -301,6 +305,50 @@ class Monitor:
             before, after = self._law.misfits
             text = f"{words}; misfit to the motion {before:.2g}, so read {after:.2g}"
             self._without(members, text, stamp)
+        elif compared:
+            self._drifting(stamp)
+
+    def _drifting(self, stamp):
+        """What follows from strains that the motion does not explain."""
+        c, law = self.channels, self._law
+        drift = law.drift
+        if not drift.found.size:
+            if drift.doubted.any() and not self.doubts.about_any(DRIFT):
+                drift.doubted[:] = False
+            return
+        worst = drift.found[np.argmax((np.abs(drift.residual) / drift.bound)[drift.found])]
+        by = f"{1e6 * drift.residual[worst]:.3g} microstrain, {1e6 * drift.bound[worst]:.2g} are possible"
+        joint = law.drift.joint(law.drive)
+        gauges = self._named(drift.found)
+        if joint is not None:
+            text = f"{c.names[joint]} and strain of {gauges} contradict each other, or something pushes the arm: {by}"
+            self.doubts.add(f"{c.names[joint]} or strain", ArmSample.STOP, text, stamp)
+            return
+        text = f"strain of {gauges} drifts, or something pushes the arm: the motion leaves {by}"
+        self.doubts.add(DRIFT, ArmSample.STOP, text, stamp)
+        lost = tuple(np.flatnonzero(self._gauges.doubted).tolist())
+        if self._map.possible_without(tuple(sorted({*lost, *drift.found.tolist()}))):
+            self._gauges.doubt(drift.found)
+        else:
+            drift.doubted[drift.found] = True
+
+    def correct(self, amplitude, inverse):
+        """Take drifts of gauges that can't be left out from the modal amplitudes, shape (m,).
+
+        Parameters
+        ----------
+        amplitude : ndarray, shape (m,)
+            From the strains.
+        inverse : ndarray, shape (m, g)
+            Of the strain map, that made them.
+        """
+        if self._law is not None and self._law.drift.correction.any():
+            amplitude -= inverse @ self._law.drift.correction
+
+    def calibrated(self):
+        """The gauges have another bias now: their zeros are learnt anew."""
+        if self._law is not None:
+            self._law.reset()
 
     def _frozen(self, stamp_ns):
         text = "the frame is frozen: joint positions and strains stand still together"

@@ -7,40 +7,63 @@ The second row of (2), without damping, multiplied by :math:`R K_2^{-1}`,
           p = R K_2^{-1}\left(M_{21}\ddot q + f_2\right),
 
 says what the strains and their acceleration must be for a motion of the joints, whatever torque, friction or brake
-makes it; :math:`\delta = W(\varepsilon - b)`. Strains, joint positions and :math:`f_2` go through the same low
-pass :math:`(\omega_f/(s+\omega_f))^3`, whose states have the filtered derivatives, and z and p through the same high
-pass, so that neither the bias of a gauge nor an unknown payload's weight counts. The misfit of the readings
+makes it; :math:`\delta = W(\varepsilon - b)`. Strains, joint positions and :math:`f_2` go through the same
+`low_pass`, which has their second derivatives, and z and p through the same high pass, so that neither the bias of a
+gauge nor an unknown payload's weight counts. (`zero_drift` judges z and p without it.) The misfit of the readings
 
 .. math:: r = \frac{\overline{|z + p|^2}}{\overline{|z|^2} + \overline{|p|^2}}
 
 is 0 where they fit, 1 where they have nothing in common, 2 where the sign is wrong; a payload that is 30 % off
 makes 0.03. When r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are
 judged under each hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the
-smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their own
-noise, or beside what a free oscillation moves, are not judged. Nor are arms with light joints (`Channels.heavy`):
-there large inertias cancel in z and p, and a payload that is 30 % off can turn their signs.
+smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their own noise
+raise no question.
+
+A hypothesis T may have begun a moment ago. The low pass is linear, so with the strains that it was given since the
+moment, :math:`F[\varepsilon 1_{t\ge t_0}]`, it would have given
+:math:`F[\varepsilon] + (T - 1)F[\varepsilon 1_{t\ge t_0}]`. Each hypothesis is judged from the beginning, and for
+`ONSETS` moments, `EVERY` apart, that move on with time: so the filter's memory of right strains does not delay the
+answer. What an offset of a single gauge explains as well is left to `zero_drift`.
+
+A hypothesis is no answer where its strains are small beside what a free oscillation moves: what
+gauges read that are exchanged says nothing of that, so it is judged as the hypothesis reads them. Arms with light
+joints (`Channels.heavy`) are not judged: there large inertias cancel in z and p, and a payload that is 30 % off can
+turn their signs.
 """
 
 from itertools import combinations
 
 import numpy as np
 
+from .low_pass import LowPass
+from .zero_drift import ZeroDrift, law_matrices
+
 #: Corner of the low pass as a multiple of the lowest frequency with free joints, and its limits [rad/s].
-CORNER, MIN_CORNER, MAX_CORNER = 2.0, 15.0, 60.0
+CORNER, MIN_CORNER, MAX_CORNER = 3.0, 15.0, 60.0
 #: Corner of the high pass as a fraction of that of the low pass [-].
-WASHOUT = 0.5
-#: Time constants of the low pass after which its start is forgotten [-].
-SETTLED = 7.0
+WASHOUT = 0.4
+#: Time constants of the low pass after which its start is forgotten, and over which readings are interpolated [-].
+SETTLED, GAP = 12.0, 0.7
 #: Time between two comparisons, over which they are averaged, and between new mass matrices [s].
-INTERVAL, MEMORY, RENEWAL = 0.004, 0.12, 0.02
+INTERVAL, MEMORY, RENEWAL = 0.008, 0.064, 0.04
 #: Misfit that raises the question [-], and for how many comparisons.
-MISFIT, PERSISTENT = 0.12, 5
+MISFIT, PERSISTENT = 0.12, 3
 #: The hypothesis that wins has a misfit below the first, and smaller by the second [-].
-FIT, RATIO = 0.2, 5.0
+FIT, RATIO = 0.05, 5.0
+#: And smaller than that of every other hypothesis by this factor [-], in so many comparisons in a row.
+DISTINCT, CONFIRMED = 3.0, 3
 #: Strains are judged when z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
 CLEAR, DRIVEN = 8.0, 0.5
 #: And the strains are at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
 STRAINED = 0.2
+#: Rms of a low-passed white noise over its own: this times the root of corner and sampling interval [-].
+WHITE = np.sqrt(3.0 / 16.0)
+#: Moments at which a wrong wiring may have begun, and the time between them [s].
+ONSETS, EVERY = 8, 0.03
+#: Of times [s].
+ROUNDING = 1e-9
+#: Counts of an encoder are not white: largest second derivative of a low-passed step, over its size and corner^2 [-].
+STEP = 0.3
 
 
 class StrainLaw:
@@ -50,6 +73,14 @@ class StrainLaw:
     ----------
     channels : Channels
     strain_map : StrainMap
+
+    Attributes
+    ----------
+    drift : ZeroDrift
+    drive : ndarray, shape (g, n)
+        Strain per joint acceleration at the present configuration.
+    misfits : float, float
+        Of the hypothesis that won: as the arm file has it, and so read.
     """
 
     def __init__(self, channels, strain_map):
@@ -65,19 +96,33 @@ class StrainLaw:
         self._concerned = np.stack([self._groups[list(h[1])].any(axis=0) for h in self.hypotheses])
         self._project = strain_map.rows @ strain_map.inverse
         self._kept = round(MEMORY / INTERVAL)
+        self.drift = ZeroDrift(c, strain_map)
+        # Strains, positions and forces; then the strains since each moment.
+        size = c.g + c.n + c.m
+        self._young = slice(size, size + ONSETS * c.g)
+        size += ONSETS * c.g * c.heavy
+        self._now, self._low = np.zeros(size), LowPass(size, self.corner)
         self.reset()
 
     def reset(self):
         """Forget the past."""
         c = self.channels
-        self._low = None
-        self._slow = np.zeros((3, c.g))
-        self._sums = np.zeros((4, c.g))
-        self._run = np.zeros(c.g, int)
-        self._history = np.zeros((self._kept, 3, c.g))
-        self._number = 0
-        self._since = self._age = 0.0
+        self._slow = np.zeros((3 + 2 * ONSETS, c.g))
+        self._history = np.zeros((self._kept, 3 + 2 * ONSETS, c.g))
+        self._interval = INTERVAL
         self._inertia = None
+        self.drift.reset()
+
+    def _begin(self, position, velocity):
+        """Begin with this sample: what came before a gap tells nothing of what moved in it. The drift is kept."""
+        g = self.channels.g
+        self._sums, self._run = np.zeros((2, g)), np.zeros(g, int)
+        self._number = self._samples = self._oldest = self._same = 0
+        self._best = None
+        self._since = self._until = 0.0
+        self._renew(position, velocity)
+        self._low.start(self._now)  # an arm that moves looks as if it had been hit
+        self._settling = SETTLED / self.corner
 
     def update(self, position, strain, velocity, dt):
         """Take the readings of a new sample.
@@ -91,108 +136,141 @@ class StrainLaw:
 
         Returns
         -------
-        int or None
+        compared : bool
+            Whether this sample ended an interval, so that `drift` is new.
+        wiring : int or None
             Index of the hypothesis that wins against the arm file's wiring.
         """
-        if self._inertia is None or self._age >= RENEWAL:
-            self._renew(position, velocity)
-        now = np.concatenate([strain, position, self._force])
-        if self._low is None:
-            # As if it had stood still until now: an arm that moves looks as if it had been hit.
-            self._low, self._settling = np.tile(now, (3, 1)), SETTLED / self.corner
-            return None
-        self._age += dt
-        self._settling -= dt
+        g, n, now = self.channels.g, self.channels.n, self._now
+        now[:g], now[g : g + n] = strain, position
+        if self.channels.heavy:
+            now[self._young].reshape(ONSETS, g)[:] = strain
+        if self._inertia is None or dt > GAP / self.corner:
+            self._begin(position, velocity)
+            return False, None
+        self._low.update(now, dt)
         self._since += dt
-        y, k = self._low, 1.0 - np.exp(-self.corner * dt)
-        y[0] += k * (now - y[0])
-        y[1] += k * (y[0] - y[1])
-        y[2] += k * (y[1] - y[2])
-        if self._since < INTERVAL:
-            return None
-        since, self._since = self._since, 0.0
+        self._samples += 1
+        if self._since < INTERVAL - ROUNDING:
+            return False, None
+        since, samples = self._since, self._samples
+        self._since, self._samples = 0.0, 0
+        self._age += since
+        if self._age >= RENEWAL - ROUNDING:
+            self._renew(position, velocity)
+        self._interval += 0.1 * (since / samples - self._interval)
+        self._settling -= since
         if self._settling > 0.0:
-            return None
-        return self._compare(since)
+            return False, None
+        return True, self._compare(since)
 
     def _renew(self, position, velocity):
         """Mass matrix and forces of the present configuration."""
-        n, age = self.channels.n, self._age
         terms = self.model.terms(position, velocity)
-        self._age = 0.0
-        if self._inertia is None or age:
-            to_strain = self._map.rows @ np.linalg.inv(terms.K2)
-            self._load = to_strain @ terms.M[n:, n:] @ self._map.inverse
-            self._drive, self._bend = to_strain @ terms.M[n:, :n], to_strain
-        self._inertia = terms.M
-        self._force = terms.f2
+        if self._inertia is None or self.channels.n > 1:  # that of a single joint's arm stays
+            self.drive, self._load, self._bend = law_matrices(self.model, self._map, terms)
+        self._inertia, self._age = terms.M, 0.0
+        first = self.channels.g + self.channels.n
+        self._now[first : first + self.channels.m] = terms.f2
 
     def _compare(self, dt):
-        g, n = self.channels.g, self.channels.n
-        y, w = self._low, self.corner
-        second = (w * w) * (y[0] - 2.0 * y[1] + y[2])
-        filtered = y[2]
-        raw = np.stack(
-            [
-                filtered[:g],
-                second[:g],
-                self._drive @ second[g : g + n] + self._bend @ filtered[g + n :],
-            ]
-        )
+        g, n, w = self.channels.g, self.channels.n, self.corner
+        filtered, second = self._low.signal, self._low.second
+        p = self.drive @ second[g : g + n] + self._bend @ filtered[g + n : g + n + self.channels.m]
+        residual = filtered[:g] + self._load @ second[:g] + p
+        self.drift.update(residual, second[: g + n], filtered[g : g + n], dt)
+        if not self.channels.heavy:
+            return None
+        young = np.concatenate([filtered[self._young], second[self._young]]).reshape(-1, g)
+        raw = np.concatenate([filtered[:g], second[:g], p]).reshape(3, g)
+        raw = np.concatenate([raw, young])
         k = 1.0 - np.exp(-WASHOUT * w * dt)
         if self._number == 0:
             self._slow[:] = raw
+            self._slow[3:] = 0.0
         self._slow += k * (raw - self._slow)
         fast = raw - self._slow
+        self._until -= dt
+        if self._until <= 0.0:
+            self._begin_anew(fast)
         self._history[self._number % self._kept] = fast
         self._number += 1
-        strain, acceleration, p = fast
-        moved = self._load @ acceleration
-        z = self._project @ strain + moved
+        strain, acceleration, p = fast[:3]
+        z = self._project @ strain + self._load @ acceleration
         keep = np.exp(-dt / MEMORY)
         self._sums *= keep
-        self._sums += (1.0 - keep) * np.stack([(z + p) ** 2, z * z + p * p, strain**2, moved**2])
+        self._sums += (1.0 - keep) * np.stack([(z + p) ** 2, z * z + p * p])
         # Sums over the gauges of one link and direction.
-        misfit, total, still, swing = self._sums @ self._groups
-        doubtful = self._judged(total, still, swing) & (misfit > MISFIT * total)
+        misfit, total = self._sums @ self._groups
+        doubtful = self._clear(total) & (misfit > MISFIT * total)
         self._run[~doubtful] = 0
         self._run[doubtful] += 1
         if self._number < self._kept or not (self._run >= PERSISTENT).any():
             return None
         return self._decide()
 
-    def _judged(self, total, still, swing):
-        """Whether z and p are larger than noise and wrong frequencies make them, by gauge."""
+    def _begin_anew(self, fast):
+        """Let the oldest of the moments be now."""
+        i, self._until = self._oldest, EVERY
+        self._oldest = (i + 1) % ONSETS
+        g, first = self.channels.g, self._young.start
+        self._low.clear(slice(first + i * g, first + (i + 1) * g))
+        rows = [3 + i, 3 + ONSETS + i]
+        self._slow[rows] = fast[rows] = 0.0
+        self._history[:, rows] = 0.0
+
+    def _clear(self, total):
+        """Whether z and p, summed over a link's gauges, are larger than noise makes them, by gauge."""
         c, w = self.channels, self.corner
-        gauge = c.noise[c.strain]
-        encoder = np.maximum(c.count / np.sqrt(12.0), c.noise[c.position])
-        # A low pass of the third order leaves about a third of white noise at a tenth of the sampling rate.
-        noise = gauge**2 + (0.3 * w * w) ** 2 * (
-            self._load**2 @ gauge**2 + self._drive**2 @ encoder**2
-        )
-        driven = (total > DRIVEN**2 * (still + swing)) & (still > STRAINED**2 * total)
-        return driven & (total > CLEAR**2 * (noise @ self._groups))
+        gauge = (WHITE**2 * w * self._interval) * c.noise[c.strain] ** 2
+        encoder = (STEP * c.count) ** 2 / 12.0
+        encoder += (WHITE**2 * w * self._interval) * c.noise[c.position] ** 2
+        noise = gauge + w**4 * (self._load**2 @ gauge + self.drive**2 @ encoder)
+        return total > CLEAR**2 * (noise @ self._groups)
 
     def _decide(self):
         """The hypothesis that fits much better, if there is one."""
-        strain, acceleration, p = np.moveaxis(self._history, 1, 0)  # each (kept, g)
+        strain, acceleration, p, *young = np.moveaxis(self._history, 1, 0)  # each (kept, g)
+        z = strain @ self._project.T + acceleration @ self._load.T
+        misfit, total = ((z + p) ** 2).mean(axis=0), (z * z + p * p).mean(axis=0)
+        clear = self._clear(total @ self._groups)
+        misfit, total = misfit * clear, total * clear + ~clear
+        nominal = self._concerned @ misfit / (self._concerned @ total)
+        doubtful = self._concerned[:, clear & (self._run >= PERSISTENT)].any(axis=1)
+        asked = doubtful & (nominal > MISFIT)
+        if not asked.any():
+            return None
+        # From the beginning, and from each moment.
+        T, change = self._hypothesis, self._hypothesis - np.eye(strain.shape[1])
+        rest = self._fit(strain @ T.transpose(0, 2, 1), acceleration @ T.transpose(0, 2, 1), p)
+        change = change.transpose(0, 2, 1)
+        for since, second in zip(young[:ONSETS], young[ONSETS:], strict=True):
+            fit = self._fit(strain + since @ change, acceleration + second @ change, p)
+            rest = np.minimum(rest, fit)
+        gain = np.where(asked & (rest < FIT), nominal / rest, 0.0)
+        best = int(np.argmax(gain))
+        self.misfits = float(nominal[best]), float(rest[best])
+        # An offset of one gauge explains as much as its mean residual: a zero that drifts is no wrong wiring.
+        residual, concerned = z + p, self._concerned[best]
+        offset = concerned * residual.mean(axis=0) ** 2
+        left = concerned @ (residual**2).mean(axis=0) - offset.max()
+        other = np.delete(rest, best).min(initial=left / (concerned @ total))
+        if not (gain[best] > RATIO and DISTINCT * rest[best] < other):
+            best = None
+        self._same = self._same + 1 if best == self._best and best is not None else 1
+        self._best = best
+        return best if self._same >= CONFIRMED else None
+
+    def _fit(self, strain, acceleration, p):
+        """Misfit of each hypothesis' strains, (h, kept, g) each; infinite where inertias cancel."""
         moved = acceleration @ self._load.T
         z = strain @ self._project.T + moved
-        misfit, total = ((z + p) ** 2).mean(axis=0), (z * z + p * p).mean(axis=0)
-        still, swing = (strain**2).mean(axis=0), (moved**2).mean(axis=0)
-        judged = self._judged(*(sums @ self._groups for sums in (total, still, swing)))
-        misfit, total = misfit * judged, total * judged + ~judged
-        T = self._hypothesis
-        z = np.einsum("ij,hjk,tk->hti", self._project, T, strain, optimize=True)
-        z += np.einsum("ij,hjk,tk->hti", self._load, T, acceleration, optimize=True)
-        others, totals = ((z + p) ** 2).mean(axis=1), (z * z).mean(axis=1) + (p * p).mean(axis=0)
-        nominal = self._concerned @ misfit / (self._concerned @ total)
-        other = (self._concerned * others).sum(axis=1) / (self._concerned * totals).sum(axis=1)
-        doubtful = self._concerned[:, judged & (self._run >= PERSISTENT)].any(axis=1)
-        gain = np.where(doubtful & (other < FIT) & (nominal > MISFIT), nominal / other, 0.0)
-        best = int(np.argmax(gain))
-        self.misfits = float(nominal[best]), float(other[best])
-        return best if gain[best] > RATIO else None
+        parts = (z + p) ** 2, z * z + p * p, strain**2, moved**2
+        misfit, total, still, swing = (
+            (self._concerned * part.mean(axis=1)).sum(axis=1) for part in parts
+        )
+        known = (total > DRIVEN**2 * (still + swing)) & (still > STRAINED**2 * total)
+        return np.where(known, misfit / np.where(known, total, 1.0), np.inf)
 
 
 def _hypotheses(gauges, places):

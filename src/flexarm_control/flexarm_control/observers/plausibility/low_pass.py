@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""A low pass whose states have the second derivative of what it lets through.
+
+Three stages, :math:`\dot y_i = \omega(y_{i-1} - y_i)` with the input as :math:`y_0`, so that
+
+.. math:: \ddot y_3 = \omega^2(y_1 - 2y_2 + y_3) .
+
+The input is taken for a straight line between two samples, whatever time h they are apart. With :math:`x = \omega h`,
+:math:`e_k = e^{-x}x^k/k!`, the step responses :math:`S_i = 1 - \sum_{k<i}e_k` and those of a ramp,
+:math:`R_i = 1 - \frac1x\sum_{k\le i}S_k`, a sample changes the states, exactly, to
+
+.. math:: y_i^+ = R_i u^+ + (S_i - R_i)u + \sum_{k<i}e_k\,y_{i-k} .
+"""
+
+from math import exp
+
+import numpy as np
+
+#: Coefficients are kept while h changes by less than this ratio [-].
+SAME = 1e-3
+
+
+class LowPass:
+    """Filters several signals alike.
+
+    Parameters
+    ----------
+    size : int
+        Number of signals N.
+    corner : float
+        omega [rad/s].
+    """
+
+    def __init__(self, size, corner):
+        self.corner = corner
+        self._rows = np.zeros((5, size))  # input, the last one, y_1, y_2, y_3
+        self._weights, self._dt = np.zeros((3, 5)), 0.0
+
+    def start(self, signal):
+        """Take it for the past, shape (N,): as if it had stood still until now."""
+        self._rows[:] = signal
+
+    def clear(self, part):
+        """Signals that have been zero until now: a slice."""
+        self._rows[:, part] = 0.0
+
+    def update(self, signal, dt):
+        """Take a new sample, shape (N,), `dt` [s] after the last."""
+        if abs(dt - self._dt) > SAME * dt:
+            self._weigh(dt)
+        rows = self._rows
+        rows[1] = rows[0]
+        rows[0] = signal
+        rows[2:] = self._weights @ rows
+
+    def _weigh(self, dt):
+        x = self.corner * dt
+        a = exp(-x)
+        b = a * x
+        c = 0.5 * b * x
+        s1 = 1.0 - a
+        s2 = s1 - b
+        s3 = s2 - c
+        r1 = 1.0 - s1 / x
+        r2 = r1 - s2 / x
+        r3 = r2 - s3 / x
+        self._weights[:] = (
+            (r1, s1 - r1, a, 0.0, 0.0),
+            (r2, s2 - r2, b, a, 0.0),
+            (r3, s3 - r3, c, b, a),
+        )
+        self._dt = dt
+
+    @property
+    def signal(self):
+        """y_3, shape (N,)."""
+        return self._rows[4]
+
+    @property
+    def second(self):
+        """Its second derivative, shape (N,)."""
+        rows = self._rows
+        return self.corner**2 * (rows[2] - 2.0 * rows[3] + rows[4])

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Finds gauges whose zero moves too slowly for a jump, and readings of a joint that the links do not follow.
+
+The law of `strain_law`, without its high pass, gives for each gauge the strain that the motion of the joints and the
+links' own inertia do not explain,
+
+.. math:: r = \varepsilon - R\delta_p, \qquad R\delta_p = -(R K_2^{-1}M_{22}\ddot\delta + p),
+
+of which a low pass with the time constant :math:`\tau` (`SLOW`) is judged beside its mean over the first `LEARNT`
+seconds in which the arm hardly accelerates, the zero :math:`r_0`:
+
+.. math::
+    |\bar r - r_0| \le Z\varepsilon_{max} + \Pi\,
+    \overline{\left(|\Delta D||\ddot q| + |\Delta L||\ddot\varepsilon|\right)} + \Pi\,\Delta W\sum_j|q_j - q_{j0}|
+
+with 0.6 % of full scale for the zero (Z = `ZERO`), and :math:`\Delta D`, :math:`\Delta L`, :math:`\Delta W` the
+largest changes of :math:`R K_2^{-1}M_{21}`, :math:`R K_2^{-1}M_{22}W` and of the weight's strain under a payload that
+is 30 % off, over some configurations; :math:`\Pi` is `MARGIN`. Noise is not in the bound: the low pass leaves
+less than a tenth of a gauge's noise, and of an encoder's counts less than half a microstrain.
+
+A zero that drifts at the rate v is found when it has left its bound b by :math:`v\tau`,
+
+.. math:: t = b/v + \tau + 3/\omega_f ,
+
+with the corner :math:`\omega_f` of the law's low pass; so no later than :math:`\tau + 3/\omega_f` after it has left the
+bound, at any rate. A drift that stays within it can't be told from another payload. From then on r less its zero is
+taken from the reading, late by `CORRECTED` + :math:`3/\omega_f`: what is left of a drift is v times that.
+
+When all residuals together are what a wrong acceleration of one joint makes, :math:`r = R K_2^{-1}M_{21}a`, its
+position may be wrong as well as the strains, or something pushes the arm: joint and gauges are named together.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.arm.strain_map import StrainMap
+from flexarm_dynamics.models import model as models
+
+#: Change of a zero that is none, as a fraction of full scale [-]; payload's error [-]; margin of what it does [-].
+ZERO, PAYLOAD, MARGIN = 0.006, 0.3, 1.5
+#: Time constant of the low pass, time in which the zero is learnt, and time constant of the correction [s].
+SLOW, LEARNT, CORRECTED = 0.2, 0.2, 0.05
+#: Part of the residuals' square that no joint's acceleration explains, for a joint to be named [-].
+UNEXPLAINED = 0.03
+#: Configurations at which the payload's effect is looked for.
+CONFIGURATIONS = 8
+
+
+class ZeroDrift:
+    """Judges the strain that the motion does not explain.
+
+    Parameters
+    ----------
+    channels : Channels
+    strain_map : StrainMap
+
+    Attributes
+    ----------
+    residual, bound : ndarray, shape (g,)
+        Low-passed residual less its zero, and what it may be [strain].
+    found : ndarray of int
+        Gauges beyond their bound.
+    doubted : ndarray of bool, shape (g,)
+        Gauges whose drift is taken out of the amplitudes; the monitor sets it.
+    correction : ndarray, shape (g,)
+        What is taken from the readings: follows the residual of those that are doubted, r less its zero [strain].
+    """
+
+    def __init__(self, channels, strain_map):
+        c = self.channels = channels
+        self._floor = ZERO * np.array([a.full_scale for a in c.model.arm.gauges])
+        self._drive, self._load, self._weight = _payload_changes(c.model, strain_map)
+        self.doubted, self.correction = np.zeros(c.g, bool), np.zeros(c.g)
+        self.reset()
+
+    def reset(self):
+        """Forget the past, zero and correction included."""
+        g = self.channels.g
+        self._age, self._count = 0.0, 0
+        self._zero, self._low, self._moving = np.zeros((3, g))
+        self._start = None
+        self.residual, self.bound = np.zeros(g), self._floor.copy()
+        self.found = NONE
+        self.doubted[:], self.correction[:] = False, 0.0
+
+    def update(self, residual, acceleration, position, dt):
+        """Take the law's residual of a comparison.
+
+        Parameters
+        ----------
+        residual : ndarray, shape (g,)
+            r [strain].
+        acceleration : ndarray, shape (g + n,)
+            Second derivatives of strains and joint positions.
+        position : ndarray, shape (n,)
+            Filtered alike [rad].
+        dt : float
+            Since the last comparison [s].
+        """
+        g, k = self.channels.g, 1.0 - np.exp(-dt / SLOW)
+        if self._start is None:
+            self._start, self._low = position.copy(), residual.copy()
+        size = np.abs(acceleration)
+        moving = self._drive @ size[g:] + self._load @ size[:g]
+        learns = self._age <= LEARNT
+        if learns and (moving < self._floor).all():
+            self._age += dt
+            self._count += 1
+            self._zero += (residual - self._zero) / self._count
+        self._low += k * (residual - self._low)
+        self._moving += k * (moving - self._moving)
+        np.subtract(self._low, self._zero, out=self.residual)
+        turned = np.abs(position - self._start).sum()
+        self.bound = self._floor + self._moving + min(turned, 2.0) * self._weight
+        wrong = np.abs(self.residual) > self.bound
+        self.found = np.flatnonzero(wrong) if not learns and wrong.any() else NONE
+        if self.doubted.any() or self.correction.any():
+            wanted = np.where(self.doubted, residual - self._zero, 0.0)
+            self.correction += (1.0 - np.exp(-dt / CORRECTED)) * (wanted - self.correction)
+            self.correction[np.abs(self.correction) < NOTHING * self._floor] = 0.0
+
+    def joint(self, drive):
+        """The joint whose acceleration explains all residuals of two gauges or more; None if there is none.
+
+        Parameters
+        ----------
+        drive : ndarray, shape (g, n)
+            Strain per joint acceleration at the present configuration.
+        """
+        r = self.residual
+        if r.size < 2 or not self.found.size:
+            return None
+        size = (drive**2).sum(axis=0)
+        explained = (r @ drive) ** 2 / np.where(size > 0.0, size, np.inf)
+        j = int(np.argmax(explained))
+        return j if explained[j] > (1.0 - UNEXPLAINED) * (r @ r) else None
+
+
+def law_matrices(model, strain_map, terms):
+    """Strain on the gauges per joint acceleration (g, n), per their own acceleration (g, g), and per force (g, m)."""
+    n = model.n_joints
+    to_strain = strain_map.rows @ np.linalg.inv(terms.K2)
+    load = to_strain @ terms.M[n:, n:] @ strain_map.inverse
+    return to_strain @ terms.M[n:, :n], load, to_strain
+
+
+def _payload_changes(model, strain_map):
+    """Largest changes of `law_matrices` under a payload that is `PAYLOAD` off, times `MARGIN`."""
+    n, arm = model.n_joints, model.arm
+    others = [models.build(scaled(arm, 1.0 + by)) for by in (-PAYLOAD, PAYLOAD)]
+    maps = [StrainMap(m) for m in others]
+    g = len(arm.gauges)
+    found = [np.zeros((g, n)), np.zeros((g, g)), np.zeros(g)]
+    random = np.random.default_rng(0)
+    for k in range(CONFIGURATIONS):
+        q = random.uniform(-1.5, 1.5, n) if k else np.zeros(n)
+        own = _at_rest(model, strain_map, q)
+        for other, map_ in zip(others, maps, strict=True):
+            for out, a, b in zip(found, own, _at_rest(other, map_, q), strict=True):
+                np.maximum(out, MARGIN * np.abs(b - a), out=out)
+    return found
+
+
+def _at_rest(model, strain_map, q):
+    """`law_matrices` at rest, the last one times f2: the weight's strain."""
+    terms = model.terms(q, np.zeros(q.size))
+    drive, load, to_strain = law_matrices(model, strain_map, terms)
+    return drive, load, to_strain @ terms.f2
+
+
+#: A correction below this fraction of the bound is none.
+NOTHING = 1e-3
+NONE = np.zeros(0, int)

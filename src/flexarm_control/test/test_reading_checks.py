@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the checks of the readings find in strains and positions that are computed, not simulated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flexarm_control.observers.plausibility.agreement import Agreement
+from flexarm_control.observers.plausibility.channels import Channels
+from flexarm_control.observers.plausibility.jumps import Jumps
+from flexarm_control.observers.plausibility.low_pass import LowPass
+from flexarm_control.observers.plausibility.strain_law import StrainLaw
+from flexarm_control.observers.plausibility.zero_drift import CORRECTED, SLOW
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.arm.strain_map import StrainMap
+from flexarm_dynamics.models import model as models
+
+PERIOD = 1e-3  # [s]
+NOISE = 5e-7  # [-] of a gauge
+COUNTS = 65536  # of the encoder, per turn
+
+
+def known_arm():
+    """Arm R with a stated noise of its sensors."""
+    arm = arm_file.load("R")
+    return replace(
+        arm,
+        gauges=tuple(replace(g, noise=NOISE) for g in arm.gauges),
+        joints=tuple(replace(j, encoder_counts=COUNTS) for j in arm.joints),
+    )
+
+
+def readings(arm, seconds, speed=3.0, amplitude=0.15, swing=0.0, seed=0):
+    """Position (k, 1) and strains (k, 2) of an arm whose joint swings: the exact answer of its links.
+
+    Parameters
+    ----------
+    arm : Arm
+    seconds, speed, amplitude : float
+        Duration [s], angular frequency [rad/s] and amplitude of the joint [rad].
+    swing : float
+        Of the first mode, free at its own frequency with the joint held [m].
+    """
+    m = models.build(arm)
+    terms, t = m.terms(np.zeros(1), np.zeros(1)), PERIOD * np.arange(round(seconds / PERIOD))
+    q = amplitude * np.sin(speed * t)
+    M, K = terms.M[1:, 1:], terms.K2
+    delta = np.outer(np.sin(speed * t), np.linalg.solve(K - speed**2 * M, terms.M[1:, 0]))
+    delta *= speed**2 * amplitude
+    squares, shapes = np.linalg.eig(np.linalg.solve(M, K))
+    first = int(np.argmin(squares))
+    delta += swing * np.outer(np.cos(np.sqrt(squares[first]) * t), shapes[:, first])
+    random, count = np.random.default_rng(seed), 2.0 * np.pi / COUNTS
+    strain = delta @ StrainMap(m).rows.T + NOISE * random.standard_normal((t.size, 2))
+    return count * np.round(q / count)[:, None], strain
+
+
+class Judged:
+    """The law of R's strains, fed with readings; what it found first."""
+
+    def __init__(self, change, plant=None, begin=1.0, seconds=3.0, **motion):
+        m = models.build(known_arm())
+        self.map = StrainMap(m)
+        self.law = StrainLaw(Channels(m, self.map), self.map)
+        self.drifting = self.wiring = None
+        position, strain = readings(plant or known_arm(), seconds, **motion)
+        for k, (q, e) in enumerate(zip(position, strain, strict=True)):
+            since = PERIOD * k - begin
+            if since >= 0.0:
+                q, e = change(q.copy(), e.copy(), since)
+            _, wiring = self.law.update(q, e, np.zeros(1), PERIOD)
+            drift = self.law.drift
+            if drift.found.size and self.drifting is None:
+                self.drifting = since, drift.found.tolist(), drift.joint(self.law.drive)
+                drift.doubted[drift.found] = True
+            if wiring is not None and self.wiring is None:
+                self.wiring = since, self.law.hypotheses[wiring][0]
+
+
+def honest(q, e, t):
+    return q, e
+
+
+def drifts(rate):
+    def change(q, e, t):
+        return q, e + np.array([rate * t, 0.0])
+
+    return change
+
+
+# --------------------------------------------------------------------------- low pass
+
+
+def test_the_second_derivative_of_the_low_pass_is_exact_for_uneven_steps():
+    """A parabola: its second derivative is 2 a, and the signal is late by three time constants."""
+    low, random, t = LowPass(2, 40.0), np.random.default_rng(0), 0.0
+    low.start(np.zeros(2))
+    for _ in range(3000):
+        dt = random.uniform(1e-4, 1e-3)
+        t += dt
+        low.update(np.array([3.0 * t, 5.0]), dt)
+    np.testing.assert_allclose(low.signal, [3.0 * (t - 3.0 / 40.0), 5.0], rtol=1e-8)
+    np.testing.assert_allclose(low.second, 0.0, atol=1e-5)
+    low.start(np.zeros(2))
+    for k in range(2000):
+        low.update(np.array([2.0 * (k * PERIOD) ** 2, 0.0]), PERIOD)
+    assert low.second[0] == pytest.approx(4.0, rel=1e-6)
+
+
+def test_signals_that_are_cleared_begin_at_zero():
+    low = LowPass(2, 40.0)
+    low.start(np.ones(2))
+    low.clear(slice(1, 2))
+    np.testing.assert_array_equal(low.signal, [1.0, 0.0])
+    low.update(np.zeros(2), PERIOD)
+    assert low.signal[0] > 0.9
+    assert low.signal[1] == 0.0
+
+
+# --------------------------------------------------------------------------- zero drift
+
+
+@pytest.mark.parametrize("payload", [0.7, 1.0, 1.3])
+def test_an_honest_arm_does_not_drift_with_another_payload(payload):
+    judged = Judged(honest, scaled(known_arm(), payload), swing=2e-3)
+    assert judged.drifting is None
+    assert judged.wiring is None
+
+
+def test_strains_fit_the_motion_to_less_than_half_of_their_noise():
+    judged = Judged(honest, swing=2e-3)
+    np.testing.assert_allclose(judged.law.drift.residual, 0.0, atol=0.4 * NOISE)
+
+
+@pytest.mark.parametrize("rate", [1e-4, 2e-5])
+@pytest.mark.parametrize("speed", [0.0, 3.0])
+def test_a_gauge_that_drifts_is_found_in_the_time_that_is_stated(rate, speed):
+    judged = Judged(drifts(rate), speed=speed)
+    since, gauges, joint = judged.drifting
+    drift = judged.law.drift
+    assert gauges == [0]
+    assert joint is None
+    assert since <= (drift.bound[0] + NOISE) / rate + SLOW + 3.0 / judged.law.corner + 0.01
+
+
+def test_what_a_drift_leaves_after_the_correction_is_its_rate_times_the_delay():
+    rate = 1e-4
+    judged = Judged(drifts(rate))
+    left = rate * 2.0 - judged.law.drift.correction[0]
+    assert left == pytest.approx(rate * (CORRECTED + 3.0 / judged.law.corner), abs=2.0 * NOISE)
+    assert judged.law.drift.correction[1] == 0.0
+
+
+def test_an_encoder_that_begins_to_drift_is_named_with_the_strains():
+    def change(q, e, t):
+        return q + 0.2 * t, e
+
+    since, _, joint = Judged(change).drifting
+    assert joint == 0
+    assert since < 0.1
+
+
+def test_a_gap_keeps_the_zero_and_forgets_the_motion():
+    m = models.build(known_arm())
+    map_ = StrainMap(m)
+    law = StrainLaw(Channels(m, map_), map_)
+    zero = np.array([3e-5, 0.0])
+    for _ in range(1000):
+        law.update(np.zeros(1), zero, np.zeros(1), PERIOD)
+    law.update(np.array([0.3]), zero, np.zeros(1), 0.05)
+    for _ in range(1000):
+        law.update(np.array([0.3]), zero, np.zeros(1), PERIOD)
+    np.testing.assert_allclose(law.drift.residual, 0.0, atol=1e-12)
+    assert not law.drift.found.size
+
+
+# --------------------------------------------------------------------------- wiring
+
+
+@pytest.mark.parametrize("begin", [0.75, 0.8, 1.5, 1.57, 1.65])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q, e, t: (q, -e), "strain of root and middle has the wrong sign"),
+        (lambda q, e, t: (q, e[::-1]), "strain of root and middle: the gauges are exchanged"),
+    ],
+)
+def test_wrong_wiring_that_begins_where_strains_do_not_jump_is_named(change, words, begin):
+    """The strains are small when it begins, so that no reading jumps."""
+    since, found = Judged(change, begin=begin, speed=4.0).wiring
+    assert found == words
+    assert since < 0.3
+
+
+def test_exchanged_gauges_are_named_although_what_they_read_fits_no_motion():
+    """A free oscillation, read wrongly, moves more than the strains that are read."""
+    motion = {"speed": 2.0, "amplitude": 0.2, "swing": 1e-3}
+    since, found = Judged(lambda q, e, t: (q, e[::-1]), **motion).wiring
+    assert "the gauges are exchanged" in found
+    assert since < 0.3
+
+
+def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
+    """The only hypothesis has no other to be compared with."""
+    text = arm_file.find("R").read_text().replace("modes: 2", "modes: 1")
+    arm = arm_file.parse(text[: text.rindex("  - {name: middle")])
+    m = models.build(arm)
+    map_ = StrainMap(m)
+    law = StrainLaw(Channels(m, map_), map_)
+    terms, found = m.terms(np.zeros(1), np.zeros(1)), set()
+    gain = 9.0 / (terms.K2 - 9.0 * terms.M[1:, 1:])[0, 0] * terms.M[1, 0] * map_.rows[0, 0]
+    for k in range(2000):
+        swing = 0.2 * np.sin(3.0 * PERIOD * k)
+        _, wiring = law.update(np.array([swing]), np.array([-gain * swing]), np.zeros(1), PERIOD)
+        found.add(wiring)
+    assert found == {None, 0}
+
+
+# --------------------------------------------------------------------------- rates, jumps
+
+
+def channels():
+    m = models.build(known_arm())
+    return Channels(m, StrainMap(m))
+
+
+@pytest.mark.parametrize(("drift", "found"), [(0.1, True), (0.0, False)])
+def test_a_position_that_drifts_beside_its_velocity_is_found_without_modal_rates(drift, found):
+    """The modes' rates are unknown; the joint's windows go on."""
+    c = channels()
+    agreement, value = Agreement(c), np.zeros(c.size)
+    value[c.rate] = np.nan
+    evidence = []
+    for k in range(400):
+        t = PERIOD * k
+        value[c.position], value[c.velocity] = 0.3 * t + drift * t, 0.3
+        pairs = agreement.update(value.copy(), PERIOD, 0.0)
+        evidence.extend([] if pairs is None else pairs.tolist())
+    assert set(evidence) == ({0} if found else set())
+
+
+def test_a_velocity_that_its_source_has_filtered_is_not_wrong():
+    c = channels()
+    agreement, value, late = Agreement(c), np.zeros(c.size), 0.0
+    value[c.rate] = np.nan
+    for k in range(2000):
+        t = PERIOD * k
+        true = 0.5 * np.sin(3.0 * t)
+        late += (1.0 - np.exp(-PERIOD / 0.004)) * (true - late)
+        value[c.position], value[c.velocity] = (1.0 - np.cos(3.0 * t)) / 6.0, late
+        assert agreement.update(value.copy(), PERIOD, 0.0) is None
+
+
+def test_a_link_that_swings_does_not_jump_at_a_low_rate():
+    """200 Hz, the second mode of R at 14 Hz: after each turn of its curvature a line misses it again."""
+    c, period = channels(), 0.005
+    jumps, random, found = Jumps(c), np.random.default_rng(2), 0
+    value, last = np.full(c.size, np.nan), 0.0
+    for k in range(1, 2000):
+        t = period * k
+        if random.random() < 0.2:
+            continue  # lost
+        value[c.position] = 0.0
+        value[c.strain] = [3e-5 * np.sin(87.2 * t), -1e-4 * np.sin(87.2 * t)]
+        value[c.strain] += NOISE * random.standard_normal(2)
+        outliers, lasting = jumps.judge(
+            value, np.ones(1), t - last, max(round((t - last) / period), 1)
+        )
+        found += (outliers is not None and outliers.size) or 0
+        assert lasting is None
+        jumps.take(value, t)
+        last = t
+    assert found == 0
