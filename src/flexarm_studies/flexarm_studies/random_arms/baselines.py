@@ -250,7 +250,7 @@ def pid_gains(task, values):
 
 
 def pid(task, kind):
-    """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind`, and its worst settling time in locked periods.
+    """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind`, and its settling time [periods].
 
     Refused where no gains are stable on the whole uncertain set.
     """
@@ -303,7 +303,7 @@ def _reference(task, train, times):
 
 
 def settling(task, gains, train):
-    """Settling time of a PID on the motion of a `task`, shaped by a `train`, after the end of the unshaped one, in periods [-].
+    """Settling time of a PID on the motion of a `task`, shaped by a `train`, from its unshaped end on [periods].
 
     The arm is the linear one at the motion's end, the worst of `PAYLOADS`; the tip is as in `trial`. Beyond `NEVER`
     periods: how often the tolerance it is still away, as a logarithm, is added.
