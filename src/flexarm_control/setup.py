@@ -29,11 +29,13 @@ setup(
             "model_following = flexarm_control.slow.model_following:ModelFollowing",
             "computed_torque = flexarm_control.slow.computed_torque:ComputedTorque",
             "resolved_acceleration = flexarm_control.slow.resolved_acceleration:ResolvedAcceleration",
+            "joint_pid = flexarm_control.slow.joint_pid:JointPid",
             "sliding_mode = flexarm_control.slow.sliding_mode:SlidingMode",
             "adaptive_model_following = flexarm_control.slow.adaptive_model_following:AdaptiveModelFollowing",
         ],
         "flexarm.fast_laws": [
             "none = flexarm_control.fast.none:NoFastLaw",
+            "fixed_gain = flexarm_control.fast.fixed_gain:FixedGain",
             "lqr = flexarm_control.fast.lqr:Lqr",
             "scheduled_lqr = flexarm_control.fast.scheduled_lqr:ScheduledLqr",
             "pole_placement = flexarm_control.fast.pole_placement:PolePlacement",

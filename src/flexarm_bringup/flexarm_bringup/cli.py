@@ -115,6 +115,11 @@ COMMANDS = {
         "analyze",
         "time scales, a bound on mu, margins, domain of attraction and Monte Carlo of a design",
     ),
+    "design": Command(
+        "flexarm_studies.commands.design",
+        "design",
+        "a controller file for an arm, made for what may differ from the arm file",
+    ),
     "attack": Command(
         "flexarm_studies.attack.command",
         "attack",

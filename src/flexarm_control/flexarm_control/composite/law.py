@@ -137,17 +137,17 @@ class CompositeControl:
         """
         before, self._before = self._before, None
         self._advance(reference, dt)
-        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
         if self.feedforward is None:
-            u_slow, delta_bar, rate_bar = self._slow_on_manifold(q, qd, reference, terms, dt)
+            u_slow, delta_bar, rate_bar = self._slow_on_manifold(q, qd, reference, dt)
         else:
-            u_slow, delta_bar, rate_bar = self._slow_about_motion(q, qd, terms)
+            u_slow, delta_bar, rate_bar = self._slow_about_motion(q, qd)
         z_f = self._deviation(delta, delta_d, delta_bar, rate_bar)  # z - z_bar
         u_fast = np.multiply(self.fast.torque(z_f, q), self.fast_fraction, out=self.fast_torque)
         np.add(u_slow, u_fast, out=self.torque)  # (12)
         if self._goes_over(before, (q, qd, delta, delta_d, reference, dt)):
             u_slow += self._exchanged.left
             np.add(u_slow, u_fast, out=self.torque)
+        self.slow.saw(self.torque)
         return self.torque
 
     def _goes_over(self, before, sample):
@@ -169,8 +169,9 @@ class CompositeControl:
         if self.feedforward is not None:
             self.feedforward.update(reference, dt)
 
-    def _slow_on_manifold(self, q, qd, reference, terms, dt):
+    def _slow_on_manifold(self, q, qd, reference, dt):
         """Slow torque towards the reference, and the manifold's z_bar with the torque that belongs to it."""
+        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
         fading, source = self._pieces, self._source
         fading.advance(dt)
         path, stamp_ns = getattr(reference, "path", None), getattr(reference, "stamp_ns", 0)
@@ -202,17 +203,22 @@ class CompositeControl:
         path, _, stamp_ns, position = source
         return at_rest(position) if path is None else At(path, stamp_ns, dt)
 
-    def _slow_about_motion(self, q, qd, terms):
+    def _slow_about_motion(self, q, qd):
         """Slow torque about the feed-forward's motion, and that motion's deflections moved by the tracking error.
 
         The motion's torque takes the place of what the slow law gives on the motion; the manifold's response to the
         tracking error is added to both.
         """
         u, motion, m = self.slow_torque, self.feedforward, self.model.n_modes
-        u[:] = self.slow.torque(q, qd, motion, terms)
-        u += motion.torque - self._nominal_torque(
-            motion.position, motion.velocity, motion.acceleration
-        )
+        if self.slow.separate:
+            u[:] = self.slow.feedback(q, qd, motion)
+            u += motion.torque
+        else:
+            terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
+            u[:] = self.slow.torque(q, qd, motion, terms)
+            u += motion.torque - self._nominal_torque(
+                motion.position, motion.velocity, motion.acceleration
+            )
         response = self._response @ self._tracking_error(q, qd, motion)
         u += response[2 * m :]
         return u, motion.amplitude + response[:m], motion.rate + response[m : 2 * m]
@@ -244,7 +250,7 @@ class CompositeControl:
         if self.feedforward is None or self._last is None:
             return
         foreseen = self.feedforward.look_ahead(*self._last)
-        if foreseen is not None:
+        if foreseen is not None and not self.slow.separate:
             self._nominal_torque(*foreseen)
 
     def _nominal_torque(self, position, velocity, acceleration):

@@ -37,6 +37,9 @@ class SlowLaw(Law, ABC):
     #: arm file's arm would not, so that such a law goes without feed-forward.
     learns = False
 
+    #: True for a law whose torque is its `nominal` one and a `feedback` of the error, which needs no terms.
+    separate = False
+
     def error_gains(self):
         """Gains (kp, kv) of the tracking error's dynamics, e'' = -kv e' - kp e, each (n,); None for another law.
 
@@ -50,6 +53,13 @@ class SlowLaw(Law, ABC):
         For `terms` of (2) on the reference, and the reference's `acceleration`, (n,) [rad/s^2].
         """
         return slow_torque(terms, acceleration)
+
+    def feedback(self, q, qd, motion):
+        """Torque beyond the `nominal` one on a `motion`, shape (n,) [N m]; of a `separate` law."""
+        raise NotImplementedError
+
+    def saw(self, torque):
+        """Take note of the whole torque (n,) [N m] that this sample asks for, before any limit."""
 
     @abstractmethod
     def torque(self, q, qd, reference, terms):

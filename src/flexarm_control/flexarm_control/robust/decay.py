@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The slowest decay of a set of loops, and its gradient by the gains.
+
+Each pole :math:`s = \ln(z)/h` of each loop has the value
+
+.. math:: v = \Re s / d(|s|), \qquad d = \begin{cases}
+    \omega_1 & |s| \le \omega_c \\ \min(\omega_1, \zeta|s|) & \text{beyond,}\end{cases}
+
+so that up to omega_c, where torque reaches, v is minus the decay over the lowest bending frequency omega_1 with the
+joints locked. Stiffer modes are only asked to keep a share of their own damping zeta. The largest v of all poles is
+what a design makes small. With the right and left eigenvectors x, y of F - G K N,
+
+.. math:: \frac{\partial s}{\partial K_{ab}} = -\frac{(y^HG)_a\,(Nx)_b}{h\,z\,y^Hx} .
+
+A pole that hardly moves with any gain is left to itself: its mode is one that torque does not reach or gauges do not
+see.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigvals, lu_factor, lu_solve
+
+#: A pole counts as one that no gain moves below this change of v by one unit of all scaled gains.
+UNMOVED = 0.01
+#: So many poles of a loop are looked at for one that gains move.
+MOST = 12
+#: Poles nearer to the origin of the z plane are those of delays and filters.
+DEAD_BEAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is asked of poles; see the module."""
+
+    omega_1: float  # [rad/s]
+    omega_c: float  # [rad/s]
+    zeta: float  # [-]
+
+    def decay(self, s):
+        """d of each pole [1/s]."""
+        size = np.abs(s)
+        beyond = np.minimum(self.omega_1, self.zeta * size)
+        return np.where(size <= self.omega_c, self.omega_1, beyond)
+
+
+def eigenvalues(loop, K):
+    """The closed loop's matrix, and its eigenvalues in the upper half plane but for those of delays."""
+    closed = loop.F - loop.G @ (K @ loop.N)
+    z = eigvals(closed, check_finite=False)
+    return closed, z[(np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)]
+
+
+def gradient(loop, closed, z):
+    """Derivative of the real part of a pole s by the gains, shape of K; by inverse iteration."""
+    size = len(closed)
+    factors = lu_factor(closed - (z * (1.0 + 1e-10) + 1e-14) * np.eye(size), check_finite=False)
+    start = np.cos(1.0 + np.arange(size)).astype(complex)
+    right, left = start, start
+    for _ in range(2):
+        right = lu_solve(factors, right, check_finite=False)
+        right /= np.linalg.norm(right)
+        left = lu_solve(factors, left, trans=2, check_finite=False)
+        left /= np.linalg.norm(left)
+    across = loop.period * z * (left.conj() @ right)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = -np.outer(left.conj() @ loop.G, loop.N @ right) / across
+    return np.nan_to_num(found.real)
+
+
+class Slowest:
+    """The largest v of a set of loops as a function of scaled gains.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+    wanted : Wanted
+    scale : ndarray, shape (n, 3n + 2m)
+        Unit of each gain; 0: the gain is none.
+    """
+
+    def __init__(self, loops, wanted, scale):
+        self.loops, self.wanted, self.scale = loops, wanted, scale
+        self.free = scale > 0.0
+
+    def gains(self, x):
+        """K of scaled gains x."""
+        K = np.zeros_like(self.scale)
+        K[self.free] = x * self.scale[self.free]
+        return K
+
+    def scaled(self, K):
+        """Scaled gains x of K."""
+        return K[self.free] / self.scale[self.free]
+
+    def values(self, x, loops=None):
+        """Of each loop: its closed matrix, poles z and their v, the largest first."""
+        K, found = self.gains(x), []
+        for loop in self.loops if loops is None else loops:
+            closed, z = eigenvalues(loop, K)
+            s = np.log(z) / loop.period
+            v = s.real / self.wanted.decay(s)
+            order = np.argsort(-v)
+            found.append((loop, closed, z[order], v[order]))
+        return found
+
+    def worst(self, found):
+        """The largest v of poles that gains move, with loop, z and the gradient by x; unmoved ones are passed over.
+
+        `found` as `values` returns it. Returns v, gradient, loop, z, and the poles that were passed over.
+        """
+        candidates = [
+            (v, k, i)
+            for k, (_, _, _, all_v) in enumerate(found)
+            for i, v in enumerate(all_v[:MOST])
+        ]
+        candidates.sort(reverse=True)
+        unmoved = []
+        for v, k, i in candidates:
+            loop, closed, z, _ = found[k]
+            s = np.log(z[i]) / loop.period
+            slope = (gradient(loop, closed, z[i]) * self.scale)[self.free] / self.wanted.decay(s)
+            if v > 1e-9 or np.linalg.norm(slope) > UNMOVED:
+                return v, slope, loop, s, unmoved
+            unmoved.append((loop, s))
+        return -np.inf, np.zeros(self.free.sum()), None, 0.0, unmoved
+
+    def smooth(self, loops, width):
+        r"""A smooth function of x above the largest v of some loops, and its gradient.
+
+        .. math:: w\ln\sum_i e^{v_i/w}
+
+        over all poles that gains move, of a `width` w: all that are near the largest have a say.
+        """
+
+        def function(x):
+            try:
+                found = self.values(x, loops)
+                worst, _, _, _, unmoved = self.worst(found)
+                w = width * max(1.0, abs(worst))
+                out = {(id(loop), s) for loop, s in unmoved}
+                total, slope = 0.0, np.zeros(x.size)
+                for loop, closed, z, v in found:
+                    for one, value in zip(z, v, strict=True):
+                        if value < worst - 6.0 * w:
+                            break
+                        s = np.log(one) / loop.period
+                        if (id(loop), s) in out:
+                            continue
+                        g = (gradient(loop, closed, one) * self.scale)[self.free]
+                        g /= self.wanted.decay(s)
+                        if value < 0.0 and np.linalg.norm(g) < UNMOVED:
+                            continue
+                        weight = np.exp((value - worst) / w)
+                        total += weight
+                        slope += weight * g
+            except (np.linalg.LinAlgError, ValueError):
+                return np.inf, np.zeros(x.size)
+            return worst + w * np.log(total), slope / total
+
+        return function

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Gains for an arm that is not quite what its file says.
+
+The control is of fixed structure: stiffness, damping and integral of each joint (`slow.type: joint_pid`) and a
+constant feedback of modal amplitudes and rates (`fast.type: fixed_gain`), both about the motion of the feed-forward.
+Its gains are found for a set of sampled loops at once (multi-model design): payload, stiffness, damping, loop gain,
+delay and configuration vary, the arm has one mode more per direction than the file, and filters and delay are part of
+each loop (`loop`). What is made as fast as possible is the slowest pole of them all (`decay`), found by BFGS on the
+nonsmooth function (`nonsmooth`) from several starts. The noise that the gains pass on to the torque is bounded.
+
+The literature knows this as static output feedback by minimisation of the spectral abscissa (Burke, Henrion, Lewis &
+Overton 2006, HIFOO; Ackermann 1980 for the multi-model idea).
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flexarm_dynamics.models.model import build
+
+from .decay import Slowest, Wanted
+from .loop import Sampling
+from .noise import Noise
+from .search import STARTS, Search, start
+from .uncertain import (
+    Uncertainty,
+    configurations,
+    lowest,
+    own_damping,
+    reach,
+    resting,
+    uncertain_loops,
+)
+
+#: Corner of the filtered derivatives over omega_c.
+FILTER = 2.0
+#: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
+FASTEST, NOISIEST = 0.8, 0.03
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the loop runs, and how long a design may take.
+
+    Attributes
+    ----------
+    rate : float
+        Samples per second [Hz].
+    delay : float
+        From a measurement until its torque acts [s].
+    speed : float
+        From 0 to 1: how much decay is looked for, and how much noise the torque may have for it. 1: `FASTEST` and
+        `NOISIEST`, the rms torque of the sensors' noise over the torque limit.
+    configurations : tuple of tuple of float
+        Where the arm moves [rad]; none: drawn from its position limits.
+    effort : float
+        Of the search; 1.0 is the default.
+    seed : int
+        Of the starts.
+    """
+
+    rate: float = 1000.0
+    delay: float = 0.001
+    speed: float = 1.0
+    configurations: tuple = ()
+    effort: float = 1.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Design:
+    """Gains, and what they were found to do.
+
+    Attributes
+    ----------
+    K : ndarray, shape (n, 3n + 2m)
+        u = -K (q, qd, -w, delta, delta_d).
+    decay : float
+        Slowest decay of all poles that gains move, over what is wanted of them [-]; negative: unstable.
+    omega_1 : float
+        Lowest bending frequency with the joints locked [rad/s].
+    omega_c : float
+        Frequency up to which torque reaches a mode [rad/s].
+    configurations : ndarray, shape (k, n)
+        [rad]
+    slowest : tuple
+        Of each loop: name, slowest pole [1/s], its value.
+    left : tuple of float
+        Frequencies of modes that no gain moves, at the first configuration [rad/s].
+    noise : tuple of float
+        Of each joint: rms torque of the sensors' noise over the torque limit [-].
+    """
+
+    arm: object
+    settings: Settings
+    uncertainty: Uncertainty
+    sampling: Sampling
+    K: np.ndarray
+    decay: float
+    omega_1: float
+    omega_c: float
+    configurations: np.ndarray
+    slowest: tuple = ()
+    left: tuple = ()
+    evaluations: int = 0
+    noise: tuple = field(default=())
+
+    @property
+    def holds(self):
+        """Whether all loops are stable."""
+        return self.decay > 0.0
+
+    def parameters(self):
+        """Flat parameters of the three nodes."""
+        n = len(self.arm.joints)
+        K = self.K
+
+        def numbers(values):
+            return [float(f"{v:.6g}") for v in np.ravel(values)]
+
+        out = {
+            "rate": self.settings.rate,
+            "feedforward": "model",
+            "slow.type": "joint_pid",
+            "slow.stiffness": numbers(np.diag(K[:, :n])),
+            "slow.damping": numbers(np.diag(K[:, n : 2 * n])),
+            "slow.integral": numbers(np.diag(K[:, 2 * n : 3 * n])),
+            "fast.type": "none",
+        }
+        if K.shape[1] > 3 * n:
+            out["fast.type"] = "fixed_gain"
+            out["fast.gain"] = numbers(-K[:, 3 * n :])
+            out["fast.configuration"] = numbers(self.configurations[0])
+        modal, joint = numbers([self.sampling.modal_corner, self.sampling.joint_corner])
+        return out | {
+            "manifold.type": "reference",
+            "observer.type": "filtered_derivative",
+            "observer.bandwidth": modal,
+            "observer.joint_velocity_bandwidth": joint,
+        }
+
+
+def design(arm, settings=None, uncertainty=None, progress=None):
+    """Gains for an arm file's arm.
+
+    Parameters
+    ----------
+    arm : Arm
+    settings : Settings, optional
+    uncertainty : Uncertainty, optional
+    progress : callable, optional
+        Called with a fraction of the work and the decay that is reached.
+
+    Returns
+    -------
+    Design
+        The best that was found, also where it is not stable: see its `decay`.
+
+    Raises
+    ------
+    DesignError
+        Where the arm rests in no configuration, or has nothing to measure its bending by.
+    """
+    settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
+    nominal = build(arm)
+    h = 1.0 / settings.rate
+    at = resting(nominal, settings.configurations or configurations(arm, settings.seed))
+    omega_1 = lowest(nominal)
+    late = settings.delay + 0.5 * h
+    omega_c = reach(nominal, at, late)
+    corner = min(settings.rate, FILTER * omega_c)
+    sampling = Sampling(h, settings.delay, corner, corner)
+    loops = uncertain_loops(nominal, at, sampling, uncertainty)
+    wanted = Wanted(omega_1, omega_c, own_damping(arm, uncertainty))
+    scale = units(nominal, at, omega_1)
+    slowest = Slowest(loops, wanted, scale)
+    speed = max(settings.speed, 0.05)
+    noise = Noise(slowest, nominal, sampling, speed * NOISIEST, omega_1)
+    starts = [slowest.scaled(start(nominal, at, scale, a, late + 1.0 / corner)) for a in STARTS]
+    search = Search(slowest, noise, speed * FASTEST, settings.effort, settings.seed)
+    x = search.best(starts, progress)
+    rows, left = [], []
+    for one in slowest.values(x):
+        v, _, _, s, unmoved = slowest.worst([one])
+        rows.append((one[0].name, complex(s), float(v)))
+        left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
+    K = slowest.gains(x)
+    return Design(
+        arm,
+        settings,
+        uncertainty,
+        sampling,
+        K,
+        -max(row[2] for row in rows),
+        omega_1,
+        omega_c,
+        at,
+        tuple(rows),
+        tuple(sorted(set(left))),
+        round(search.evaluations),
+        tuple(noise.shares(K).tolist()),
+    )
+
+
+def units(model, at, omega_1):
+    """Unit of each gain, (n, 3n + 2m): what moves joints and modes at about omega_1; 0 where there is no gain."""
+    n, m = model.n_joints, model.n_modes
+    out = np.zeros((n, 3 * n + 2 * m))
+    for q in at:
+        terms = model.terms(q, np.zeros(n))
+        M = terms.M
+        inertia, modal = np.diag(M)[:n], np.diag(M)[n:]
+        one = np.zeros_like(out)
+        for i in range(n):
+            for k, power in enumerate((2, 1, 3)):
+                one[i, k * n + i] = inertia[i] * omega_1**power
+        if m:
+            omega = np.sqrt(np.abs(np.diag(terms.K2)) / modal)
+            coupling = np.abs(M[:n, n:]) + 0.05 * np.sqrt(np.outer(inertia, modal))
+            one[:, 3 * n : 3 * n + m] = 3.0 * coupling * omega * omega_1
+            one[:, 3 * n + m :] = coupling * omega
+        out = np.maximum(out, one)
+    return out

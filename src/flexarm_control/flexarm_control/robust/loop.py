@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""One sampled loop of an uncertain set: an arm at rest in a configuration, its sensors, filters and delay.
+
+The arm (2), linear about rest, moves from sample to sample by Phi and Gamma (`full_order`). The control measures
+joint positions and, through the strain map of the arm *file*, modal amplitudes, :math:`y = Cs`; modes that the arm has
+beyond the file's leak into them. Rates are filtered derivatives with the corners of `observer.bandwidth` and
+`observer.joint_velocity_bandwidth`, as the observer computes them,
+
+.. math::
+    r_k = d_k + (r_{k-1} - d_k)\,e^{-\omega_c h}, \qquad d_k = (y_k - y_{k-1})/h,
+
+the integral is that of the slow law, :math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. With
+the state X of all of this, and the control :math:`u = -K\,m`,
+
+.. math:: X_{k+1} = F X_k + G u_k, \qquad m = N X = (q, r_q, -w, \hat\delta, r_\delta) .
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.linear import linear_plant, sampled
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How the loop samples."""
+
+    period: float  # h [s]
+    delay: float  # from the measurement to the torque [s]
+    joint_corner: float  # of the filtered derivative of joint positions [rad/s]
+    modal_corner: float  # of that of modal amplitudes [rad/s]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """One member of the uncertain set; see the module."""
+
+    name: str
+    F: np.ndarray  # (N, N)
+    G: np.ndarray  # (N, n)
+    N: np.ndarray  # (3n + 2m, N): measurements
+    period: float
+
+
+def measured_amplitudes(nominal, plant):
+    """Amplitudes that the file's strain map gives for the plant's deflections, shape (m, m of the plant)."""
+    map_ = StrainMap(nominal)
+    gains = np.array([g.gain for g in nominal.arm.gauges])
+    return map_.inverse @ (gains[:, None] * gauge_rows(plant, nominal.arm.gauges))
+
+
+def sampled_loop(nominal, plant, q, sampling, gain=1.0, name=""):
+    """The `Loop` of a `plant` at rest in q (n,) [rad] under a control that knows the `nominal` model.
+
+    `gain` is that of the torque on its way to the arm [-].
+    """
+    n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
+    A, B = linear_plant(plant, np.asarray(q, float), coulomb=False)
+    B = gain * B
+    h, size, p = sampling.period, A.shape[0], n + m
+    C = np.zeros((p, size))
+    C[:n, :n] = np.eye(n)
+    if m:
+        C[n:, n : n + mp] = measured_amplitudes(nominal, plant)
+    keep = np.exp(-h * np.repeat([sampling.joint_corner, sampling.modal_corner], [n, m]))
+    whole = int(sampling.delay / h + 1e-9)
+    late = sampling.delay - whole * h
+    split = late > 1e-12
+    under_way = whole + split
+    # X = (s, y of the last sample, r of the last sample, -w of the last sample, torques under way, newest last)
+    at_y, at_r, at_w, at_u = size, size + p, size + 2 * p, size + 2 * p + n
+    total = at_u + n * under_way
+    rate = np.zeros((p, total))  # r_k
+    slope = (1.0 - keep) / h
+    rate[:, :size] = slope[:, None] * C
+    rate[:, at_y : at_y + p] = -np.diag(slope)
+    rate[:, at_r : at_r + p] = np.diag(keep)
+    integral = np.zeros((n, total))  # -w_k
+    integral[:, at_w : at_w + n] = np.eye(n)
+    integral[:, at_y : at_y + n] = h * np.eye(n)
+    F, G = np.zeros((total, total)), np.zeros((total, n))
+    F[:size, :size] = sampled(A, B, h)[0]
+    F[at_y : at_y + p, :size] = C
+    F[at_r : at_r + p] = rate
+    F[at_w : at_w + n] = integral
+    later, end = sampled(A, B, h - late)
+
+    def add(matrix, age):
+        if age:
+            at = total - n * age
+            F[:size, at : at + n] += matrix
+        else:
+            G[:size] += matrix
+
+    add(end, whole)
+    if split:
+        add(later @ sampled(A, B, late)[1], whole + 1)
+    for age in range(under_way, 0, -1):
+        at = total - n * age
+        if age > 1:
+            F[at : at + n, at + n : at + 2 * n] = np.eye(n)
+        else:
+            G[at : at + n] = np.eye(n)
+    N = np.zeros((3 * n + 2 * m, total))
+    N[:n, :size] = C[:n]
+    N[n : 2 * n] = rate[:n]
+    N[2 * n : 3 * n] = integral
+    N[3 * n : 3 * n + m, :size] = C[n:]
+    N[3 * n + m :] = rate[n:]
+    return Loop(name, F, G, N, h)

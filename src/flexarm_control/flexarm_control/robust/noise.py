@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much of the sensors' noise the gains pass on to the torque."""
+
+import numpy as np
+
+from flexarm_dynamics.arm.strain_map import StrainMap
+
+#: Joint and strain noise assumed where the file states none [rad], [-].
+ENCODER_NOISE, STRAIN_NOISE = 1.5e-5, 1e-6
+
+
+class Noise:
+    """Torque that sensor noise makes, over the torque limit, and the penalty for too much of it.
+
+    Parameters
+    ----------
+    slowest : Slowest
+    model : ArmModel
+    sampling : Sampling
+    allowed : float
+        [-]
+    omega_1 : float
+        [rad/s]
+    """
+
+    def __init__(self, slowest, model, sampling, allowed, omega_1):
+        n, m, arm = model.n_joints, model.n_modes, model.arm
+        counts = np.array([j.encoder_counts for j in arm.joints], float)
+        with np.errstate(divide="ignore"):
+            joint = np.where(counts > 0, 2.0 * np.pi / counts / np.sqrt(12.0), ENCODER_NOISE)
+        modal = np.zeros(m)
+        if m:
+            map_ = StrainMap(model)
+            strain = np.array([g.uncertainty or STRAIN_NOISE for g in arm.gauges])
+            modal = np.linalg.norm(map_.inverse * strain, axis=1)
+        sigma = np.zeros(3 * n + 2 * m)
+        sigma[:n], sigma[3 * n : 3 * n + m] = joint, modal
+        sigma[n : 2 * n] = joint * _of_rate(sampling.joint_corner, sampling.period)
+        sigma[3 * n + m :] = modal * _of_rate(sampling.modal_corner, sampling.period)
+        limit, inertia = arm.torque_limits, np.diag(model.terms(np.zeros(n), np.zeros(n)).M)[:n]
+        limit = np.where(np.isfinite(limit), limit, inertia * omega_1**2)
+        self._share = sigma / limit[:, None]
+        self._slowest, self._allowed = slowest, allowed
+
+    def shares(self, K):
+        """Rms torque of the noise over the limit, (n,) [-]."""
+        return np.linalg.norm(K * self._share, axis=1)
+
+    def __call__(self, x):
+        """The penalty of scaled gains, and its gradient."""
+        K = self._slowest.gains(x)
+        shares = self.shares(K)
+        over = np.maximum(np.log(np.maximum(shares, 1e-300) / self._allowed), 0.0)
+        slope = np.zeros_like(K)
+        for i in np.flatnonzero(over > 0.0):
+            slope[i] = 2.0 * over[i] / shares[i] ** 2 * K[i] * self._share[i] ** 2
+        return float(over @ over), (slope * self._slowest.scale)[self._slowest.free]
+
+
+def _of_rate(corner, period):
+    """Noise of a filtered derivative over that of the signal [1/s]."""
+    keep = np.exp(-corner * period)
+    return (1.0 - keep) / period * np.sqrt(2.0 / (1.0 + keep))

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The set of loops that a design is for: what may differ from the arm file, and where the arm is."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import qmc
+
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.errors import DesignError, ModelError
+from flexarm_dynamics.models.model import build
+
+from .loop import sampled_loop
+
+#: Configurations are drawn within this of straight [rad].
+WORKSPACE = 1.3
+#: Damping ratio that every mode is taken to have at least [-].
+LEAST_DAMPING = 1e-4
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the design holds for.
+
+    Attributes
+    ----------
+    payload, stiffness, damping : (float, float)
+        Least and greatest factor of what the file says [-].
+    gain : (float, float)
+        Of the torque on its way to the arm [-].
+    delay : float
+        So much later than the stated delay a torque may come, in periods [-].
+    """
+
+    payload: tuple = (0.7, 1.3)
+    stiffness: tuple = (0.9, 1.1)
+    damping: tuple = (0.3, 3.0)
+    gain: tuple = (0.8, 1.25)
+    delay: float = 0.5
+
+
+def lowest(model):
+    """Lowest bending frequency with straight, locked joints, omega_1 [rad/s]; 10 for a rigid arm."""
+    return float(model.frequencies(locked=True)[0]) if model.n_modes else 10.0
+
+
+def configurations(arm, seed=0):
+    """Configurations to design for, (k, n) [rad]: straight, and drawn evenly from the position limits."""
+    n = len(arm.joints)
+    low, high = np.clip(arm.position_limits, -WORKSPACE, WORKSPACE).T
+    middle = np.clip(0.0, low, high)
+    if n == 1:
+        return (
+            np.array([middle, 0.8 * low + 0.2 * middle, 0.8 * high + 0.2 * middle])
+            if any(arm.gravity)
+            else middle[None]
+        )
+    drawn = qmc.scale(
+        qmc.Halton(n, seed=seed).random(4 if n == 2 else 5), low, np.maximum(high, low + 1e-9)
+    )
+    if n > 1:
+        drawn[0] = 0.9 * middle + 0.1 * high
+    return drawn
+
+
+def resting(model, at):
+    """Those of the configurations in which the arm rests under gravity."""
+    kept, why = [], None
+    for q in np.atleast_2d(np.asarray(at, float)):
+        try:
+            model.static_deflection(q)
+            kept.append(q)
+        except ModelError as error:
+            why = error
+    if not kept:
+        raise DesignError(
+            f"no configuration to design for, of {len(at)}: {why}",
+            field=f"arm {model.arm.name}",
+            hint="give configurations in which it rests",
+        )
+    return np.array(kept)
+
+
+def richer(arm):
+    """The arm with one mode more in each direction of each link; itself where shapes are measured or given."""
+    if arm.model != "chain":
+        return arm
+    links = tuple(
+        replace(
+            link,
+            flexible={
+                d: f if f.shape == "from_frequencies" else replace(f, modes=f.modes + 1)
+                for d, f in link.flexible.items()
+            },
+        )
+        for link in arm.links
+    )
+    return replace(arm, links=links)
+
+
+def uncertain_loops(nominal, at, sampling, uncertainty):
+    """The set of loops that a design is for.
+
+    In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
+    less gain, one that is later, and one whose joint speeds are measured.
+    """
+    (p0, p1), (k0, k1), (d0, _) = uncertainty.payload, uncertainty.stiffness, uncertainty.damping
+    arm = richer(nominal.arm)
+    plants = {
+        f"payload x {p:g}, stiffness x {k:g}": build(scaled(arm, p, k, d0))
+        for p, k in ((1.0, 1.0), (p1, k0), (p0, k1))
+    }
+    stated = next(iter(plants.values()))
+    out = []
+    for i, q in enumerate(at):
+        for name, plant in plants.items():
+            try:
+                out.append(
+                    sampled_loop(
+                        nominal, plant, q, sampling, name=f"{name}, at configuration {i + 1}"
+                    )
+                )
+            except ModelError:  # heavier than what rests there
+                continue
+    for gain in uncertainty.gain:
+        out.append(sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}"))
+    later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
+    out.append(
+        sampled_loop(nominal, stated, at[0], later, name=f"delay {1e3 * later.delay:.3g} ms")
+    )
+    measured = replace(sampling, joint_corner=1e6)
+    out.append(sampled_loop(nominal, stated, at[0], measured, name="joint speeds measured"))
+    return out
+
+
+def reach(model, at, late):
+    """Frequency up to which a torque that is `late` [s] can do something about a mode, omega_c [rad/s].
+
+    The delay turns a torque by omega times it: by one radian at most. Above one and a half times the controller's own
+    stiffest mode it knows none.
+    """
+    if not model.n_modes:
+        return 1.0 / late
+    return min(1.0 / late, 1.5 * max(float(model.frequencies(q)[-1]) for q in at))
+
+
+def own_damping(arm, uncertainty):
+    """Least damping ratio of the arm's modes, as far as it is uncertain [-]."""
+    stated = [d for link in arm.links for f in link.flexible.values() for d in f.damping]
+    return max(uncertainty.damping[0] * min(stated, default=0.0), LEAST_DAMPING)

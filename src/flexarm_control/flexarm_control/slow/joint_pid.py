@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Stiffness, damping and integral of each joint about the rigid arm's torque on the reference.
+
+.. math::
+    \bar u = B^{-1}(x_{ref})\,[\ddot q_{ref} - a(x_{ref})] + K_q e + K_{\dot q}\dot e + w, \qquad
+    \dot w = K_w e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
+
+with diagonal gains in torque per angle: the slow law that `flexarm design` makes gains for, together with a constant
+feedback of the deflections (`fast.type: fixed_gain`) on the manifold of the reference. Gains of (13) multiply the
+inertia of the arm file; these do not, so that what is designed for an uncertain arm does not change with what the
+file says. The integral leaves no error at rest under a payload, friction or weight that the file does not have. On a
+motion that the model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is
+beyond the joint's.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.parameters import parameter
+from flexarm_dynamics.singular_perturbation import slow_torque
+
+from .base import SlowLaw
+
+
+class JointPid(SlowLaw):
+    """PID of each joint about the model's torque; see the module.
+
+    Attributes
+    ----------
+    integral : ndarray, shape (n,)
+        w [N m].
+    """
+
+    separate = True
+
+    PARAMETERS = (
+        parameter("stiffness", [0.0], "N m/rad", 0.0, 1e9, length="joints").described(
+            "K_q of joint_pid: torque per joint error."
+        ),
+        parameter("damping", [0.0], "N m s/rad", -1e9, 1e9, length="joints").described(
+            "K_qd of joint_pid: torque per error of the joint's speed."
+        ),
+        parameter("integral", [0.0], "N m/(rad s)", 0.0, 1e9, length="joints").described(
+            "K_w of joint_pid: torque per integrated joint error; 0.0: none."
+        ),
+        parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
+            "Largest torque of joint_pid's integral; 0.0: the torque limit."
+        ),
+    )
+
+    def __init__(self, model, parameters):
+        super().__init__(model, parameters)
+        self.stiffness, self.damping, self.gain, most = (
+            np.array(self.parameters[name])
+            for name in ("stiffness", "damping", "integral", "integral_torque")
+        )
+        self._limit = model.arm.torque_limits
+        self._most = np.where(most > 0.0, most, self._limit)
+        n = model.n_joints
+        self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._known = b"", np.zeros(n)
+
+    def reset(self):
+        for state in (self.integral, self._error, self._beyond):
+            state[:] = 0.0
+
+    def resume(self, other):
+        if isinstance(other, JointPid):
+            np.clip(other.integral, -self._most, self._most, out=self.integral)
+            self.integral *= self.gain > 0.0
+
+    def advance(self, dt):
+        # Where the torque is at its limit, an error that pushes farther has nothing to gain.
+        grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
+        self.integral += dt * self.gain * grows
+        np.clip(self.integral, -self._most, self._most, out=self.integral)
+
+    def torque(self, q, qd, reference, terms):
+        return self._on(reference) + self.feedback(q, qd, reference)
+
+    def feedback(self, q, qd, motion):
+        np.subtract(motion.position, q, out=self._error)
+        u = self.stiffness * self._error
+        u += self.damping * (motion.velocity - qd)
+        u += self.integral
+        return u
+
+    def saw(self, torque):
+        self._beyond[:] = np.sign(torque) * (np.abs(torque) > self._limit)
+
+    def _on(self, reference):
+        """The rigid arm's torque on the reference, shape (n,) [N m]; what was asked for last is remembered."""
+        motion = reference.position, reference.velocity, reference.acceleration
+        key = b"".join(x.tobytes() for x in motion)
+        if key != self._known[0]:
+            terms = self.model.terms(*motion[:2])
+            self._known = key, np.array(slow_torque(terms, motion[2]))
+        return self._known[1]

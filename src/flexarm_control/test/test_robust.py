@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Designs for uncertain arms: the sampled loop is the real one, its gradient is right, and what is promised holds."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexarm_control.composite.assembly import control, flat
+from flexarm_control.composite.full_order import closed_loop
+from flexarm_control.robust.card import card
+from flexarm_control.robust.decay import Slowest, Wanted, eigenvalues, gradient
+from flexarm_control.robust.design import Settings, design, units
+from flexarm_control.robust.loop import Sampling, sampled_loop
+from flexarm_control.robust.nonsmooth import minimise
+from flexarm_control.robust.uncertain import Uncertainty, configurations, reach, resting, richer
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import DesignError, ModelError
+from flexarm_dynamics.linear import linear_plant, sampled
+from flexarm_dynamics.models.model import build
+
+QUICK = Settings(rate=500.0, delay=0.002, effort=0.2)
+FAST = 1e9  # a corner at which a filtered derivative is a difference
+
+
+@pytest.fixture(scope="module")
+def two_link():
+    return build(arm_file.load("two_link"))
+
+
+def test_without_filters_integral_and_delay_the_loop_is_that_of_full_state_feedback(two_link):
+    # Differences of the last two samples in place of speeds: the plant's own, sample by sample.
+    q, h = np.array([0.0, 0.7]), 1e-3
+    loop = sampled_loop(two_link, two_link, q, Sampling(h, 0.0, FAST, FAST))
+    n, m = 2, 4
+    draw = np.random.default_rng(1)
+    K = draw.standard_normal((n, 3 * n + 2 * m))
+    Phi, Gamma = sampled(*linear_plant(two_link, q, coulomb=False), h)
+    s, last, w = draw.standard_normal(12), draw.standard_normal(6), np.zeros(2)
+    X = np.concatenate([s, last, np.zeros(6), w])
+    for _ in range(5):
+        y = s[:6]
+        rate = (y - last) / h
+        w = w - h * last[:2]
+        u = -K @ np.concatenate([y[:2], rate[:2], -w, y[2:], rate[2:]])
+        s, last = Phi @ s + Gamma @ u, y
+        X = (loop.F - loop.G @ K @ loop.N) @ X
+        assert_allclose(X[:12], s, rtol=1e-9, atol=1e-9 * np.abs(s).max())
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-3, 1.4e-3, 2e-3])
+def test_the_delay_is_that_of_the_full_order_loop(two_link, delay):
+    # Against the composite control's own loop, with the same gains of positions and amplitudes.
+    q, h, n, m = np.array([0.0, 0.7]), 1e-3, 2, 4
+    stiffness, gain = [3.0, 1.0], np.zeros((n, 2 * m))
+    gain[:, :m] = 0.5
+    law = control(
+        two_link,
+        flat(
+            {
+                "slow": {"type": "joint_pid", "stiffness": stiffness, "damping": [0.0, 0.0]},
+                "fast": {"type": "fixed_gain", "gain": gain.ravel().tolist()},
+                "manifold": {"type": "reference"},
+                "feedforward": "none",
+                "stability_margin": -1e3,
+            }
+        ),
+    )
+    K = np.zeros((n, 3 * n + 2 * m))
+    K[:, :n], K[:, 3 * n :] = np.diag(stiffness), -gain
+    loop = sampled_loop(two_link, two_link, q, Sampling(h, delay, 10.0, 10.0))
+    mine = np.linalg.eigvals(loop.F - loop.G @ K @ loop.N)
+    theirs = np.linalg.eigvals(closed_loop(law, q, h, delay))
+    for z in theirs[np.abs(theirs) > 1e-6]:
+        assert np.abs(mine - z).min() < 1e-6
+
+
+def test_gradients_are_those_of_differences(two_link):
+    q = np.array([0.0, 0.7])
+    loop = sampled_loop(two_link, two_link, q, Sampling(2e-3, 3e-3, 300.0, 200.0))
+    K = 0.1 * np.random.default_rng(2).standard_normal((2, 14))
+    closed, z = eigenvalues(loop, K)
+    step = 1e-6
+    for one in z[np.argsort(-np.abs(z))][:6]:
+        exact = gradient(loop, closed, one)
+        for a, b in ((0, 0), (1, 3), (0, 4), (1, 9), (0, 13)):
+            move = np.zeros_like(K)
+            move[a, b] = step
+
+            def real(gains, one=one):
+                near = eigenvalues(loop, gains)[1]
+                return np.log(near[np.argmin(np.abs(near - one))]).real / loop.period
+
+            difference = (real(K + move) - real(K - move)) / (2.0 * step)
+            assert_allclose(exact[a, b], difference, rtol=1e-4, atol=1e-4 * np.abs(exact).max())
+
+
+def test_the_smooth_maximum_is_just_above_the_largest_value_and_has_its_slope(two_link):
+    at = np.array([[0.0, 0.4], [0.0, 1.0]])
+    sampling = Sampling(2e-3, 2e-3, 300.0, 300.0)
+    loops = [sampled_loop(two_link, two_link, q, sampling) for q in at]
+    slowest = Slowest(loops, Wanted(2.75, 200.0, 3e-3), units(two_link, at, 2.75))
+    x = 0.05 * np.random.default_rng(3).standard_normal(slowest.free.sum())
+    function = slowest.smooth(loops, 0.05)
+    value, slope = function(x)
+    largest = slowest.worst(slowest.values(x))[0]
+    assert largest <= value < largest + 0.05 * max(1.0, abs(largest)) * np.log(60)
+    for i in (0, 3, 7, 12):
+        move = np.zeros(x.size)
+        move[i] = 1e-6
+        difference = (function(x + move)[0] - function(x - move)[0]) / 2e-6
+        assert_allclose(slope[i], difference, rtol=1e-3, atol=1e-4 * np.abs(slope).max())
+
+
+def test_a_kink_is_crossed():
+    # Nonsmooth Rosenbrock function of Lewis and Overton; its minimum is a kink.
+    def function(x):
+        kink = x[1] - x[0] ** 2
+        sign = np.sign(kink) or 1.0
+        value = 8.0 * abs(kink) + (1.0 - x[0]) ** 2
+        return value, np.array([-16.0 * sign * x[0] - 2.0 * (1.0 - x[0]), 8.0 * sign])
+
+    x, value, used = minimise(function, np.array([-1.0, 0.5]), 2000)
+    assert value < 1e-3 and used <= 2040
+    assert_allclose(x, 1.0, atol=0.05)
+
+
+def test_a_search_ends_when_it_is_good_enough():
+    def bowl(x):
+        return x @ x, 2.0 * x
+
+    assert minimise(bowl, np.full(3, 9.0), 500, lambda value: value < 1.0)[1] < 1.0
+    assert minimise(bowl, np.full(3, 0.1), 500, lambda value: value < 1.0)[2] == 1
+
+
+@pytest.fixture(scope="module")
+def designed():
+    return design(arm_file.load("R"), QUICK)
+
+
+def test_the_paper_s_arm_gets_a_third_of_its_bending_frequency_in_the_worst_case(designed):
+    assert designed.holds and designed.decay > 0.33
+    assert max(designed.noise) < 0.035
+    # The decay is that of the slowest of all loops, computed apart from the search.
+    pole = max((row[1] for row in designed.slowest), key=lambda s: s.real)
+    assert_allclose(-pole.real / designed.omega_1, designed.decay, rtol=1e-9)
+
+
+def test_a_design_is_the_same_each_time():
+    short = replace(QUICK, effort=1e-3)
+    first, again = (design(arm_file.load("R"), short).K for _ in range(2))
+    assert np.array_equal(first, again)
+
+
+def test_its_parameters_make_the_control(designed):
+    model = build(designed.arm)
+    law = control(model, {k: v for k, v in designed.parameters().items()})
+    K, n = designed.K, 1
+    assert_allclose(law.slow.stiffness, K[0, 0], rtol=1e-5)
+    assert_allclose(law.slow.gain, K[0, 2], rtol=1e-5)
+    assert_allclose(law.fast.K_f, -K[:, 3 * n :], rtol=1e-5)
+
+
+def test_the_card_ends_where_the_loop_becomes_unstable(designed):
+    bears = card(designed)
+    model, q = build(designed.arm), designed.configurations[0]
+
+    def slowest(delay):
+        late = replace(designed.sampling, delay=delay)
+        loop = sampled_loop(model, build(richer(designed.arm)), q, late)
+        return np.abs(eigenvalues(loop, designed.K)[1]).max()
+
+    assert slowest(0.99 * bears.delay) < 1.0 < slowest(1.01 * bears.delay)
+    assert bears.delay > 0.004 and bears.gain[0] < 0.5 and bears.gain[1] > 2.0
+    assert bears.payload[1] > 2.0 and bears.stiffness[0] < 0.6
+
+
+def test_a_mode_that_no_torque_reaches_is_left_to_itself():
+    arm = arm_file.load("one_link")
+    link = arm.links[0]
+    bends = {**link.flexible, "z": replace(link.flexible["y"], modes=1)}
+    link = replace(link, flexible=bends, stiffness={**link.stiffness, "z": 50.0})
+    gauge = replace(arm.gauges[0], name="side", direction="z")
+    modes = (*arm.observed_modes, f"{link.name}_z_mode1")
+    arm = replace(
+        arm,
+        links=(link,),
+        gauges=(*arm.gauges, gauge),
+        observed_modes=modes,
+        gravity=(0.0, 0.0, 0.0),
+    )
+    found = design(arm, QUICK)
+    alone = build(arm).frequencies(np.zeros(1))
+    assert found.holds and found.decay > 0.1
+    assert any(np.abs(omega / alone - 1.0).min() < 0.02 for omega in found.left)
+
+
+def test_configurations_are_within_limits_and_rest():
+    arm = arm_file.load("long_reach")
+    at = configurations(arm)
+    low, high = arm.position_limits.T
+    assert (at >= low).all() and (at <= high).all()
+    assert len(resting(build(arm), at)) >= 3
+
+
+def test_an_arm_that_rests_nowhere_is_refused_with_the_reason():
+    def folds(q):
+        raise ModelError("folds", field="joint position", value=q.tolist())
+
+    model = SimpleNamespace(static_deflection=folds, arm=SimpleNamespace(name="weak"))
+    with pytest.raises(DesignError, match=r"no configuration to design for, of 2: .*folds"):
+        resting(model, np.zeros((2, 3)))
+
+
+def test_torque_reaches_no_mode_that_turns_by_more_than_a_radian_during_the_delay(two_link):
+    at = np.array([[0.0, 0.5]])
+    assert reach(two_link, at, 0.01) == 100.0
+    assert reach(two_link, at, 1e-4) == pytest.approx(1.5 * two_link.frequencies(at[0])[-1])
+
+
+def test_the_set_holds_what_it_says(two_link):
+    assert Uncertainty().payload == (0.7, 1.3)
+    assert [f.modes for link in richer(two_link.arm).links for f in link.flexible.values()] == [
+        3,
+        3,
+    ]

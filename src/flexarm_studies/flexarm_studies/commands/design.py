@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm design``: a controller file for an arm, made for what may differ from the arm file, and what it bears."""
+
+import sys
+import time
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError, FlexarmError
+
+from .options import add_arm_arguments, angles, in_range, new_path, numbers, show
+
+#: Comments of the controller file, by the start of a parameter's name.
+COMMENTS = {
+    "rate": "[Hz] samples per second that the design is for",
+    "feedforward": "the nominal arm simulated alongside; preview: planned to end at rest",
+    "slow.type": "slow control: stiffness, damping and integral of each joint",
+    "slow.stiffness": "[N m/rad]",
+    "slow.damping": "[N m s/rad]",
+    "slow.integral": "[N m/(rad s)]",
+    "manifold.type": "deflections of the reference's motion",
+    "fast.type": "fast control: constant feedback of the deflections; none: slow control alone",
+    "fast.gain": "for each joint: modal amplitudes, then their rates",
+    "fast.configuration": "[rad] where the loop is checked",
+    "observer.type": "rates as filtered derivatives: no model that could be wrong",
+    "observer.bandwidth": "[rad/s]",
+    "observer.joint_velocity_bandwidth": "[rad/s]",
+}
+
+
+def add_arguments(parser):
+    """Arguments of ``design``."""
+    parser.description = (
+        "Designs slow law, fast law, feed-forward and observer for an arm file, so that the sampled loop holds for"
+        " all that may differ from the file, and writes a controller file for the nodes."
+    )
+    parser.epilog = "example: flexarm design my_arm.yaml --payload 0.5:1.5 --rate 500 --delay 0.002 --out my.yaml"
+    add = parser.add_argument
+    add_arm_arguments(parser, "the design and what it bears as JSON")
+    add("--out", metavar="FILE", help="controller file to write; not given: printed")
+    add("--rate", type=float, default=1000.0, help="samples per second (1000)")
+    add("--delay", type=float, metavar="S", help="from a sample to its torque (one period) [s]")
+    for name, default in (
+        ("payload", "0.7:1.3"),
+        ("stiffness", "0.9:1.1"),
+        ("damping", "0.3:3"),
+        ("gain", "0.8:1.25"),
+    ):
+        add(
+            f"--{name}",
+            default=default,
+            metavar="LEAST:MOST",
+            help=f"factors of the file's ({default})",
+        )
+    add(
+        "--speed",
+        type=float,
+        default=1.0,
+        help="0 to 1: less asks less decay, makes less noise (1)",
+    )
+    add(
+        "--at",
+        action="append",
+        metavar="Q1,Q2,...",
+        help="configuration to design for [rad]; may be repeated (drawn from the position limits)",
+    )
+    add("--effort", type=float, default=1.0, help="of the search, 0.1 to 100 (1)")
+
+
+def design(options):
+    """Run ``design``."""
+    from flexarm_control.robust.card import card
+    from flexarm_control.robust.design import Settings
+    from flexarm_control.robust.design import design as find
+    from flexarm_control.robust.uncertain import Uncertainty
+    from flexarm_dynamics.arm import arm_file
+
+    arm = arm_file.load(options.arm)
+    out = None if options.out is None else new_path(options.out, "--out")
+    rate = in_range("--rate", options.rate, 10.0, 20000.0)
+    delay = 1.0 / rate if options.delay is None else in_range("--delay", options.delay, 0.0, 0.1)
+    at = tuple(tuple(angles(text, arm, "--at").tolist()) for text in options.at or ())
+    settings = Settings(
+        rate=rate,
+        delay=delay,
+        speed=in_range("--speed", options.speed, 0.0, 1.0),
+        effort=in_range("--effort", options.effort, 0.1, 100.0),
+        configurations=at,
+    )
+    uncertainty = Uncertainty(
+        *(
+            _factors(f"--{k}", getattr(options, k))
+            for k in ("payload", "stiffness", "damping", "gain")
+        )
+    )
+    begin = time.monotonic()
+
+    def progress(fraction, decay):
+        print(
+            f"{100.0 * fraction:3.0f} %, {time.monotonic() - begin:.0f} s: slowest decay {decay:.3f} omega_1",
+            file=sys.stderr,
+        )
+
+    found = find(arm, settings, uncertainty, progress)
+    if not found.holds:
+        raise DesignError(
+            in_the_way(found), field=f"controller of {arm.name}", hint=what_helps(found)
+        )
+    bears = card(found)
+    text = controller_file(options.arm, found, card_lines(found, bears))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text, encoding="utf-8")
+    result = {
+        "parameters": found.parameters(),
+        "decay": found.decay,
+        "omega_1_rad_s": found.omega_1,
+        "slowest": [
+            {"loop": name, "pole": [s.real, s.imag], "value": v} for name, s, v in found.slowest
+        ],
+        "left_rad_s": list(found.left),
+        "noise": list(found.noise),
+        "gain": list(bears.gain),
+        "payload": list(bears.payload),
+        "stiffness": list(bears.stiffness),
+        "delay_s": bears.delay,
+        "damping": bears.damping,
+        "settling_s": bears.settling,
+    }
+    lines = card_lines(found, bears)
+    lines += ["", f"written to {out}" if out else text]
+    show(options, result, lines, default=float)
+    return 0
+
+
+def _factors(option, text):
+    values = numbers(option, text, ":")
+    if len(values) != 2 or not 0.0 < values[0] <= 1.0 <= values[1]:
+        hint = "write LEAST:MOST with 0 < LEAST <= 1 <= MOST"
+        raise FlexarmError("is no range of factors", field=option, value=text, hint=hint)
+    return tuple(values)
+
+
+def card_lines(found, bears):
+    """What a design was found to do, in words."""
+    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    hertz = found.omega_1 / (2.0 * np.pi)
+    lines = [
+        f"{found.arm.name}: first frequency with the joints locked {hertz:.3g} Hz; {len(found.slowest)} loops at"
+        f" {len(found.configurations)} configurations, {found.settings.rate:g} Hz, delay"
+        f" {1e3 * found.settings.delay:.3g} ms",
+        f"  worst decay         {-pole.real:.3g} 1/s ({found.decay:.2f} of what is asked): {name}",
+        f"  expected settling   {bears.settling:.2g} s to 2 %, in the worst of these loops",
+        f"  damping ratio       {bears.damping:.2g} at least, with the file's numbers",
+        f"  bears gain          x {_span(bears.gain)}",
+        f"  bears payload       x {_span(bears.payload)}",
+        f"  bears stiffness     x {_span(bears.stiffness)}",
+        f"  bears delay         {_number(1e3 * bears.delay)} ms",
+        f"  noise in the torque {', '.join(f'{100.0 * share:.2g} %' for share in found.noise)} of the limit, rms",
+    ]
+    if found.left:
+        listed = ", ".join(f"{omega / (2.0 * np.pi):.3g} Hz" for omega in found.left)
+        lines.append(
+            f"  left to themselves  {listed}: no torque reaches these modes, or no gauge sees them"
+        )
+    return lines
+
+
+def _number(value):
+    return "any" if not np.isfinite(value) else f"{value:.3g}"
+
+
+def _span(limits):
+    low, high = limits
+    return f"{low:.2g} to {'any' if not np.isfinite(high) else f'{high:.2g}'}"
+
+
+def in_the_way(found):
+    """Which loop no gains were found for, and by which pole, in words."""
+    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    return (
+        f"no gains hold all of it: the best found lets a pole at {abs(pole) / (2.0 * np.pi):.3g} Hz grow at"
+        f" {pole.real:.3g} 1/s with {name}"
+    )
+
+
+def what_helps(found):
+    """What to try, for the slowest pole of a design that does not hold."""
+    _, pole, _ = max(found.slowest, key=lambda row: row[2])
+    if abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period) > 0.5:
+        return (
+            "sample faster or shorten the delay: this pole is too fast for the loop; a rotor_inertia in the arm file"
+            " slows it"
+        )
+    if any(found.arm.gravity) and abs(pole) < found.omega_1:
+        return (
+            "narrow --payload or the configurations (--at): gravity turns the arm over faster than its bending lets the"
+            " joints hold"
+        )
+    return "narrow --payload and --stiffness, give the configurations that the arm moves in (--at), or --effort 5"
+
+
+def controller_file(arm, found, lines):
+    """Text of the nodes' parameter file."""
+    out = ["# Controller made by flexarm design. What it was found to do:"]
+    out += [f"# {line}" for line in lines]
+    out += ["/**:", "  ros__parameters:", f"    arm: {arm}"]
+    section = None
+    for name, value in found.parameters().items():
+        head, _, rest = name.rpartition(".")
+        if head != section and head:
+            out.append(f"    {head}:")
+        section = head
+        indent = "      " if head else "    "
+        comment = COMMENTS.get(name)
+        text = _yaml(value)
+        out.append(f"{indent}{rest}: {text}" + (f"  # {comment}" if comment else ""))
+    return "\n".join(out) + "\n"
+
+
+def _yaml(value):
+    if isinstance(value, list):
+        return "[" + ", ".join(_yaml(v) for v in value) + "]"
+    if isinstance(value, float):
+        text = repr(value)
+        # YAML reads 1e-05 as a string, and ROS an integer as one.
+        if "e" in text and "." not in text.split("e")[0]:
+            text = text.replace("e", ".0e", 1)
+        return text
+    return str(value)

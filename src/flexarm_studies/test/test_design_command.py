@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm design``: its controller file is one that the loop runs from, and a design that can't hold is refused."""
+
+import re
+
+import pytest
+
+from flexarm_bringup import cli
+from flexarm_studies.commands.design import _yaml
+from flexarm_studies.loop import parameter_files
+
+
+def main(argv):
+    """Exit code of the command line."""
+    try:
+        return cli.main(argv) or 0
+    except SystemExit as ended:
+        return ended.code
+
+
+SHORT = ["--rate", "500", "--delay", "0.002", "--effort", "0.2"]
+
+
+def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys):
+    out = tmp_path / "made.yaml"
+    assert main(["design", "R", *SHORT, "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "bears payload" in said and f"written to {out}" in said
+    nodes = parameter_files.load(out)
+    controller, observer = nodes["controller"], nodes["observer"]
+    assert controller["slow.type"] == "joint_pid" and len(controller["fast.gain"]) == 4
+    assert observer["observer.type"] == "filtered_derivative"
+    motion = [
+        "--controller",
+        str(out),
+        "--trajectory",
+        "paper",
+        "--rate",
+        "500",
+        "--delay",
+        "0.002",
+    ]
+    assert main(["simulate", "R", *motion, "--payload-scale", "1.3"]) == 0
+    row = re.search(r"^joint1 +(\S+)", capsys.readouterr().out, re.M)
+    assert float(row[1]) < 0.35  # degrees; a full search gets 0.21
+    # What exists is not overwritten.
+    assert main(["design", "R", *SHORT, "--out", str(out)]) != 0
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
+    # No arm bears a torque that may be a hundredth or a hundred times what is sent.
+    wide = ["--gain", "0.01:100", "--effort", "0.1"]
+    assert main(["design", "two_link", *wide]) != 0
+    said = capsys.readouterr().err
+    assert "no gains hold all of it" in said and "gain x 100" in said and "--at" in said
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "text"),
+    [
+        ("--payload", "1.3", "no range of factors"),
+        ("--payload", "1.1:1.3", "no range of factors"),
+        ("--rate", "1", "out of range"),
+        ("--speed", "2", "out of range"),
+        ("--at", "0,1", "wrong number of angles"),
+    ],
+)
+def test_options_are_checked(capsys, option, value, text):
+    assert main(["design", "R", option, value]) != 0
+    said = capsys.readouterr().err
+    assert option in said and text in said
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1e-5, "1.0e-05"), (-2e16, "-2.0e+16"), ([0.5, 1.0], "[0.5, 1.0]"), ("R", "R")],
+)
+def test_numbers_are_floats_for_yaml_and_ros(value, text):
+    assert _yaml(value) == text
