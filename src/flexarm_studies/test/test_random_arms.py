@@ -150,6 +150,15 @@ def test_a_baseline_that_is_tuned_for_the_arm_settles_on_it_and_the_same_every_t
     assert again == found
 
 
+@pytest.mark.slow
+def test_a_designed_controller_runs():
+    case = arm_like_r()
+    setup = CONTROLLERS["designed_preview"](case)
+    assert setup.controller["feedforward"] == "preview" and setup.law is None
+    found = trial.run(case, setup, trial.VARIANTS["exact"])
+    assert "lost" not in found and "refused" not in found and found["peak_joint_error_deg"] < 5.0
+
+
 def test_a_design_that_is_refused_is_a_result():
     case = generator.arm(1, seed=5)  # a yaw joint reaches no vertical bending
     found = trial.run(case, CONTROLLERS["default"](case), trial.VARIANTS["exact"])

@@ -2,14 +2,19 @@
 """The controllers that random arms are tried with, by name; each makes its `Setup` from a `RandomArm`.
 
 ``default`` and ``preview`` are what docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm.
+``designed`` and ``designed_preview`` are what ``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay.
 The baselines are tuned for each arm.
 """
 
-from functools import partial
+from functools import lru_cache, partial
+
+from flexarm_control.robust.design import Settings, design
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import DesignError
 
 from ..loop import scenario as scenarios
 from .baselines import full_state_lqr, shaped_pid
-from .trial import Setup
+from .trial import DELAY, SLOW_RATE, Setup
 
 
 def _tutorial(feedforward, case):
@@ -17,9 +22,25 @@ def _tutorial(feedforward, case):
     return Setup(scenarios.parameters("composite", settings))
 
 
+@lru_cache(maxsize=2)
+def _design(text):
+    settings = Settings(rate=SLOW_RATE, delay=DELAY)
+    found = design(arm_file.parse(text), settings)
+    if not found.holds:
+        problem = f"no gains hold: the slowest decay found is {found.decay:.2g} of what is asked"
+        raise DesignError(problem, field=found.arm.name)
+    return found.parameters()
+
+
+def _designed(feedforward, case):
+    return Setup(_design(case.text) | {"feedforward": feedforward})
+
+
 CONTROLLERS = {
     "default": partial(_tutorial, "model"),
     "preview": partial(_tutorial, "preview"),
+    "designed": partial(_designed, "model"),
+    "designed_preview": partial(_designed, "preview"),
     "pid_zvd": partial(shaped_pid, kind="zvd"),
     "pid_ei": partial(shaped_pid, kind="ei"),
     "lqr": full_state_lqr,
