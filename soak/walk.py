@@ -62,7 +62,7 @@ SERVICES = (
     ("simulator/pause", SetBool, {"data": False}),
 )
 #: Largest change of torque from one sample to the next, and largest torque that may begin after none [of its limit].
-KICKS = {"between torques": 0.15, "after none": 0.05}
+KICKS = {"between torques": 0.02, "after none": 0.03}
 #: How often each kind of step is taken, out of 100.
 WEIGHTS = {"transition": 25, "wrong transition": 15, "service": 15, "parameters": 15, "motion": 30}
 
@@ -194,9 +194,12 @@ class Walk:
         self.counts["parameters refused"] += sum(not r.successful for r in results)
 
     def motion(self):
-        """Publish a motion, if the controller reads it."""
+        """Publish a motion that the torque limit allows, if the controller reads it.
+
+        One that asks for more changes the torque as fast as its budget allows, and would hide a kick.
+        """
         if self.state["controller"] != "unconfigured":
-            goal, time = self.random.uniform(-0.8, 0.8), self.random.uniform(0.5, 2.0)
+            goal, time = self.random.uniform(-0.8, 0.8), self.random.uniform(2.0, 4.0)
             n = len(self.joints)
             point = (time, [goal] * n, [0.0] * n, [0.0] * n)
             publisher = self.bench.publisher(harness.JointTrajectory, "joint_trajectory")
@@ -222,7 +225,8 @@ class Walk:
         self.serve(100)
         arm.recover()
         arm.wait_ready()
-        arm.offer(harness.trajectory(self.joints, (1.0, [0.3] * len(self.joints))))
+        n = len(self.joints)  # with velocity and acceleration: positions alone ask for jumps of velocity
+        arm.offer(harness.trajectory(self.joints, (2.0, [0.3] * n, [0.0] * n, [0.0] * n)))
         self.bench.wait_for(
             "a motion to its end",
             lambda: self.serve(50) or arm.state.supervisor_state == CompositeState.HOLDING,

@@ -175,6 +175,16 @@ def test_the_honest_run_is_the_scale(honest):
     assert 5e-5 < honest.strain < 1e-4
     assert abs(honest.low[0]) < 1e-3 and abs(honest.high[0] - 1.0) < 5e-3
     assert honest.static(np.zeros(1)) == 0.0
+    # Its largest change of torque is at its end, where the reference's jerk jumps: 0.3 % of the limit.
+    steps = np.abs(np.diff(honest.trace.torque[honest.trace.since(0.2)], axis=0)).max()
+    assert 0.002 * honest.limit < honest.step == steps < run.KICK * honest.limit
+
+
+def test_every_stop_of_a_motion_steps_less_than_twice_as_much_as_the_motion(honest):
+    """Near the end of the motion, and after it, the motion's own end is part of the run that is stopped."""
+    for moment in (0.75, 1.0):
+        row = run.attack(honest, lies.LIES["~/stop"], moment)
+        assert row["failed"] == [] and row["step"] < 1.1
 
 
 def test_what_holds_an_arm_against_gravity_is_no_returning_torque():

@@ -6,8 +6,9 @@ A run is compared with the honest one of the same case, `Honest`, whose motion s
 - *speed*: the largest speed of a joint over its largest in the motion, :math:`\max|\dot q_i|/\max|\dot q_i^h|`;
 - *strain*: the largest strain on a gauge over the largest in the motion; *strain under torque*: before the safe action;
 - *excursion*: how far a joint leaves the range that it passes through in the motion [rad];
-- *step*: the largest change of torque between two samples over that in the motion, of which `EDGE` is left out at
-  either end;
+- *step*: the largest change of torque between two samples over that in the motion, begin and end included: a motion
+  whose jerk jumps changes its torque most there, and so does a run that is stopped after it. A motion that kicks by
+  more than `KICK` of the torque limit is no scale beyond that;
 - *outlier*: how far the torque is from that of the honest run, as a fraction of its limit;
 - *returning*: the largest torque in the first `SOON` after an interruption, less what holds the arm against gravity,
   as a fraction of its limit;
@@ -37,8 +38,8 @@ AFTER, AT_ONCE = 3.0, 0.6
 RESTS, RESTED = 0.03, 0.3
 #: A joint's or gauge's own peak counts for at least this fraction of the largest one [-].
 MIN_SCALE = 0.1
-#: The motion's first and last part, which a feed-forward may begin and end with a step of its own [-].
-EDGE = 0.05
+#: Largest change of torque between two samples that a motion of its own may set as the scale, of its limit [-].
+KICK = 0.02
 #: Torque that returns is judged for so long [s].
 SOON = 0.02
 #: Beyond this the arm is lost [rad].
@@ -227,12 +228,10 @@ class Honest:
         self.speed = np.maximum(speed, MIN_SCALE * speed.max())
         self.strain = np.abs(trace.strain[moving]).max(initial=0.0)
         self.low, self.high = trace.position[moving].min(axis=0), trace.position[moving].max(axis=0)
-        edge = EDGE * MOTION
-        inner = (trace.time >= START + edge) & (trace.time <= START + MOTION - edge)
-        steps = np.abs(np.diff(trace.torque[inner], axis=0)).max(axis=0)
-        self.step = np.maximum(steps, MIN_SCALE * steps.max())
         limit = self.model.arm.torque_limits
         self.limit = np.where(np.isfinite(limit), limit, np.nanmax(np.abs(trace.torque[moving])))
+        steps = np.abs(np.diff(trace.torque[trace.since(START)], axis=0)).max(axis=0)
+        self.step = np.minimum(np.maximum(steps, MIN_SCALE * steps.max()), KICK * self.limit)
 
     def static(self, position):
         """What holds the arm against gravity, (n,) [N m]."""
