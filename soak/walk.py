@@ -225,7 +225,8 @@ class Walk:
         self.serve(100)
         arm.recover()
         arm.wait_ready()
-        n = len(self.joints)  # with velocity and acceleration: positions alone ask for jumps of velocity
+        # With velocity and acceleration: positions alone ask for jumps of velocity.
+        n = len(self.joints)
         arm.offer(harness.trajectory(self.joints, (2.0, [0.3] * n, [0.0] * n, [0.0] * n)))
         self.bench.wait_for(
             "a motion to its end",
