@@ -8,7 +8,6 @@ import pytest
 
 from flexarm_control.observers.plausibility.agreement import Agreement
 from flexarm_control.observers.plausibility.channels import Channels
-from flexarm_control.observers.plausibility.jumps import Jumps
 from flexarm_control.observers.plausibility.low_pass import LowPass
 from flexarm_control.observers.plausibility.strain_law import StrainLaw
 from flexarm_control.observers.plausibility.zero_drift import CORRECTED, SLOW
@@ -218,7 +217,7 @@ def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
     assert found == {None, 0}
 
 
-# --------------------------------------------------------------------------- rates, jumps
+# --------------------------------------------------------------------------- rates
 
 
 def channels():
@@ -251,25 +250,3 @@ def test_a_velocity_that_its_source_has_filtered_is_not_wrong():
         late += (1.0 - np.exp(-PERIOD / 0.004)) * (true - late)
         value[c.position], value[c.velocity] = (1.0 - np.cos(3.0 * t)) / 6.0, late
         assert agreement.update(value.copy(), PERIOD, 0.0) is None
-
-
-def test_a_link_that_swings_does_not_jump_at_a_low_rate():
-    """200 Hz, the second mode of R at 14 Hz: after each turn of its curvature a line misses it again."""
-    c, period = channels(), 0.005
-    jumps, random, found = Jumps(c), np.random.default_rng(2), 0
-    value, last = np.full(c.size, np.nan), 0.0
-    for k in range(1, 2000):
-        t = period * k
-        if random.random() < 0.2:
-            continue  # lost
-        value[c.position] = 0.0
-        value[c.strain] = [3e-5 * np.sin(87.2 * t), -1e-4 * np.sin(87.2 * t)]
-        value[c.strain] += NOISE * random.standard_normal(2)
-        outliers, lasting = jumps.judge(
-            value, np.ones(1), t - last, max(round((t - last) / period), 1)
-        )
-        found += (outliers is not None and outliers.size) or 0
-        assert lasting is None
-        jumps.take(value, t)
-        last = t
-    assert found == 0

@@ -9,12 +9,10 @@ With the time h to the last sample and T the baseline of the slope s, :math:`\rh
 
 for the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest deviation of late from the
 mean period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for
-rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so, or in the last ten samples if
-that is longer: a motion that has begun may go on. (The curvature of a link that swings is zero twice in a period;
-where samples are far apart, that of the last half period has to be remembered.) A torque that is unknown, or zero on
-every joint, so that brakes may act, stands for a step of the largest torque; so do lost samples, for the links, and
-for `UNREPORTED` of it for the joints. The noise is the larger of what `channels` has and the rms of r so far. The
-first `LEARNT` samples are not judged.
+rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so: a motion that has begun may
+go on. A torque that is unknown, or zero on every joint, so that brakes may act, stands for a step of the largest
+torque; so do lost samples, for the links, and for `UNREPORTED` of it for the joints. The noise is the larger of
+what `channels` has and the rms of r so far. The first `LEARNT` samples are not judged.
 
 A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump is real.
 """
@@ -29,8 +27,6 @@ LEARNT = 50
 DEVIATIONS, GROWTH = 6.0, 2.0
 #: Time in which an excess is forgotten, and one bridged reading [s].
 EXCESS_TIME, RARE_TIME = 0.02, 1.0
-#: The first lasts so many samples at least.
-EXCESS_SAMPLES = 10
 #: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
 FREQUENT = 8.0
 #: Over more lost samples in a row the deflections can't be extrapolated.
@@ -222,7 +218,7 @@ class Jumps:
         residual /= self._scale
         if self._outliers is not None:
             residual[self._outliers] = 0.0
-        self._excess *= np.exp(-dt / max(EXCESS_TIME, EXCESS_SAMPLES * self.period))
+        self._excess *= np.exp(-dt / EXCESS_TIME)
         np.maximum(self._excess, residual, out=self._excess)
         if self._grace.any():
             self._grace[self._grace > 0] -= 1
