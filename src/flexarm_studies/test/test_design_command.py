@@ -24,8 +24,8 @@ SHORT = ["--rate", "500", "--delay", "0.002", "--effort", "0.2"]
 def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys):
     out = tmp_path / "made.yaml"
     assert main(["design", "R", *SHORT, "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "bears payload" in said and f"written to {out}" in said
+    printed = capsys.readouterr().out
+    assert "bears payload" in printed and f"written to {out}" in printed
     nodes = parameter_files.load(out)
     controller, observer = nodes["controller"], nodes["observer"]
     assert controller["slow.type"] == "joint_pid" and len(controller["fast.gain"]) == 4
@@ -52,8 +52,12 @@ def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
     # No arm bears a torque that may be a hundredth or a hundred times what is sent.
     wide = ["--gain", "0.01:100", "--effort", "0.1"]
     assert main(["design", "two_link", *wide]) != 0
-    said = capsys.readouterr().err
-    assert "no gains hold all of it" in said and "gain x 100" in said and "sample faster" in said
+    printed = capsys.readouterr().err
+    assert (
+        "no gains hold all of it" in printed
+        and "gain x 100" in printed
+        and "sample faster" in printed
+    )
 
 
 @pytest.mark.parametrize(
@@ -68,8 +72,8 @@ def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
 )
 def test_options_are_checked(capsys, option, value, text):
     assert main(["design", "R", option, value]) != 0
-    said = capsys.readouterr().err
-    assert option in said and text in said
+    printed = capsys.readouterr().err
+    assert option in printed and text in printed
 
 
 @pytest.mark.parametrize(

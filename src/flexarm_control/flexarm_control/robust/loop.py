@@ -54,7 +54,8 @@ def measured_amplitudes(nominal, plant):
 def sampled_loop(nominal, plant, q, sampling, gain=1.0, name=""):
     """The `Loop` of a `plant` at rest in q (n,) [rad] under a control that knows the `nominal` model.
 
-    `gain` is that of the torque on its way to the arm [-].
+    `sampling` has the interval, the delay and the corners of the filters, `gain` is that of the torque on its way to
+    the arm [-], and `name` is for reports.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
     A, B = linear_plant(plant, np.asarray(q, float), coulomb=False)

@@ -12,7 +12,7 @@ import numpy as np
 DECREASE, CURVATURE = 1e-4, 0.5
 #: Bisections of one line search, and the shortest step.
 BISECTIONS, SHORTEST = 40, 1e-9
-#: A search ends when so many steps have brought less than this share of the value.
+#: A search ends when so many steps have brought less than this fraction of the value.
 STALE, LITTLE = 30, 1e-3
 
 

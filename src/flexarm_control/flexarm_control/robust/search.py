@@ -129,14 +129,14 @@ def start(model, at, scale, a, late):
     """Gains of joints alone with a natural frequency of a omega_1, as far as a torque that is `late` [s] allows.
 
     What a torque moves at first is not the arm but the inertia that is left when the links bend, 1 / H_ii with H the
-    inverse of the mass matrix: K_qd H_ii late is kept below a third.
+    inverse of the mass matrix: K_qd H_ii late is kept below a third. `scale` (n, N) has what each gain is measured in.
     """
     K, n = np.zeros_like(scale), scale.shape[0]
     H = np.max([np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n] for q in at], axis=0)
     for i in range(n):
         damping = scale[i, n + i] * 2.0 * a
-        share = min(1.0, 1.0 / (3.0 * H[i] * late) / damping)
-        K[i, n + i] = share * damping
-        K[i, i] = share * scale[i, i] * a**2 * 2.0
-        K[i, 2 * n + i] = share * scale[i, 2 * n + i] * 0.3 * a**3
+        fraction = min(1.0, 1.0 / (3.0 * H[i] * late) / damping)
+        K[i, n + i] = fraction * damping
+        K[i, i] = fraction * scale[i, i] * a**2 * 2.0
+        K[i, 2 * n + i] = fraction * scale[i, 2 * n + i] * 0.3 * a**3
     return K

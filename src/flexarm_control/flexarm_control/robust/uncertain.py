@@ -15,7 +15,7 @@ from .loop import sampled_loop
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
 #: Damping ratio that every mode is taken to have at least [-].
-LEAST_DAMPING = 1e-4
+MIN_DAMPING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,10 @@ def richer(arm):
 
 
 def uncertain_loops(nominal, at, sampling, uncertainty):
-    """The set of loops that a design is for.
+    """The set of loops that a design for an `uncertainty` of the `nominal` model is for, sampled as `sampling` has it.
 
-    In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
-    less gain, one that is later, and one whose joint speeds are measured.
+    In each configuration of `at` the softest, the stated and the stiffest arm; in the first one a loop with more and
+    one with less gain, one that is later, and one whose joint speeds are measured.
     """
     (p0, p1), (k0, k1), (d0, _) = uncertainty.payload, uncertainty.stiffness, uncertainty.damping
     arm = richer(nominal.arm)
@@ -147,4 +147,4 @@ def reach(model, at, late):
 def own_damping(arm, uncertainty):
     """Least damping ratio of the arm's modes, as far as it is uncertain [-]."""
     stated = [d for link in arm.links for f in link.flexible.values() for d in f.damping]
-    return max(uncertainty.damping[0] * min(stated, default=0.0), LEAST_DAMPING)
+    return max(uncertainty.damping[0] * min(stated, default=0.0), MIN_DAMPING)

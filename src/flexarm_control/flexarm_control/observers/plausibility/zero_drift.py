@@ -23,7 +23,7 @@ A zero that drifts at the rate v is found when it has left its bound b by :math:
 .. math:: t = b/v + \tau + 3/\omega_f ,
 
 with the corner :math:`\omega_f` of the law's low pass; so no later than :math:`\tau + 3/\omega_f` after it has left the
-bound, at any rate. A drift that stays within it can't be told from another payload. From then on r less its zero is
+bound, at any rate. A drift that stays within it looks the same as another payload. From then on r less its zero is
 taken from the reading, late by `CORRECTED` + :math:`3/\omega_f`: what is left of a drift is v times that.
 
 When all residuals together are what a wrong acceleration of one joint makes, :math:`r = R K_2^{-1}M_{21}a`, its
