@@ -2,6 +2,7 @@
 """The feed-forward that simulates the nominal arm: no step of its torque, whatever the reference's jerk does."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,11 @@ from numpy.testing import assert_allclose
 from flexarm_control import trajectory
 from flexarm_control.composite.design import design
 from flexarm_control.fading import Fading
+from flexarm_control.feedforward.model import regulator
 from flexarm_control.trajectory import ReferenceGenerator
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.linear import linear_plant
+from flexarm_dynamics.models.model import build
 
 MS = 1_000_000
 SLOW, FAST, CORRECTED = {"type": "linear_model_following"}, {"type": "lqr"}, {"type": "corrected"}
@@ -20,6 +25,20 @@ def faded(time, rate):
     """phi of the module, from 0 on."""
     x = rate * np.maximum(time, 0.0)
     return np.where(time < 0.0, 0.0, (1.0 + x + 0.5 * x * x) * np.exp(-x))
+
+
+def test_a_mode_that_no_torque_reaches_is_left_out_of_the_regulator():
+    arm = arm_file.load("one_link")
+    link = arm.links[0]
+    bends = {**link.flexible, "z": replace(link.flexible["y"], modes=1)}
+    link = replace(link, flexible=bends, stiffness={**link.stiffness, "z": 50.0})
+    arm = replace(arm, links=(link,), gravity=(0.0, 0.0, 0.0), gauges=(), observed_modes=())
+    both, q = build(arm), np.zeros(1)
+    A, B = linear_plant(both, q, coulomb=False)
+    closed = np.linalg.eigvals(A - B @ regulator(both, q))
+    decay = 0.3 * both.frequencies(locked=True)[0]
+    alone = closed[closed.real > -decay]
+    assert len(alone) == 2 and np.abs(np.abs(alone[0]) / both.frequencies(q) - 1.0).min() < 1e-3
 
 
 def test_jumps_add_up_and_fade_whatever_the_samples():

@@ -70,7 +70,8 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
         Of (s, the fast law's states, torques under way, newest last).
     """
     model = law.model
-    A, B = linear_plant(plant or model, np.asarray(q, float))
+    # A law that compensates Coulomb friction takes it to be as steep as at rest; to another one it is no damping.
+    A, B = linear_plant(plant or model, np.asarray(q, float), not law.slow.separate)
     B = gain * B
     n = B.shape[1]
     U, Z = linear_law(law, q)

@@ -16,7 +16,8 @@ gains that the real arm allows.
 
 The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the joint errors e alone, with
 :math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`. omega_1 is the lowest bending
-frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. If the arm's
+frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. A mode that no
+torque reaches, as the vertical bending of an arm that only yaws, is left out. If the arm's
 inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated. A
 trajectory that arrives while the arm moves is then followed on the slow manifold alone.
 
@@ -30,7 +31,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
+from scipy.linalg import null_space, solve_continuous_are
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import linear_plant, sampled
@@ -39,6 +40,7 @@ from flexarm_dynamics.models.model import build
 
 from ..arrays import clip
 from ..fading import Fading, fading_rate, lowest
+from ..fast.pole_placement import PolePlacement, reaches
 from ..trajectory.path import Path
 from ..trajectory.values import SECOND
 from .base import Feedforward
@@ -64,6 +66,8 @@ def regulator(model, q):
     Q = np.zeros(A.shape)
     inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
     Q[:n, :n] = np.diag((inertia * omega**2) ** 2)
+    V = reached(A, B)
+    A, B, Q = V.T @ A @ V, V.T @ B, V.T @ Q @ V
     try:
         P = solve_continuous_are(A + DECAY * omega * np.eye(len(A)), B, Q, np.eye(n))
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -72,7 +76,23 @@ def regulator(model, q):
             field="feedforward model",
             hint="set feedforward: none",
         ) from None
-    return B.T @ P
+    return B.T @ P @ V.T
+
+
+def reached(A, B):
+    """Orthonormal directions of the state without the modes that no torque reaches, shape (N, k).
+
+    The left eigenvectors W of those modes, :math:`W A = T W` with :math:`W B = 0`, move by themselves whatever the
+    torque is; V spans the rest, :math:`W V = 0`. A gain K of (V'AV, V'B) gives A - B K V' the poles of T and of
+    V'AV - V'B K.
+    """
+    poles, vectors = np.linalg.eig(A.T)
+    bending = np.flatnonzero(poles.imag > 0.0)
+    alone = bending[reaches(A, B, poles[bending]) < PolePlacement.UNREACHED]
+    if not alone.size:
+        return np.eye(len(A))
+    W = np.vstack([vectors[:, alone].real.T, vectors[:, alone].imag.T])
+    return null_space(W)
 
 
 class Gains:

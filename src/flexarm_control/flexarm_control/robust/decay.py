@@ -4,11 +4,13 @@ r"""The slowest decay of a set of loops, and its gradient by the gains.
 Each pole :math:`s = \ln(z)/h` of each loop has the value
 
 .. math:: v = \Re s / d(|s|), \qquad d = \begin{cases}
-    \omega_1 & |s| \le \omega_c \\ \min(\omega_1, \zeta|s|) & \text{beyond,}\end{cases}
+    \omega_1\min\bigl(1, \sqrt{4\omega_1/|s|}\bigr) & |s| \le \omega_c \\
+    \min(\omega_1, \zeta|s|) & \text{beyond,}\end{cases}
 
 so that up to omega_c, where torque reaches, v is minus the decay over the lowest bending frequency omega_1 with the
-joints locked. Stiffer modes are only asked to keep a fraction of their own damping zeta. The largest v of all poles is
-what a design makes small. With the right and left eigenvectors x, y of F - G K N,
+joints locked; of modes that are much stiffer less is asked, since a motion hardly excites them. Still stiffer modes are only asked to keep a fraction of their own damping zeta, and of loops that are less likely
+a fraction of all this is asked. The largest v of all poles is what a design makes small. With the right and left
+eigenvectors x, y of F - G K N,
 
 .. math:: \frac{\partial s}{\partial K_{ab}} = -\frac{(y^HG)_a\,(Nx)_b}{h\,z\,y^Hx} .
 
@@ -25,6 +27,8 @@ from scipy.linalg import eigvals, lu_factor, lu_solve
 UNMOVED = 0.01
 #: So many poles of a loop are looked at for one that gains move.
 MOST = 12
+#: Beyond this many times omega_1 less decay is asked.
+SOFT = 4.0
 #: Poles nearer to the origin of the z plane are those of delays and filters.
 DEAD_BEAT = 1e-6
 
@@ -37,11 +41,13 @@ class Wanted:
     omega_c: float  # [rad/s]
     zeta: float  # [-]
 
-    def decay(self, s):
-        """d of each pole [1/s]."""
-        size = np.abs(s)
+    def decay(self, s, fraction=1.0):
+        """d of each pole [1/s], of a loop of which this fraction is asked."""
+        size = np.maximum(np.abs(s), 1e-12)
+        soft = self.omega_1 * np.minimum(1.0, np.sqrt(SOFT * self.omega_1 / size))
         beyond = np.minimum(self.omega_1, self.zeta * size)
-        return np.where(size <= self.omega_c, self.omega_1, beyond)
+        # A pole that grows counts in full.
+        return np.where(s.real < 0.0, fraction, 1.0) * np.where(size <= self.omega_c, soft, beyond)
 
 
 def eigenvalues(loop, K):
@@ -99,7 +105,7 @@ class Slowest:
         for loop in self.loops if loops is None else loops:
             closed, z = eigenvalues(loop, K)
             s = np.log(z) / loop.period
-            v = s.real / self.wanted.decay(s)
+            v = s.real / self.wanted.decay(s, loop.fraction)
             order = np.argsort(-v)
             found.append((loop, closed, z[order], v[order]))
         return found
@@ -119,7 +125,9 @@ class Slowest:
         for v, k, i in candidates:
             loop, closed, z, _ = found[k]
             s = np.log(z[i]) / loop.period
-            slope = (gradient(loop, closed, z[i]) * self.scale)[self.free] / self.wanted.decay(s)
+            slope = (gradient(loop, closed, z[i]) * self.scale)[self.free] / self.wanted.decay(
+                s, loop.fraction
+            )
             if v > 1e-9 or np.linalg.norm(slope) > UNMOVED:
                 return v, slope, loop, s, unmoved
             unmoved.append((loop, s))
@@ -148,7 +156,7 @@ class Slowest:
                         if (id(loop), s) in out:
                             continue
                         g = (gradient(loop, closed, one) * self.scale)[self.free]
-                        g /= self.wanted.decay(s)
+                        g /= self.wanted.decay(s, loop.fraction)
                         if value < 0.0 and np.linalg.norm(g) < UNMOVED:
                             continue
                         weight = np.exp((value - worst) / w)

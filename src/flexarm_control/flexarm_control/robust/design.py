@@ -21,7 +21,7 @@ from flexarm_dynamics.models.model import build
 from .decay import Slowest, Wanted
 from .loop import Sampling
 from .noise import Noise
-from .search import STARTS, Search, start
+from .search import DECAYS, STARTS, Search, optimal, start
 from .uncertain import (
     Uncertainty,
     configurations,
@@ -35,7 +35,7 @@ from .uncertain import (
 #: Corner of the filtered derivatives over omega_c.
 FILTER = 2.0
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
-FASTEST, NOISIEST = 0.8, 0.03
+FASTEST, NOISIEST = 0.6, 0.03
 
 
 @dataclass(frozen=True)
@@ -177,6 +177,9 @@ def design(arm, settings=None, uncertainty=None, progress=None):
     speed = max(settings.speed, 0.05)
     noise = Noise(slowest, nominal, sampling, speed * NOISIEST, omega_1)
     starts = [slowest.scaled(start(nominal, at, scale, a, late + 1.0 / corner)) for a in STARTS]
+    starts += [
+        slowest.scaled(optimal(nominal, at[len(at) // 2], omega_1, decay)) for decay in DECAYS
+    ]
     search = Search(slowest, noise, speed * FASTEST, settings.effort, settings.seed)
     x = search.best(starts, progress)
     rows, left = [], []

@@ -42,6 +42,7 @@ class Loop:
     G: np.ndarray  # (N, n)
     N: np.ndarray  # (3n + 2m, N): measurements
     period: float
+    fraction: float = 1.0  # of the decay that is asked of it [-]
 
 
 def measured_amplitudes(nominal, plant):
@@ -51,14 +52,26 @@ def measured_amplitudes(nominal, plant):
     return map_.inverse @ (gains[:, None] * gauge_rows(plant, nominal.arm.gauges))
 
 
-def sampled_loop(nominal, plant, q, sampling, gain=1.0, name=""):
+def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, coulomb=False):
     """The `Loop` of a `plant` at rest in q (n,) [rad] under a control that knows the `nominal` model.
 
-    `sampling` has the interval, the delay and the corners of the filters, `gain` is that of the torque on its way to
-    the arm [-], and `name` is for reports.
+    Parameters
+    ----------
+    nominal, plant : ArmModel
+    q : ndarray, shape (n,)
+        [rad]
+    sampling : Sampling
+    gain : float
+        Of the torque on its way to the arm [-].
+    name : str
+        Of the loop.
+    fraction : float
+        Of the decay that is asked of it [-].
+    coulomb : bool
+        With Coulomb friction as steep as at rest.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
-    A, B = linear_plant(plant, np.asarray(q, float), coulomb=False)
+    A, B = linear_plant(plant, np.asarray(q, float), coulomb)
     B = gain * B
     h, size, p = sampling.period, A.shape[0], n + m
     C = np.zeros((p, size))
@@ -110,4 +123,4 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name=""):
     N[2 * n : 3 * n] = integral
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
-    return Loop(name, F, G, N, h)
+    return Loop(name, F, G, N, h, fraction)

@@ -2,11 +2,16 @@
 """The search for the gains whose slowest pole is the fastest."""
 
 import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from flexarm_dynamics.linear import linear_plant
 
 from .nonsmooth import minimise
 
 #: Starts: natural frequency of the joints over omega_1.
 STARTS = (0.4, 0.2, 0.8, 0.1)
+#: Starts from optimal regulators: their prescribed degree of stability over omega_1.
+DECAYS = (0.1, 0.3)
 #: Weight of the gains' size against the slowest pole.
 SMALL_GAINS = 1e-6
 #: Widths of the smooth maximum, one after the other; and rounds in which a search takes up the worst loop.
@@ -129,7 +134,23 @@ def start(model, at, scale, a, late):
     """Gains of joints alone with a natural frequency of a omega_1, as far as a torque that is `late` [s] allows.
 
     What a torque moves at first is not the arm but the inertia that is left when the links bend, 1 / H_ii with H the
-    inverse of the mass matrix: K_qd H_ii late is kept below a third. `scale` (n, N) has what each gain is measured in.
+    inverse of the mass matrix: K_qd H_ii late is kept below a third.
+
+    Parameters
+    ----------
+    model : ArmModel
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    scale : ndarray, shape (n, 3n + 2m)
+        Unit of each gain.
+    a : float
+        [-]
+    late : float
+        [s]
+
+    Returns
+    -------
+    ndarray, shape (n, 3n + 2m)
     """
     K, n = np.zeros_like(scale), scale.shape[0]
     H = np.max([np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n] for q in at], axis=0)
@@ -140,3 +161,24 @@ def start(model, at, scale, a, late):
         K[i, i] = fraction * scale[i, i] * a**2 * 2.0
         K[i, 2 * n + i] = fraction * scale[i, 2 * n + i] * 0.3 * a**3
     return K
+
+
+def optimal(model, q, omega_1, decay):
+    r"""Gains of the optimal regulator of the whole arm at rest in q, without what the structure has no place for.
+
+    It minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the joint errors e with
+    :math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and alpha = `decay` omega_1.
+    """
+    n, m = model.n_joints, model.n_modes
+    A, B = linear_plant(model, q, coulomb=False)
+    inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
+    Q = np.zeros(A.shape)
+    Q[:n, :n] = np.diag((decay * inertia * omega_1**2) ** 2)
+    try:
+        P = solve_continuous_are(A + decay * omega_1 * np.eye(len(A)), B, Q, np.eye(n))
+    except (np.linalg.LinAlgError, ValueError):
+        return np.zeros((n, 3 * n + 2 * m))
+    joint, amplitude, speed, rate = np.split(B.T @ P, [n, n + m, 2 * n + m], axis=1)
+    joint, speed = np.abs(np.diag(joint)), np.diag(speed)
+    diagonal = (np.diag(k) for k in (joint, speed, 0.2 * decay * omega_1 * joint))
+    return np.hstack([*diagonal, amplitude, rate])

@@ -14,6 +14,10 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
+#: Share of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
+UNLIKELY, STICKING = 0.5, 0.05
+#: Corner of a filtered derivative that is a mere difference [rad/s].
+UNFILTERED = 1e6
 #: Damping ratio that every mode is taken to have at least [-].
 MIN_DAMPING = 1e-4
 
@@ -35,7 +39,7 @@ class Uncertainty:
     payload: tuple = (0.7, 1.3)
     stiffness: tuple = (0.9, 1.1)
     damping: tuple = (0.3, 3.0)
-    gain: tuple = (0.8, 1.25)
+    gain: tuple = (0.75, 1.33)
     delay: float = 0.5
 
 
@@ -99,10 +103,24 @@ def richer(arm):
 
 
 def uncertain_loops(nominal, at, sampling, uncertainty):
-    """The set of loops that a design for an `uncertainty` of the `nominal` model is for, sampled as `sampling` has it.
+    """The set of loops that a design is for.
 
-    In each configuration of `at` the softest, the stated and the stiffest arm; in the first one a loop with more and
-    one with less gain, one that is later, and one whose joint speeds are measured.
+    In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
+    less gain, one that is later, one without delay, and one without delay whose rates are measured. An arm with
+    Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing makes it.
+
+    Parameters
+    ----------
+    nominal : ArmModel
+        Of the arm file.
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    sampling : Sampling
+    uncertainty : Uncertainty
+
+    Returns
+    -------
+    list of Loop
     """
     (p0, p1), (k0, k1), (d0, _) = uncertainty.payload, uncertainty.stiffness, uncertainty.damping
     arm = richer(nominal.arm)
@@ -123,13 +141,25 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
             except ModelError:  # heavier than what rests there
                 continue
     for gain in uncertainty.gain:
-        out.append(sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}"))
+        out.append(
+            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}", UNLIKELY)
+        )
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
-        sampled_loop(nominal, stated, at[0], later, name=f"delay {1e3 * later.delay:.3g} ms")
+        sampled_loop(
+            nominal, stated, at[0], later, name=f"delay {1e3 * later.delay:.3g} ms", fraction=UNLIKELY
+        )
     )
-    measured = replace(sampling, joint_corner=1e6)
-    out.append(sampled_loop(nominal, stated, at[0], measured, name="joint speeds measured"))
+    sooner = replace(sampling, delay=0.0)
+    out.append(sampled_loop(nominal, stated, at[0], sooner, name="no delay", fraction=UNLIKELY))
+    measured = replace(sooner, joint_corner=UNFILTERED, modal_corner=UNFILTERED)
+    out.append(
+        sampled_loop(nominal, stated, at[0], measured, name="no delay, no filters", fraction=UNLIKELY)
+    )
+    if any(joint.friction.coulomb for joint in arm.joints):
+        for i, q in enumerate(at):
+            name = f"sticking, at configuration {i + 1}"
+            out.append(sampled_loop(nominal, stated, q, sampling, 1.0, name, STICKING, True))
     return out
 
 

@@ -44,7 +44,7 @@ def add_arguments(parser):
         ("payload", "0.7:1.3"),
         ("stiffness", "0.9:1.1"),
         ("damping", "0.3:3"),
-        ("gain", "0.8:1.25"),
+        ("gain", "0.75:1.33"),
     ):
         add(
             f"--{name}",
