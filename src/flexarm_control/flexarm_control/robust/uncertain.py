@@ -14,7 +14,7 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Share of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
+#: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
 UNLIKELY, STICKING = 0.5, 0.05
 #: Corner of a filtered derivative that is a mere difference [rad/s].
 UNFILTERED = 1e6
@@ -147,14 +147,21 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
         sampled_loop(
-            nominal, stated, at[0], later, name=f"delay {1e3 * later.delay:.3g} ms", fraction=UNLIKELY
+            nominal,
+            stated,
+            at[0],
+            later,
+            name=f"delay {1e3 * later.delay:.3g} ms",
+            fraction=UNLIKELY,
         )
     )
     sooner = replace(sampling, delay=0.0)
     out.append(sampled_loop(nominal, stated, at[0], sooner, name="no delay", fraction=UNLIKELY))
     measured = replace(sooner, joint_corner=UNFILTERED, modal_corner=UNFILTERED)
     out.append(
-        sampled_loop(nominal, stated, at[0], measured, name="no delay, no filters", fraction=UNLIKELY)
+        sampled_loop(
+            nominal, stated, at[0], measured, name="no delay, no filters", fraction=UNLIKELY
+        )
     )
     if any(joint.friction.coulomb for joint in arm.joints):
         for i, q in enumerate(at):
