@@ -2,7 +2,8 @@
 """The controllers that random arms are tried with, by name; each makes its `Setup` from a `RandomArm`.
 
 ``default`` and ``preview`` are what docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm.
-``designed`` and ``designed_preview`` are what ``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay.
+``designed`` and ``designed_preview`` are what ``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay,
+at start, middle and end of the motion, as the baselines are tuned.
 The baselines are tuned for each arm.
 """
 
@@ -13,7 +14,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
 
 from ..loop import scenario as scenarios
-from .baselines import full_state_lqr, shaped_pid
+from .baselines import full_state_lqr, shaped_pid, task_of
 from .trial import DELAY, SLOW_RATE, Setup
 
 
@@ -23,8 +24,8 @@ def _tutorial(feedforward, case):
 
 
 @lru_cache(maxsize=2)
-def _design(text):
-    settings = Settings(rate=SLOW_RATE, delay=DELAY)
+def _design(text, places):
+    settings = Settings(rate=SLOW_RATE, delay=DELAY, configurations=places)
     found = design(arm_file.parse(text), settings)
     if not found.holds:
         problem = f"no gains hold: the slowest decay found is {found.decay:.2g} of what is asked"
@@ -33,7 +34,8 @@ def _design(text):
 
 
 def _designed(feedforward, case):
-    return Setup(_design(case.text) | {"feedforward": feedforward})
+    start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
+    return Setup(_design(case.text, (middle, start, end)) | {"feedforward": feedforward})
 
 
 CONTROLLERS = {
