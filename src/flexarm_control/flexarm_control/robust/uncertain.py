@@ -16,8 +16,6 @@ from .loop import sampled_loop
 WORKSPACE = 1.3
 #: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
 UNLIKELY, STICKING = 0.5, 0.05
-#: Corner of a filtered derivative that is a mere difference [rad/s].
-UNFILTERED = 1e6
 #: Damping ratio that every mode is taken to have at least [-].
 MIN_DAMPING = 1e-4
 
@@ -106,7 +104,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     """The set of loops that a design is for.
 
     In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
-    less gain, one that is later, one without delay, and one without delay whose rates are measured. An arm with
+    less gain, one that is later, and two whose joint speeds are measured, one of them without delay. An arm with
     Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing makes it.
 
     Parameters
@@ -155,14 +153,12 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
             fraction=UNLIKELY,
         )
     )
-    sooner = replace(sampling, delay=0.0)
-    out.append(sampled_loop(nominal, stated, at[0], sooner, name="no delay", fraction=UNLIKELY))
-    measured = replace(sooner, joint_corner=UNFILTERED, modal_corner=UNFILTERED)
-    out.append(
-        sampled_loop(
-            nominal, stated, at[0], measured, name="no delay, no filters", fraction=UNLIKELY
-        )
-    )
+    measured = replace(sampling, joint_corner=np.inf)
+    name = "joint speeds measured"
+    out.append(sampled_loop(nominal, stated, at[0], measured, name=name, fraction=UNLIKELY))
+    sooner = replace(measured, delay=0.0)
+    name = "joint speeds measured, no delay"
+    out.append(sampled_loop(nominal, stated, at[0], sooner, name=name, fraction=UNLIKELY))
     if any(joint.friction.coulomb for joint in arm.joints):
         for i, q in enumerate(at):
             name = f"sticking, at configuration {i + 1}"

@@ -13,6 +13,7 @@ from .options import add_arm_arguments, angles, in_range, new_path, numbers, sho
 #: Comments of the controller file, by the start of a parameter's name.
 COMMENTS = {
     "rate": "[Hz] samples per second that the design is for",
+    "stability_margin": "[1/s] not checked again without filters and delay, for which these gains are not made",
     "feedforward": "the nominal arm simulated alongside; preview: planned to end at rest",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
