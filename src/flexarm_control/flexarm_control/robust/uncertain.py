@@ -15,7 +15,7 @@ from .loop import sampled_loop
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
 #: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
-UNLIKELY, STICKING = 0.5, 0.05
+UNLIKELY, STICKING = 0.5, 0.4
 #: Damping ratio that every mode is taken to have at least [-].
 MIN_DAMPING = 1e-4
 
