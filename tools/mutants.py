@@ -235,6 +235,12 @@ LAWS = [
             "u = np.linalg.solve(B, v)",
         ),
         (
+            "joint_pid",
+            "the integral grows beyond the torque limit",
+            "np.where(self._beyond * self._error > 0.0, 0.0, self._error)",
+            "self._error",
+        ),
+        (
             "resolved_acceleration",
             "null space: missing",
             "return y + self.damped_inverse(J) @ (b - J @ y)",
@@ -274,6 +280,12 @@ LAWS = [
             "its estimator's gain",
             "(1.0 - rho) * (Phi[m:, m:] @ inverse",
             "(1.0 + rho) * (Phi[m:, m:] @ inverse",
+        ),
+        (
+            "fixed_gain",
+            "rows and columns of the gain",
+            ".reshape(model.n_joints, 2 * model.n_modes)",
+            ".reshape(2 * model.n_modes, model.n_joints).T",
         ),
         ("scheduled_lqr", "interpolation", "for v in (1.0 - t, t)]", "for v in (t, 1.0 - t)]"),
     ),
@@ -352,7 +364,12 @@ LAWS = [
         TESTS
         + "test_look_ahead.py flexarm_control/test/test_model_feedforward.py"
         + " flexarm_studies/test/test_beyond_the_paper.py",
-        ("model", "the regulator's gain: sign", "    return B.T @ P\n", "    return -B.T @ P\n"),
+        (
+            "model",
+            "the regulator's gain: sign",
+            "    return B.T @ P @ V.T\n",
+            "    return -B.T @ P @ V.T\n",
+        ),
         (
             "model",
             "jumps of the manifold: not faded",

@@ -593,3 +593,10 @@ def test_over_a_gap_too_long_to_tell_the_rates_it_predicts_and_gives_up_when_all
     with pytest.raises(DesignError, match=r"0\.035 s between samples.*link1_y_mode2"):
         for _ in range(law.BLIND):
             law.advance(0.035)
+
+
+def test_a_gain_that_is_given_is_read_row_by_row(two_link):
+    numbers = np.arange(16.0)
+    law = design_law(FAST, "fixed_gain", two_link, {"gain": numbers.tolist()})
+    z = np.linspace(-1.0, 1.0, 8)
+    assert_allclose(law.torque(z, np.zeros(2)), [numbers[:8] @ z, numbers[8:] @ z], rtol=1e-13)

@@ -62,7 +62,7 @@ class Judged:
     def __init__(self, change, plant=None, begin=1.0, seconds=3.0, **motion):
         m = models.build(known_arm())
         self.map = StrainMap(m)
-        self.law = StrainLaw(Channels(m, self.map), self.map)
+        self.law = StrainLaw(Channels(m, self.map), self.map, 0.3)
         self.drifting = self.wiring = None
         position, strain = readings(plant or known_arm(), seconds, **motion)
         for k, (q, e) in enumerate(zip(position, strain, strict=True)):
@@ -164,7 +164,7 @@ def test_an_encoder_that_begins_to_drift_is_named_with_the_strains():
 def test_a_gap_keeps_the_zero_and_forgets_the_motion():
     m = models.build(known_arm())
     map_ = StrainMap(m)
-    law = StrainLaw(Channels(m, map_), map_)
+    law = StrainLaw(Channels(m, map_), map_, 0.3)
     zero = np.array([3e-5, 0.0])
     for _ in range(1000):
         law.update(np.zeros(1), zero, np.zeros(1), PERIOD)
@@ -207,7 +207,7 @@ def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
     arm = arm_file.parse(text[: text.rindex("  - {name: middle")])
     m = models.build(arm)
     map_ = StrainMap(m)
-    law = StrainLaw(Channels(m, map_), map_)
+    law = StrainLaw(Channels(m, map_), map_, 0.3)
     terms, found = m.terms(np.zeros(1), np.zeros(1)), set()
     gain = 9.0 / (terms.K2 - 9.0 * terms.M[1:, 1:])[0, 0] * terms.M[1, 0] * map_.rows[0, 0]
     for k in range(2000):

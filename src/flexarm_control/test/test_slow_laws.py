@@ -705,3 +705,41 @@ def test_friction_is_no_payload(rigid):
         adaptive(rough).regressor(q, qd, qd, ref.acceleration),
         adaptive(rigid).regressor(q, qd, qd, ref.acceleration),
     )
+
+
+def test_joint_pid_adds_stiffness_damping_and_integral_to_the_rigid_arms_torque(two_link):
+    q, qd = np.array([0.3, 0.8]), np.array([0.1, -0.2])
+    ref = reference([0.4, 0.7], [0.5, 0.1], [1.0, -2.0])
+    bare = law_of("joint_pid", two_link)
+    own = law_of("model_following", two_link, kp=[0.0], kv=[0.0])
+    assert_allclose(
+        torque_at(bare, q, qd, ref), torque_at(own, ref.position, ref.velocity, ref), rtol=1e-12
+    )
+    law = law_of(
+        "joint_pid", two_link, stiffness=[3.0, 2.0], damping=[0.5, 0.25], integral=[4.0, 1.0]
+    )
+    error, rate = ref.position - q, ref.velocity - qd
+    wanted = torque_at(bare, q, qd, ref) + [3.0, 2.0] * error + [0.5, 0.25] * rate
+    assert_allclose(torque_at(law, q, qd, ref), wanted, rtol=1e-12)
+    law.advance(0.1)
+    assert_allclose(law.integral, 0.1 * np.array([4.0, 1.0]) * error, rtol=1e-12)
+    assert_allclose(torque_at(law, q, qd, ref), wanted + law.integral, rtol=1e-12)
+
+
+def test_joint_pids_integral_ends_at_its_limit_and_waits_while_the_torque_is_beyond_the_joints(
+    two_link,
+):
+    law = law_of("joint_pid", two_link, integral=[10.0], integral_torque=[0.3])
+    at = np.zeros(2), np.zeros(2), reference([0.5, -0.5])
+    torque_at(law, *at)
+    for _ in range(10):
+        law.advance(0.1)
+    assert_array_equal(law.integral, [0.3, -0.3])
+    law.reset()
+    torque_at(law, *at)
+    law.saw(np.array([6.0, -1.0]))  # the limits are 5 and 2 N m
+    law.advance(0.01)
+    assert_allclose(law.integral, [0.0, -0.05], rtol=1e-12)
+    law.saw(np.array([-6.0, -3.0]))  # the error leads back inside, and farther out
+    law.advance(0.01)
+    assert_allclose(law.integral, [0.05, -0.05], rtol=1e-12)

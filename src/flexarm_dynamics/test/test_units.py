@@ -45,4 +45,4 @@ def test_imperial_factors_are_those_of_the_tables_and_si_stays_as_it_is(dimensio
 
 def test_every_dimension_has_a_unit_for_messages():
     assert set(DIMENSIONS) == set(SI_UNIT)
-    assert len(DIMENSIONS) == 13
+    assert len(DIMENSIONS) == 14

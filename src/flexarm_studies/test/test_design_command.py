@@ -41,9 +41,9 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
         "0.002",
     ]
     assert main(["simulate", "R", *motion, "--payload-scale", "1.333"]) == 0
-    said = capsys.readouterr().out
-    peak = re.search(r"^joint1 +(\S+)", said, re.M)
-    settled = re.search(r"^settled within 1 mm after \[s\] +(\S+)", said, re.M)
+    printed = capsys.readouterr().out
+    peak = re.search(r"^joint1 +(\S+)", printed, re.M)
+    settled = re.search(r"^settled within 1 mm after \[s\] +(\S+)", printed, re.M)
     assert float(peak[1]) < 0.2 and float(settled[1]) < 0.5  # degrees, as the README has it
     # What exists is not overwritten.
     assert main(["design", "R", *LOOP, "--out", str(out)]) != 0

@@ -263,7 +263,7 @@ def test_a_gauge_that_drifts_stops_the_arm_and_hardly_moves_it():
     loop.move(4.0)
     time, doubt, degree = loop.named
     assert doubt.startswith("strain of root drifts")
-    assert 1.0 < time < 1.4
+    assert 1.0 < time < 1.7  # in motion a payload of up to three times the file's is possible
     assert degree == STOP
     assert loop.controller.state == State.HOLDING
     assert loop.simulator.position[0] < 0.5 + 0.1

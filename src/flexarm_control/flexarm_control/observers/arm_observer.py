@@ -104,7 +104,9 @@ class ArmObserver:
                 field="observed_modes",
                 hint="lower `modes` in links[].flexible",
             )
-        self.monitor = monitor.Monitor(model, self.strain_map, self.gauges)
+        self.monitor = monitor.Monitor(
+            model, self.strain_map, self.gauges, settings["payload_tolerance"]
+        )
         n, m = model.n_joints, model.n_modes
         self.position, self.velocity = np.zeros(n), np.zeros(n)
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)

@@ -28,11 +28,16 @@ from .doubts import Doubts
 from .jumps import BRIDGED, LEARNT, Jumps
 from .standstill import Standstill
 from .strain_law import StrainLaw
+from .zero_drift import TOLERANCE
 
 PARAMETERS = (
     parameter("plausibility", True).described(
         "Whether readings are compared with each other, with the last ones and with the model: single outliers are"
         " replaced, a sensor in doubt is named, and the arm is stopped or its torque switched off."
+    ),
+    parameter("payload_tolerance", TOLERANCE, "-", 0.0, 100.0, read_only=True).described(
+        "By which fraction the payload may differ from the arm file's before strains and motion are taken to contradict"
+        " each other; 2.0: from none to three times as much. Less finds a gauge that drifts sooner."
     ),
 )
 
@@ -53,6 +58,8 @@ class Monitor:
     strain_map : StrainMap or None
     gauges : GaugeHealth or None
         It leaves out those in doubt.
+    payload : float
+        By which fraction the payload may differ from the arm file's [-].
 
     Attributes
     ----------
@@ -62,12 +69,12 @@ class Monitor:
         Of the last sample that was taken [ns].
     """
 
-    def __init__(self, model, strain_map, gauges):
+    def __init__(self, model, strain_map, gauges, payload=TOLERANCE):
         c = self.channels = Channels(model, strain_map)
         self._map, self._gauges = strain_map, gauges
         self.doubts, self.jumps = Doubts(), Jumps(c)
         self._agreement, self._standstill = Agreement(c), Standstill(c)
-        self._law = StrainLaw(c, strain_map) if c.g and c.m else None
+        self._law = StrainLaw(c, strain_map, payload) if c.g and c.m else None
         self._value, self._raw = np.zeros(c.size), np.zeros(2 * c.n + c.g)
         self._strain, self._amplitude, self._rates = np.zeros(c.g), np.zeros(c.m), np.zeros(c.m)
         self.stamp_ns = 0

@@ -36,7 +36,7 @@ from itertools import combinations
 import numpy as np
 
 from .low_pass import LowPass
-from .zero_drift import ZeroDrift, law_matrices
+from .zero_drift import TOLERANCE, ZeroDrift, law_matrices
 
 #: Corner of the low pass as a multiple of the lowest frequency with free joints, and its limits [rad/s].
 CORNER, MIN_CORNER, MAX_CORNER = 3.0, 15.0, 60.0
@@ -73,6 +73,8 @@ class StrainLaw:
     ----------
     channels : Channels
     strain_map : StrainMap
+    payload : float
+        By which fraction the payload may differ from the arm file's [-].
 
     Attributes
     ----------
@@ -83,7 +85,7 @@ class StrainLaw:
         Of the hypothesis that won: as the arm file has it, and so read.
     """
 
-    def __init__(self, channels, strain_map):
+    def __init__(self, channels, strain_map, payload=TOLERANCE):
         c, self._map = channels, strain_map
         self.channels, self.model = c, c.model
         lowest = self.model.frequencies().min(initial=np.inf)
@@ -96,7 +98,7 @@ class StrainLaw:
         self._concerned = np.stack([self._groups[list(h[1])].any(axis=0) for h in self.hypotheses])
         self._project = strain_map.rows @ strain_map.inverse
         self._kept = round(MEMORY / INTERVAL)
-        self.drift = ZeroDrift(c, strain_map)
+        self.drift = ZeroDrift(c, strain_map, payload)
         # Strains, positions and forces; then the strains since each moment.
         size = c.g + c.n + c.m
         self._young = slice(size, size + ONSETS * c.g)

@@ -15,8 +15,8 @@ seconds in which the arm hardly accelerates, the zero :math:`r_0`:
 
 with 0.6 % of full scale for the zero (Z = `ZERO`), and :math:`\Delta D`, :math:`\Delta L`, :math:`\Delta W` the
 largest changes of :math:`R K_2^{-1}M_{21}`, :math:`R K_2^{-1}M_{22}W` and of the weight's strain under a payload that
-is 30 % off, over some configurations; :math:`\Pi` is `MARGIN`. Noise is not in the bound: the low pass leaves
-less than a tenth of a gauge's noise, and of an encoder's counts less than half a microstrain.
+is off by `payload_tolerance`, over some configurations; :math:`\Pi` is `MARGIN`. Noise is not in the bound: the low
+pass leaves less than a tenth of a gauge's noise, and of an encoder's counts less than half a microstrain.
 
 A zero that drifts at the rate v is found when it has left its bound b by :math:`v\tau`,
 
@@ -36,8 +36,10 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.models import model as models
 
-#: Change of a zero that is none, as a fraction of full scale [-]; payload's error [-]; margin of what it does [-].
-ZERO, PAYLOAD, MARGIN = 0.006, 0.3, 1.5
+#: Change of a zero that is none, as a fraction of full scale [-]; margin of what a payload does [-].
+ZERO, MARGIN = 0.006, 1.2
+#: By which fraction a payload may differ from the arm file's where nothing else is stated [-].
+TOLERANCE = 2.0
 #: Time constant of the low pass, time in which the zero is learnt, and time constant of the correction [s].
 SLOW, LEARNT, CORRECTED = 0.2, 0.2, 0.05
 #: Part of the residuals' square that no joint's acceleration explains, for a joint to be named [-].
@@ -53,6 +55,8 @@ class ZeroDrift:
     ----------
     channels : Channels
     strain_map : StrainMap
+    payload : float
+        By which fraction the payload may differ from the arm file's [-].
 
     Attributes
     ----------
@@ -66,10 +70,10 @@ class ZeroDrift:
         What is taken from the readings: follows the residual of those that are doubted, r less its zero [strain].
     """
 
-    def __init__(self, channels, strain_map):
+    def __init__(self, channels, strain_map, payload=TOLERANCE):
         c = self.channels = channels
         self._floor = ZERO * np.array([a.full_scale for a in c.model.arm.gauges])
-        self._drive, self._load, self._weight = _payload_changes(c.model, strain_map)
+        self._drive, self._load, self._weight = _payload_changes(c.model, strain_map, payload)
         self.doubted, self.correction = np.zeros(c.g, bool), np.zeros(c.g)
         self.reset()
 
@@ -144,10 +148,10 @@ def law_matrices(model, strain_map, terms):
     return to_strain @ terms.M[n:, :n], load, to_strain
 
 
-def _payload_changes(model, strain_map):
-    """Largest changes of `law_matrices` under a payload that is `PAYLOAD` off, times `MARGIN`."""
+def _payload_changes(model, strain_map, payload):
+    """Largest changes of `law_matrices` under a payload that is off by a fraction `payload`, times `MARGIN`."""
     n, arm = model.n_joints, model.arm
-    others = [models.build(scaled(arm, 1.0 + by)) for by in (-PAYLOAD, PAYLOAD)]
+    others = [models.build(scaled(arm, 1.0 + by)) for by in (-min(payload, 1.0), payload)]
     maps = [StrainMap(m) for m in others]
     g = len(arm.gauges)
     found = [np.zeros((g, n)), np.zeros((g, g)), np.zeros(g)]
