@@ -18,6 +18,7 @@ import numpy as np
 
 from flexarm_dynamics.models.model import build
 
+from ..fading import lowest
 from .decay import Slowest, Wanted
 from .loop import Sampling
 from .noise import Noise
@@ -25,7 +26,6 @@ from .search import DECAYS, STARTS, Search, optimal, start
 from .uncertain import (
     Uncertainty,
     configurations,
-    lowest,
     own_damping,
     reach,
     resting,

@@ -41,11 +41,6 @@ class Uncertainty:
     delay: float = 0.5
 
 
-def lowest(model):
-    """Lowest bending frequency with straight, locked joints, omega_1 [rad/s]; 10 for a rigid arm."""
-    return float(model.frequencies(locked=True)[0]) if model.n_modes else 10.0
-
-
 def configurations(arm, seed=0):
     """Configurations to design for, (k, n) [rad]: straight, and drawn evenly from the position limits."""
     n = len(arm.joints)

@@ -37,9 +37,9 @@ from flexarm_dynamics.models import model
 from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 
 from ..comparison.baselines import Baseline, FullStateLqr, JointPid
-from ..comparison.controllers import DAMPED, IDLE, MAX_INTEGRAL, SHAPED, UNWATCHED
+from ..comparison.controllers import DAMPED, IDLE, MAX_INTEGRAL, SHAPED, UNWATCHED, Setup
 from ..comparison.tuning import Free, tune
-from .trial import TOLERANCE, Setup
+from .trial import TOLERANCE
 
 #: Factors of the payload in the uncertain set [-].
 PAYLOADS = (0.7, 1.0, 1.3)

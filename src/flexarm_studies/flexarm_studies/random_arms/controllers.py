@@ -13,9 +13,10 @@ from flexarm_control.robust.design import Settings, design
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
 
+from ..comparison.controllers import Setup
 from ..loop import scenario as scenarios
 from .baselines import full_state_lqr, shaped_pid, task_of
-from .trial import DELAY, SLOW_RATE, Setup
+from .trial import DELAY, SLOW_RATE
 
 
 def _tutorial(feedforward, case):

@@ -14,8 +14,7 @@ Integration: dop853 where a few substeps are short enough for the highest mode. 
 loop of a drive does. Those would cost a hundred substeps per sample, and the table a day.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -76,25 +75,6 @@ VARIANTS = {
     "damping x3": Variant(damping=3.0),
     "noisy": Variant(noisy=True),
 }
-
-
-@dataclass(frozen=True)
-class Setup:
-    """A controller with its numbers, made for one arm.
-
-    Attributes
-    ----------
-    controller : dict
-        Flat parameters, as `Scenario.controller`.
-    law : callable or None
-        Makes from the arm's model the law that replaces the composite control.
-    motion : callable or None
-        Makes from the arm's model the trajectory that is sent in place of the motion.
-    """
-
-    controller: dict = field(default_factory=dict)
-    law: Callable | None = None
-    motion: Callable | None = None
 
 
 def plant_of(arm, variant):
