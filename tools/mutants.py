@@ -261,6 +261,31 @@ LAWS = [
     ),
     *of(
         "flexarm_control",
+        "robust",
+        TESTS + "test_robust.py",
+        (
+            "loop",
+            "the integral",
+            "integral[:, at_y : at_y + n] = h",
+            "integral[:, at_y : at_y + n] = -h",
+        ),
+        ("loop", "a late torque acts at once", "add(end, whole)", "add(end, 0)"),
+        ("decay", "the gradient's sign", "found = -np.outer(", "found = np.outer("),
+        (
+            "decay",
+            "the smooth maximum is none",
+            "worst + w * np.log(total)",
+            "worst - w * np.log(total)",
+        ),
+        (
+            "card",
+            "limits are looked for outwards only",
+            "(middle, high) if stable(middle)",
+            "(low, high) if stable(middle)",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "fast",
         TESTS + "test_fast_laws.py",
         (
