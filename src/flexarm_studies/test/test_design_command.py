@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm design``: its controller file is one that the loop runs from, and a design that can't hold is refused."""
 
+import json
 import re
 
 import pytest
 
 from flexarm_bringup import cli
+from flexarm_control.robust import cache
 from flexarm_studies.commands.design import _yaml
 from flexarm_studies.loop import parameter_files
+from flexarm_studies.random_arms import generator
 
 
 def main(argv):
@@ -84,3 +87,45 @@ def test_options_are_checked(capsys, option, value, text):
 )
 def test_numbers_are_floats_for_yaml_and_ros(value, text):
     assert _yaml(value) == text
+
+
+def test_an_arm_that_is_not_shipped_moves_without_any_parameter(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cache, "cache_directory", lambda: tmp_path)
+    path = tmp_path / "arm.yaml"
+    path.write_text(generator.arm(0).text)
+    motion = "quintic:to=0.8,duration=1.5"
+    words = ["simulate", str(path), "--trajectory", motion, "--rate", "500", "--json"]
+    words += [
+        "--payload-scale",
+        "1.3",
+        "--delay",
+        "0.003",
+        "--window",
+        "1",
+        "--set",
+        "design.effort=0.1",
+    ]
+    outputs, reported = [], []
+    for more in ([], [], ["slow.integral=0"]):
+        assert main([*words, *more]) == 0
+        printed = capsys.readouterr()
+        outputs.append(json.loads(printed.out)["metrics"])
+        reported.append("designing a controller" in printed.err)
+    assert outputs[0] == outputs[1] and reported == [True, False, False]
+    assert outputs[0]["state"] == "HOLDING" and outputs[0]["settling_time_s"] < 2.0
+    # What is given by hand is taken: without the integral another payload leaves an error.
+    assert outputs[2]["final_tip_error_mm"] > 3.0 * outputs[0]["final_tip_error_mm"]
+
+
+def test_a_delay_that_the_design_does_not_bear_is_reported(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cache, "cache_directory", lambda: tmp_path)
+    words = [
+        "simulate",
+        "rigid",
+        "--trajectory",
+        "quintic:to=0.1;0.1,duration=0.5",
+        "--rate",
+        "200",
+    ]
+    main([*words, "--delay", "0.05"])
+    assert "longer than the" in capsys.readouterr().err

@@ -54,10 +54,12 @@ REFUSED = {
     },
     "simulate": {
         "R --foreshortening": "model: 'paper_appendix' of R supports neither foreshortening",
-        "R --payload-scale 2": "--payload-scale: is possible only with --controller",
-        "R --noise": "--noise: is possible only with --controller",
-        "R --set slow.kp=1": "--set: is possible only with --controller",
+        "R --payload-scale 2": "--payload-scale: is possible only with --trajectory",
+        "R --noise": "--noise: is possible only with --trajectory",
+        "R --set slow.kp=1": "--set: is possible only with --trajectory",
         "R --controller paper_composite": "--trajectory: is missing",
+        "R --trajectory paper --modes 3": "--modes: is not possible with --trajectory",
+        "two_link --trajectory paper --set slow.kp=1": "slow.kp: no such parameter of 'joint_pid'",
         "nothing": "'nothing' is neither a file nor a shipped arm",
     },
     "simulate R --trajectory paper --controller": {

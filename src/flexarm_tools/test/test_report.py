@@ -791,9 +791,9 @@ def test_what_can_not_be_recorded_is_refused(tmp_path, monkeypatch, changes, rea
     assert not list(tmp_path.iterdir())
 
 
-def test_simulate_takes_a_bag_only_with_a_controller(flexarm):
+def test_simulate_takes_a_bag_only_with_a_motion(flexarm):
     code, _, err = flexarm("simulate", "R", "--bag", "x")
-    assert code == 1 and "only with --controller" in err
+    assert code == 1 and "only with --trajectory" in err
 
 
 def test_an_arm_that_was_read_has_no_name_in_its_bag(tmp_path):

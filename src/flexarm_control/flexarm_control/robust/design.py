@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import build
 
 from ..fading import lowest
@@ -36,6 +37,8 @@ from .uncertain import (
 FILTER = 2.0
 #: The controller's own check has neither filters nor delay, which the design has.
 UNCHECKED = -1000.0
+#: Beside a period a torque is under way for so long between processes [s].
+TRANSPORT = 1e-3
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 
@@ -49,7 +52,7 @@ class Settings:
     rate : float
         Samples per second [Hz].
     delay : float
-        From a measurement until its torque acts [s].
+        From a measurement until its torque acts [s]; not given: one period and `TRANSPORT`.
     speed : float
         From 0 to 1: how much decay is looked for, and how much noise the torque may have for it. 1: `FASTEST` and
         `NOISIEST`, the rms torque of the sensors' noise over the torque limit.
@@ -62,11 +65,15 @@ class Settings:
     """
 
     rate: float = 1000.0
-    delay: float = 0.001
+    delay: float | None = None
     speed: float = 1.0
     configurations: tuple = ()
     effort: float = 1.0
     seed: int = 0
+
+    def __post_init__(self):
+        if self.delay is None:
+            object.__setattr__(self, "delay", 1.0 / self.rate + TRANSPORT)
 
 
 @dataclass(frozen=True)
@@ -112,14 +119,24 @@ class Design:
         """Whether all loops are stable."""
         return self.decay > 0.0
 
+    def check(self):
+        """Refuse a design that does not hold.
+
+        Raises
+        ------
+        DesignError
+            With the loop and the pole that are in the way, and what would help.
+        """
+        if not self.holds:
+            problem = in_the_way(self)
+            raise DesignError(
+                problem, field=f"controller of {self.arm.name}", hint=what_helps(self)
+            )
+
     def parameters(self):
         """Flat parameters of the three nodes."""
         n = len(self.arm.joints)
         K = self.K
-
-        def numbers(values):
-            return [float(f"{v:.6g}") for v in np.ravel(values)]
-
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -134,13 +151,64 @@ class Design:
             out["fast.type"] = "fixed_gain"
             out["fast.gain"] = numbers(-K[:, 3 * n :])
             out["fast.configuration"] = numbers(self.configurations[0])
-        modal, joint = numbers([self.sampling.modal_corner, self.sampling.joint_corner])
-        return out | {
-            "manifold.type": "reference",
-            "observer.type": "filtered_derivative",
-            "observer.bandwidth": modal,
-            "observer.joint_velocity_bandwidth": joint,
-        }
+        return out | {"manifold.type": "reference"} | observer_parameters(self.sampling)
+
+
+def numbers(values):
+    """A list of numbers as parameters have them: six digits."""
+    return [float(f"{v:.6g}") for v in np.ravel(values)]
+
+
+def observer_parameters(sampling):
+    """Flat parameters of the observer that belongs to a `Sampling`."""
+    modal, joint = numbers([sampling.modal_corner, sampling.joint_corner])
+    return {
+        "observer.type": "filtered_derivative",
+        "observer.bandwidth": modal,
+        "observer.joint_velocity_bandwidth": joint,
+    }
+
+
+def in_the_way(found):
+    """Which loop no gains were found for, and by which pole, in words."""
+    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    return (
+        f"no gains hold all of it: the best found lets a pole at {abs(pole) / (2.0 * np.pi):.3g} Hz grow at"
+        f" {pole.real:.3g} 1/s with {name}"
+    )
+
+
+def what_helps(found):
+    """What to try, for the slowest pole of a design that does not hold."""
+    _, pole, _ = max(found.slowest, key=lambda row: row[2])
+    if abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period) > 0.5:
+        return (
+            "sample faster or shorten the delay: this pole is too fast for the loop; a rotor_inertia in the arm file"
+            " slows it"
+        )
+    if any(found.arm.gravity) and abs(pole) < found.omega_1:
+        return (
+            "narrow the payload or the configurations (of a node design.payload and design.configurations, of the"
+            " command --payload and --at): gravity turns the arm over faster than its bending lets the joints hold"
+        )
+    return (
+        "narrow payload and stiffness, give the configurations that the arm moves in, or a larger effort"
+        " (of a node design.payload and so on, of the command --payload, --stiffness, --at, --effort)"
+    )
+
+
+def places(nominal, settings):
+    """Configurations that a design is for, those of the `settings` or drawn, (k, n) [rad]."""
+    given = settings.configurations or configurations(nominal.arm, settings.seed)
+    return resting(nominal, given)
+
+
+def sampling_for(nominal, at, settings):
+    """How the loop samples, with the corners of its filters; and omega_c [rad/s]. It takes no search."""
+    h = 1.0 / settings.rate
+    omega_c = reach(nominal, at, settings.delay + 0.5 * h)
+    corner = min(settings.rate, FILTER * omega_c)
+    return Sampling(h, settings.delay, corner, corner), omega_c
 
 
 def design(arm, settings=None, uncertainty=None, progress=None):
@@ -166,20 +234,20 @@ def design(arm, settings=None, uncertainty=None, progress=None):
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
     nominal = build(arm)
-    h = 1.0 / settings.rate
-    at = resting(nominal, settings.configurations or configurations(arm, settings.seed))
+    at = places(nominal, settings)
     omega_1 = lowest(nominal)
-    late = settings.delay + 0.5 * h
-    omega_c = reach(nominal, at, late)
-    corner = min(settings.rate, FILTER * omega_c)
-    sampling = Sampling(h, settings.delay, corner, corner)
+    sampling, omega_c = sampling_for(nominal, at, settings)
+    late = sampling.delay + 0.5 * sampling.period
     loops = uncertain_loops(nominal, at, sampling, uncertainty)
     wanted = Wanted(omega_1, omega_c, own_damping(arm, uncertainty))
     scale = units(nominal, at, omega_1)
     slowest = Slowest(loops, wanted, scale)
     speed = max(settings.speed, 0.05)
     noise = Noise(slowest, nominal, sampling, speed * NOISIEST, omega_1)
-    starts = [slowest.scaled(start(nominal, at, scale, a, late + 1.0 / corner)) for a in STARTS]
+    starts = [
+        slowest.scaled(start(nominal, at, scale, a, late + 1.0 / sampling.joint_corner))
+        for a in STARTS
+    ]
     starts += [
         slowest.scaled(optimal(nominal, at[len(at) // 2], omega_1, decay)) for decay in DECAYS
     ]

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from flexarm_dynamics.errors import DesignError, FlexarmError
+from flexarm_dynamics.errors import FlexarmError
 
 from .options import add_arm_arguments, angles, in_range, new_path, numbers, show
 
@@ -40,7 +40,12 @@ def add_arguments(parser):
     add_arm_arguments(parser, "the design and what it bears as JSON")
     add("--out", metavar="FILE", help="controller file to write; not given: printed")
     add("--rate", type=float, default=1000.0, help="samples per second (1000)")
-    add("--delay", type=float, metavar="S", help="from a sample to its torque (one period) [s]")
+    add(
+        "--delay",
+        type=float,
+        metavar="S",
+        help="from a sample to its torque (one period and 1 ms) [s]",
+    )
     for name, default in (
         ("payload", "0.7:1.3"),
         ("stiffness", "0.9:1.1"),
@@ -79,7 +84,7 @@ def design(options):
     arm = arm_file.load(options.arm)
     out = None if options.out is None else new_path(options.out, "--out")
     rate = in_range("--rate", options.rate, 10.0, 20000.0)
-    delay = 1.0 / rate if options.delay is None else in_range("--delay", options.delay, 0.0, 0.1)
+    delay = None if options.delay is None else in_range("--delay", options.delay, 0.0, 0.1)
     at = tuple(tuple(angles(text, arm, "--at").tolist()) for text in options.at or ())
     settings = Settings(
         rate=rate,
@@ -103,10 +108,7 @@ def design(options):
         )
 
     found = find(arm, settings, uncertainty, progress)
-    if not found.holds:
-        raise DesignError(
-            in_the_way(found), field=f"controller of {arm.name}", hint=what_helps(found)
-        )
+    found.check()
     bears = card(found)
     text = controller_file(options.arm, found, card_lines(found, bears))
     if out is not None:
@@ -174,31 +176,6 @@ def _number(value):
 def _span(limits):
     low, high = limits
     return f"{low:.2g} to {'any' if not np.isfinite(high) else f'{high:.2g}'}"
-
-
-def in_the_way(found):
-    """Which loop no gains were found for, and by which pole, in words."""
-    name, pole, _ = max(found.slowest, key=lambda row: row[2])
-    return (
-        f"no gains hold all of it: the best found lets a pole at {abs(pole) / (2.0 * np.pi):.3g} Hz grow at"
-        f" {pole.real:.3g} 1/s with {name}"
-    )
-
-
-def what_helps(found):
-    """What to try, for the slowest pole of a design that does not hold."""
-    _, pole, _ = max(found.slowest, key=lambda row: row[2])
-    if abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period) > 0.5:
-        return (
-            "sample faster or shorten the delay: this pole is too fast for the loop; a rotor_inertia in the arm file"
-            " slows it"
-        )
-    if any(found.arm.gravity) and abs(pole) < found.omega_1:
-        return (
-            "narrow --payload or the configurations (--at): gravity turns the arm over faster than its bending lets the"
-            " joints hold"
-        )
-    return "narrow --payload and --stiffness, give the configurations that the arm moves in (--at), or --effort 5"
 
 
 def controller_file(arm, found, lines):

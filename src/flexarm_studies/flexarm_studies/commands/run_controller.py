@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate --controller``: plant, observer and controller in one process, with metrics."""
+"""``flexarm simulate --trajectory``: plant, observer and controller in one process, with metrics."""
 
 import json
 import math
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flexarm_control.robust import default
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
@@ -34,7 +35,9 @@ def add_arguments(parser):
     )
     add = group.add_argument
     add(
-        "--controller", metavar="FILE", help="parameter file of the nodes: a shipped name or a path"
+        "--controller",
+        metavar="FILE",
+        help="parameter file of the nodes: a shipped name or a path; not given: a design for the arm",
     )
     add(
         "--trajectory",
@@ -77,15 +80,20 @@ def add_arguments(parser):
     )
 
 
+def is_closed(options):
+    """Whether the options ask for a closed loop."""
+    return options.controller is not None or options.trajectory is not None
+
+
 def check_arguments(options):
     """Refuse options that do not fit the mode, with or without a controller."""
-    if options.controller is None:
+    if not is_closed(options):
         others = [k for k in (*FIELDS, "set", "bag") if k not in SHARED]
         wrong = [k for k in others if getattr(options, k) is not None]
-        why = "is possible only with --controller"
+        why = "is possible only with --trajectory"
     else:
         wrong = [k for k in OPEN_LOOP if getattr(options, k)]
-        why = "is not possible with --controller"
+        why = f"is not possible with {'--trajectory' if options.controller is None else '--controller'}"
         if options.trajectory is None:
             hint = "give a file, or a motion such as paper"
             raise FlexarmError("is missing", field="--trajectory", hint=hint)
@@ -96,7 +104,7 @@ def check_arguments(options):
 
 def scenario_of(options):
     """The `Scenario` that the options describe."""
-    parameters = scenarios.parameters(options.controller, options.set or ())
+    parameters = scenarios.parameters(options.controller, options.set or (), options.arm)
     if options.initial is not None:
         parameters["initial_position"] = angles(
             options.initial, arm_file.load(options.arm), "--initial"
@@ -112,6 +120,12 @@ def scenario_of(options):
 def run_controller(options, recorder=None):
     """Run the sub-command, recorded as in `scenario.run_loop`; exit code 1 if the loop lost the arm."""
     scenario = scenario_of(options)
+    task = scenarios.design_task(scenario)
+    if task is not None and not default.is_cached(arm_file.load(options.arm), *task):
+        print(
+            "flexarm simulate: designing a controller for this arm; it is kept for the next time",
+            file=sys.stderr,
+        )
     record, metrics, loop = scenarios.run_loop(scenario, recorder)
     plant = loop.simulator.plant_model
     for warning in warnings(scenario, loop):
@@ -124,7 +138,7 @@ def run_controller(options, recorder=None):
             result |= {"out": str(Path(options.out)), "rows": len(record.time)}
         print(json.dumps(result, allow_nan=False))
     else:
-        print("\n".join(report(scenario, loop.model, metrics)))
+        print("\n".join(report(scenario, loop, metrics)))
     if options.bag:
         print(f"bag {options.bag}; look at it with: flexarm report {options.bag}", file=sys.stderr)
     if metrics["lost"]:
@@ -136,6 +150,12 @@ def warnings(scenario, loop):
     """Warnings about a run, which is carried out nevertheless."""
     law, gauges = loop.controller.law, loop.simulator.plant_model.arm.gauges
     yield from law.warnings()
+    if loop.designed is not None and scenario.delay > loop.designed.bears_delay:
+        yield (
+            f"the delay of {1e3 * scenario.delay:.3g} ms is longer than the"
+            f" {1e3 * loop.designed.bears_delay:.3g} ms that the design bears: design for it, --set"
+            f" design.delay={scenario.delay:g}"
+        )
     if loop.unprepared:
         yield f"no preview of the trajectory: {loop.unprepared}"
     if scenario.noise and not any(g.noise or g.drift for g in gauges):
@@ -145,9 +165,11 @@ def warnings(scenario, loop):
 # What is printed -------------------------------------------------------------------------------
 
 
-def report(scenario, arm_model, metrics):
+def report(scenario, loop, metrics):
     """Lines with the metrics, for people."""
-    values, m = scenario.controller, metrics
+    arm_model, m, values = loop.model, metrics, scenario.controller
+    if loop.designed is not None:
+        values = loop.designed.parameters | values
     parts = [f"{k} {scenarios.type_of(k, values)}" for k in scenarios.COMPONENTS]
     lines = [
         f"{arm_model.arm.name}: {', '.join(parts)}, feed-forward {values.get('feedforward', 'model')}",

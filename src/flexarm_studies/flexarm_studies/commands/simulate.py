@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm simulate``: a table of an arm's motion under given torques, or with prescribed joint angles.
 
-With ``--controller`` the arm is in a closed loop: `run_controller`.
+With ``--trajectory`` the arm is in a closed loop: `run_controller`.
 """
 
 import itertools
@@ -37,7 +37,8 @@ def add_arguments(parser):
         "examples:\n"
         "  flexarm simulate two_link --torque torque.csv --duration 4 --out run.csv\n"
         "  flexarm simulate R --controller paper_composite --trajectory paper "
-        "--payload-scale 2"
+        "--payload-scale 2\n"
+        "  flexarm simulate my_arm.yaml --trajectory quintic:to=0.5,duration=2"
     )
     add_arm_arguments(
         parser,
@@ -89,7 +90,7 @@ def add_arguments(parser):
 def simulate(options, recorder=None):
     """Run the sub-command; `recorder` writes the bag that ``--bag`` asks for, see `scenario.run_loop`."""
     run_controller.check_arguments(options)
-    if options.controller is not None:
+    if run_controller.is_closed(options):
         run_controller.run_controller(options, recorder)
         return
     for name, value in DEFAULTS.items():

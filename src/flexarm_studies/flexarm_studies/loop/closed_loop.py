@@ -53,6 +53,8 @@ class ClosedLoop:
         Why its trajectory went without preview; empty if it did not, or none was asked for.
     bag : LoopBag or None
         Where every sample and its answer are written.
+    designed : Default or None
+        The design that the control is from; None: its parameters were given.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class ClosedLoop:
         self._set_delay(delay)
         self._reach = sum(link.length for link in model.arm.links)
         self.lost = self.unprepared = ""
-        self.bag = None
+        self.bag = self.designed = None
 
     @property
     def estimated(self):

@@ -18,6 +18,7 @@ from flexarm_control.composite.design import PARAMETERS as DESIGN_PARAMETERS
 from flexarm_control.loop.arm_controller import PARAMETERS as CONTROLLER_PARAMETERS
 from flexarm_control.loop.arm_controller import START_TOLERANCE
 from flexarm_control.loop.supervisor import State
+from flexarm_control.robust import default
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm, scaled
@@ -31,7 +32,7 @@ from .network import Network, NetworkedLoop
 
 #: Parameters of the nodes themselves: they do not affect the loop.
 OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
-CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS)
+CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS, *default.PARAMETERS)
 #: Fields of a scenario have these.
 OF_SCENARIOS = ("plant_arm", "plant_modes", "noise", "seed")
 
@@ -48,7 +49,7 @@ class Scenario:
     controller : dict
         Parameters of the loop by their names in a parameter file, flat: ``{"slow.type": "model_following",
         "slow.kp": [6.25], "observer.type": "luenberger", "torque_limit": [5.0], "rate": 500.0, …}``; see
-        `parameters`.
+        `parameters`. Without laws they are those of a design for the arm, as in the nodes: `robust.default`.
     trajectory : str or dict
         A motion in a line, such as ``paper`` or ``quintic:to=1.5,duration=2`` (`trajectory.specs`); a file, .csv or
         .yaml (`trajectory.files`); or a mapping with ``times`` [s], ``positions`` [rad] and, if wanted,
@@ -106,17 +107,19 @@ class Scenario:
         return asdict(self)
 
 
-def parameters(file, settings=()):
+def parameters(file, settings=(), arm=""):
     """Flat parameters for `Scenario.controller`, from a parameter file and settings beyond it.
 
     Parameters
     ----------
-    file : str or Path
+    file : str or Path or None
         Parameter file of the nodes: shipped name or path. Each parameter is taken from the section of the node
-        that it belongs to.
+        that it belongs to. None: the settings alone.
     settings : sequence of str
         ``name=value`` each, the value as YAML, as `ros2 param set` takes it; for a float or an array of them also
         plain numbers: ``slow.kp=9``, one for all joints, or ``slow.kp=9,4``.
+    arm : str
+        Arm file: without laws the settings are about those of a design for it.
 
     Returns
     -------
@@ -127,7 +130,8 @@ def parameters(file, settings=()):
     ParameterError
         For a file that can't be read, and for a setting that is no parameter of the components chosen.
     """
-    nodes = parameter_files.load(file)
+    nodes = {} if file is None else parameter_files.load(file)
+    nodes = {node: nodes.get(node, {}) for node in parameter_files.PREFIXES}
     of_simulator = {p.name for p in SIMULATOR_PARAMETERS}
     found = {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
     # The rate is the simulator's; the controller's parameter of that name is for other sources.
@@ -138,9 +142,16 @@ def parameters(file, settings=()):
     found = {k: v for k, v in found.items() if k not in (*OF_NODES, *OF_SCENARIOS)}
     set_here = dict(map(_setting, settings))
     found |= set_here
+    known = _with_types(arm, found)
     for name, value in set_here.items():
-        found[name] = _as_declared(_parameter(name, found), value)
+        found[name] = _as_declared(_parameter(name, known), value)
     return found
+
+
+def _with_types(arm, values):
+    """Flat parameters with the laws of a design where one is to be made."""
+    kind = values.get("design.type", default.AUTO)
+    return default.TYPES | values if default.is_wanted(arm, values, kind) else values
 
 
 def _setting(text):
@@ -186,27 +197,41 @@ def _parameter(name, values):
     raise ParameterError(f"no such parameter{what}", field=name, hint=hint)
 
 
+def design_task(scenario):
+    """What the control of a scenario is designed for, see `default.wanted_task`; None where it needs no design."""
+    return default.wanted_task(_name(scenario.arm), _read(scenario.arm), _given(scenario))
+
+
+def _given(scenario):
+    values = dict(scenario.controller)
+    if scenario.rate is not None:
+        values["rate"] = scenario.rate
+    return values
+
+
 def loop_of(scenario):
-    """The scenario's `ClosedLoop`, before its first sample."""
-    values = scenario.controller
+    """The scenario's `ClosedLoop`, before its first sample; `designed` is the `Default` that was made for it, or None.
+
+    A design that is not in the cache takes seconds to minutes.
+    """
+    arm, given = _read(scenario.arm), _given(scenario)
+    known = _with_types(_name(scenario.arm), given)
+    for name in given:
+        if name.split(".")[0] not in COMPONENTS:
+            _parameter(name, known)
+    values, designed = default.complete(_name(scenario.arm), arm, given)
     simulator, controller = {}, {}
     for name, value in values.items():
-        if name.split(".")[0] in COMPONENTS:
-            continue
-        _parameter(name, values)
         if name in {p.name for p in CONTROLLER}:
             controller[name] = value
         if name in {p.name for p in SIMULATOR_PARAMETERS}:  # `rate` is both nodes'
             simulator[name] = value
     simulator |= {"noise": scenario.noise, "seed": scenario.seed}
     simulator["plant_modes"] = scenario.plant_modes
-    if scenario.rate is not None:
-        simulator["rate"] = controller["rate"] = scenario.rate
     controller.setdefault("feedforward", "model")
     if type_of("observer", values) == "true_rates":
         simulator["publish_rates"] = True
     groups = {prefix: chosen(prefix, values) for prefix in COMPONENTS}
-    arm = _read(scenario.arm)
     plant = scaled(
         _read(scenario.plant_arm) if scenario.plant_arm else arm,
         scenario.payload_scale,
@@ -216,13 +241,21 @@ def loop_of(scenario):
     parts = {**groups, "simulator": simulator, "controller": controller, "plant_arm": plant}
     if scenario.loss or scenario.jitter:
         network = Network(scenario.loss, scenario.delay, scenario.jitter, scenario.seed)
-        return NetworkedLoop(arm, **parts, network=network)
-    return ClosedLoop(arm, **parts, delay=scenario.delay)
+        loop = NetworkedLoop(arm, **parts, network=network)
+    else:
+        loop = ClosedLoop(arm, **parts, delay=scenario.delay)
+    loop.designed = designed
+    return loop
 
 
 def _read(arm):
     """An arm, as given or from its file."""
     return arm if isinstance(arm, Arm) else arm_file.load(arm)
+
+
+def _name(arm):
+    """How an arm was given: by this name or path; empty for one that was read."""
+    return "" if isinstance(arm, Arm) else arm
 
 
 def run(scenario):

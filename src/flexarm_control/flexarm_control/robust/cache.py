@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Designs that were made before, one file each in the cache directory, beside the compiled kernels.
+
+A file is named by all that its design depends on: arm, `Settings`, `Uncertainty` and the source code that designs. What
+is not readable, was cut short, or belongs to something else is as good as absent, and written anew.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import asdict
+from functools import cache as once
+from pathlib import Path
+
+import flexarm_dynamics
+from flexarm_dynamics.kernels.load import cache_directory
+
+#: Fields of an arm that change no design.
+WORDS = ("name", "description", "source")
+
+
+@once
+def version():
+    """Hash of the source code that designs: this package, and the models of `flexarm_dynamics`."""
+    code = hashlib.sha256()
+    for folder in (Path(__file__).parent, Path(flexarm_dynamics.__file__).parent):
+        for path in sorted(folder.rglob("*.py")):
+            code.update(path.read_bytes())
+    return code.hexdigest()
+
+
+def key(arm, settings, uncertainty):
+    """Name of the design for an `Arm` with these `Settings` and this `Uncertainty`."""
+    content = {k: v for k, v in asdict(arm).items() if k not in WORDS}
+    whole = [content, asdict(settings), asdict(uncertainty), version()]
+    return _hash(json.dumps(whole, sort_keys=True, default=_plain))
+
+
+def _plain(value):
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
+
+
+def _hash(text):
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def path_of(name):
+    """File of the design with the `key` `name`."""
+    return cache_directory() / "designs" / f"{name}.json"
+
+
+def read(name):
+    """The entry, a mapping, that was written under a `key`; None where there is none that can be used."""
+    try:
+        found = json.loads(path_of(name).read_text(encoding="utf-8"))
+        entry = found["entry"]
+        whole = found["key"] == name and found["sum"] == _hash(_text(entry))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return entry if whole else None
+
+
+def write(name, entry):
+    """Keep an entry, plain data, under a `key`; where the disk refuses, it is made again the next time."""
+    path = path_of(name)
+    body = _text({"key": name, "sum": _hash(_text(entry)), "entry": entry})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Whole or not at all, also when two processes write at once.
+        with tempfile.NamedTemporaryFile(
+            "w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(body)
+        os.replace(file.name, path)
+    except OSError:
+        return
+
+
+def _text(entry):
+    return json.dumps(entry, sort_keys=True)
