@@ -9,6 +9,7 @@ import contextlib
 import io
 import json
 import time
+from concurrent.futures import Future
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,8 +18,8 @@ from in_process import InProcess
 
 from flexarm_control.motions import profiles
 from flexarm_dynamics.arm import arm_file
+from flexarm_studies.case_study import heavier, tables
 from flexarm_studies.case_study import runs as case_study
-from flexarm_studies.case_study import tables
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 from flexarm_studies.progress import Progress
 from flexarm_tools.case_study import demo, nodes
@@ -84,6 +85,16 @@ def test_nodes_give_every_sample_of_the_loop_without_ros(run, how, tmp_path, mon
     follows_the_loop_without_ros(tmp_path / "bag", run, SHORT, how is nodes.run_nodes)
 
 
+class InThisProcess:
+    """An executor that calls at once."""
+
+    @staticmethod
+    def submit(function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Results of the demo, and what it printed; of its seven runs four, two of them with the nodes.
@@ -92,11 +103,13 @@ def made(tmp_path_factory):
     """
     out, printed = tmp_path_factory.mktemp("case_study"), io.StringIO()
 
-    def with_nodes(run, directory, progress):
-        return in_process(run, directory) if run in WITH_NODES else demo._timed(run)
+    def with_nodes(run, directory, progress=None):
+        return in_process(run, directory / run.name) if run in WITH_NODES else demo._timed(run)
 
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setattr(demo, "RUNS", (*WITH_NODES, *(r for r in ALONE if r.model == "P3_m11")))
+        patch.setattr(demo, "TIMED", WITH_NODES[-1])
+        patch.setattr(demo, "processes", lambda count: contextlib.nullcontext(InThisProcess()))
         patch.setattr(demo, "_with_nodes", with_nodes)
         patch.setattr(demo, "_relay", lambda directory: 1e-3)
         demo.demo(out, Progress())
@@ -158,4 +171,19 @@ def test_terminal_shows_the_table_beside_the_published_numbers(made):
         assert number in made.printed
     assert f"{entry(made, 'R_m11', 'composite')['peak_joint_error_deg']:.4f}" in made.printed
     assert str(made.out / "summary.json") in made.printed
-    assert (made.out / "report.html").stat().st_size > 10_000
+
+
+def test_the_last_lines_and_the_report_say_what_the_designed_control_gains(made):
+    by = {s["control"]: s for s in made.summary["heavier_payload"]}
+    assert list(by) == ["slow", "composite", "designed"]
+    assert {s["payload_scale"] for s in by.values()} == {4.0 / 3.0}
+    last = made.printed.split("What is gained")[1]
+    page = (made.out / "report.html").read_text()
+    for control, name in heavier.NAMES.items():
+        assert f"{name}:" in last and f"{by[control]['peak_joint_error_deg']:.2f} deg" in last
+        assert name in page and (made.out / f"R_heavier_{control}" / "bag").is_dir()
+    for sentence in tables.compared(made.summary["heavier_payload"]):
+        assert sentence in last and sentence in page
+    assert len(last.splitlines()) <= 8
+    for suffix in ("png", "svg"):
+        assert (made.out / "figures" / "R_heavier" / f"overview.{suffix}").stat().st_size > 5000

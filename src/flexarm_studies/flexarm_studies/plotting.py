@@ -9,7 +9,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 
-SLOW, COMPOSITE, REFERENCE = "#c1502e", "#1f5a94", "#555555"
+SLOW, COMPOSITE, DESIGNED, REFERENCE = "#c1502e", "#1f5a94", "#2e7d4f", "#555555"
 STYLE = {
     "figure.figsize": (7.0, 3.8),
     "figure.dpi": 100,

@@ -10,7 +10,9 @@ import numpy as np
 
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE_FOOT
 
-from ..plotting import COMPOSITE, REFERENCE, SLOW, STYLE, plt, save
+from ..loop.metrics import tip_path
+from ..plotting import COMPOSITE, DESIGNED, REFERENCE, SLOW, STYLE, plt, save
+from . import heavier
 
 #: One sample in four is drawn: 250 points a second, 17 a period of the second mode.
 PLOTTED_EVERY = 4
@@ -161,3 +163,54 @@ def overview(slow, composite, model, title):
         f"{title}: 90 deg in 2 s (shaded), with and without the fast control", fontsize=12
     )
     return figure
+
+
+def draw_heavier(directory, records, model, heavier_model):
+    """Write the figure of the controls with a heavier payload as PNG and SVG to a `directory`; the PNG file.
+
+    `records` are those of `heavier.run`, by control; `heavier_model` is the simulated arm's.
+    """
+    looks = {"slow": (SLOW, 0.9), "composite": (COMPOSITE, 1.3), "designed": (DESIGNED, 1.9)}
+    panels = (
+        ("Joint angle error", "reference - joint angle [deg]", _angle_error),
+        ("The same, enlarged", "reference - joint angle [deg]", _angle_error),
+        (
+            "Tip deflection after the motion: what rings",
+            "tip deflection [ft]",
+            lambda r: r.tip_deflection(model) / FOOT,
+        ),
+        (
+            "Distance of the tip from the reference (dashed: 1 mm)",
+            "tip distance [mm]",
+            lambda r: _tip_distance(r, model, heavier_model),
+        ),
+    )
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(2, 2, figsize=(11.0, 6.4))
+        for ax, (title, unit, of) in zip(axes.flat, panels, strict=True):
+            for control, record in records.items():
+                colour, width = looks[control]
+                label = heavier.NAMES[control]
+                ax.plot(record.time, of(record), color=colour, linewidth=width, label=label)
+            _finish(ax, title, unit, record.time[-1])
+        shown = 1.4 * max(np.abs(_angle_error(records[c])).max() for c in ("slow", "designed"))
+        axes[0, 1].set_ylim(-shown, shown)
+        axes[1, 0].set_xlim(2.0, record.time[-1])
+        axes[1, 0].set_ylim(-0.03, 0.03)
+        axes[1, 1].set_yscale("log")
+        axes[1, 1].set_ylim(1e-3, 300.0)
+        axes[1, 1].axhline(1.0, color=REFERENCE, linestyle="--", linewidth=0.9)
+        figure.suptitle(
+            f"arm R with {heavier.PAYLOAD:.2f} times the payload that the controller knows: 90 deg in 2 s (shaded),"
+            f" {heavier.RATE:g} Hz, delay {1e3 * heavier.DELAY:g} ms",
+            fontsize=12,
+        )
+        figure.tight_layout()
+        return save(figure, *(Path(directory, f"overview.{s}") for s in ("png", "svg")))
+
+
+def _tip_distance(record, model, heavier_model):
+    """Distance of the simulated arm's tip from that of the rigid arm on the reference [mm]."""
+    tip = tip_path(heavier_model, record.plant_position, record.plant_amplitude)
+    straight = np.zeros((record.time.size, model.n_modes))
+    return 1e3 * np.linalg.norm(tip - tip_path(model, record.reference, straight), axis=1)

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The case study's tables, beside the published numbers."""
 
+from flexarm_dynamics.arm.units import FOOT
+
+from . import heavier
+
 #: Section 5 of Siciliano & Book (1986), magnitudes, in the paper's units.
 PRINT = {
     "k_f": (75.50, 6375.64, 17.07, 173.10),
@@ -59,3 +63,64 @@ def nonlinear_table(summaries, references):
             f"{s['peak_torque_lbf_ft']['total']:8.3f}{c['peak_torque_lbf_ft']['total']:7.3f}"
         )
     return lines
+
+
+def heavier_table(summaries):
+    """Lines of the table of the controls with a payload that they do not know."""
+    lines = [
+        f"The same motion of arm R, payload {heavier.PAYLOAD:.2f} times that of the arm file, {heavier.RATE:g} Hz,"
+        f" delay {1e3 * heavier.DELAY:g} ms, rates from the gauges",
+        f"{'':26}{'peak joint':>15}{'tip residual':>17}{'tip within 1 mm':>19}{'peak torque':>15}",
+        f"{'':26}{'error [deg]':>15}{'rms 3-8 s [ft]':>17}{'after motion [s]':>19}{'[lbf ft]':>15}",
+    ]
+    for s in summaries:
+        settled = s["settling_time_s"]
+        lines.append(
+            f"{heavier.NAMES[s['control']]:26}{s['peak_joint_error_deg']:15.3f}{s['residual_tip_rms_ft']:17.2e}"
+            f"{'never' if settled is None else format(settled, '.2f'):>19}"
+            f"{s['peak_torque_lbf_ft']['total']:15.3f}"
+        )
+    return lines
+
+
+def gained(summaries):
+    """Sentences on what the designed control gains over the paper's two, for the same payload."""
+    by = {s["control"]: s for s in summaries}
+    lines = [
+        "What is gained: the payload is a third heavier than the controller knows, and torque is"
+        f" {1e3 * heavier.DELAY:g} ms late."
+    ]
+    for control, s in by.items():
+        settled = s["settling_time_s"]
+        rest = (
+            "does not come to rest within 1 mm"
+            if settled is None
+            else f"is at rest within 1 mm {settled:.2f} s after the motion"
+        )
+        lines.append(
+            f"  {heavier.NAMES[control] + ':':20} the joint is up to {s['peak_joint_error_deg']:.2f} deg off; the tip"
+            f" vibrates by {1e3 * FOOT * s['residual_tip_rms_ft']:.2g} mm rms and {rest}"
+        )
+    return lines + [f"  {sentence}" for sentence in compared(summaries)]
+
+
+def compared(summaries):
+    """The designed control beside each of the paper's two, a sentence each."""
+    by, found = {s["control"]: s for s in summaries}, []
+    for control in ("composite", "slow"):
+        error, residual, settling = (
+            _ratio(by[control][key], by["designed"][key])
+            for key in ("peak_joint_error_deg", "residual_tip_rms_ft", "settling_time_s")
+        )
+        found.append(
+            f"Against the {heavier.NAMES[control]}, the designed control has {error} less joint error and {residual}"
+            f" less vibration, and rests {settling} sooner."
+        )
+    return found
+
+
+def _ratio(value, designed):
+    """How many times smaller the designed control's value is, in words."""
+    if value is None or not designed:
+        return "far"
+    return f"{float(f'{value / designed:.2g}'):g} times"

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm design``: a controller file for an arm, made for what may differ from the arm file, and what it bears."""
 
+import argparse
+import shlex
 import sys
 import time
 
@@ -27,6 +29,10 @@ COMMENTS = {
     "observer.bandwidth": "[rad/s]",
     "observer.joint_velocity_bandwidth": "[rad/s]",
 }
+#: Options that make a design another one.
+OF_THE_DESIGN = (
+    "rate", "delay", "payload", "stiffness", "damping", "gain", "speed", "at", "effort",
+)  # fmt: skip
 
 
 def add_arguments(parser):
@@ -110,7 +116,7 @@ def design(options):
     found = find(arm, settings, uncertainty, progress)
     found.check()
     bears = card(found)
-    text = controller_file(options.arm, found, card_lines(found, bears))
+    text = controller_file(options.arm, found, card_lines(found, bears), command(options))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
@@ -178,9 +184,23 @@ def _span(limits):
     return f"{low:.2g} to {'any' if not np.isfinite(high) else f'{high:.2g}'}"
 
 
-def controller_file(arm, found, lines):
+def command(options):
+    """The command line that makes the same design again."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    words = ["flexarm design", shlex.quote(options.arm)]
+    for name in OF_THE_DESIGN:
+        value = getattr(options, name)
+        if value != parser.get_default(name):
+            for one in value if isinstance(value, list) else [value]:
+                text = f"{one:g}" if isinstance(one, float) else one
+                words.append(f"--{name}{'=' if text.startswith('-') else ' '}{text}")
+    return " ".join(words)
+
+
+def controller_file(arm, found, lines, made_by):
     """Text of the nodes' parameter file."""
-    out = ["# Controller made by flexarm design. What it was found to do:"]
+    out = [f"# Controller made by: {made_by}", "# What it was found to do:"]
     out += [f"# {line}" for line in lines]
     out += ["/**:", "  ros__parameters:", f"    arm: {arm}"]
     section = None

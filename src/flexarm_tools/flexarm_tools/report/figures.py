@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 
-from flexarm_studies.plotting import COMPOSITE, REFERENCE, SLOW, plt
+from flexarm_studies.plotting import COMPOSITE, DESIGNED, REFERENCE, SLOW, plt
 from flexarm_studies.plotting import STYLE as PAPER_STYLE
 
 from . import analysis
@@ -27,7 +27,7 @@ STYLE = PAPER_STYLE | {
     "lines.linewidth": 1.2,
     "axes.titlelocation": "left",
 }
-COLOURS = (COMPOSITE, SLOW, "#2e7d4f", "#8a5fa8", "#b8860b", "#4f8f9f", "#a0456e", "#6b6b6b")
+COLOURS = (COMPOSITE, SLOW, DESIGNED, "#8a5fa8", "#b8860b", "#4f8f9f", "#a0456e", "#6b6b6b")
 #: Colours of the supervisor's states, in their order.
 STATE_COLOURS = ("#d0d0d0", "#9cc3e0", "#2e7d4f", "#8fcf9f", "#e0a030", "#c62828")
 UNKNOWN = "#f4f4f4"
