@@ -39,8 +39,9 @@ ARM = Argument(
     "", "arm file: a shipped name (R, two_link, ...) or a path; empty: the controller file's"
 )
 CONTROLLER = Argument(
-    "composite",
-    "controller file, for all nodes: a shipped name (composite, two_link, ...) or a path",
+    "",
+    "controller file, for all nodes: a shipped name (composite, two_link, ...) or a path; empty: the arm's shipped one,"
+    " for another arm none, and its control is designed",
 )
 NAMESPACE = Argument("", "namespace of the nodes and of their topics")
 LOCKSTEP = Argument(
@@ -111,7 +112,9 @@ def one_arm(values):
     """
     values = {"with_shape": SHAPE.default, **values}  # not an argument of every launch file
     check(values, ONE_ARM)
-    common = [str(parameter_files.find(values["controller"]))]
+    arm, file = values["arm"] or "R", values["controller"]
+    file = parameter_files.find(file) if file else parameter_files.of_arm(arm)
+    common = [str(file)] if file else []
     if values["arm"]:
         common.append({"arm": values["arm"]})
     own = {"namespace": values["namespace"], "log_level": values["log_level"]}

@@ -29,7 +29,8 @@ def values(arguments, **given):
 
 def merged(start):
     """Parameters that a node gets beside its file."""
-    return {k: v for part in start.parameters[1:] for k, v in part.items()}
+    parts = (part for part in start.parameters if isinstance(part, dict))
+    return {k: v for part in parts for k, v in part.items()}
 
 
 class Record(SimpleNamespace):
@@ -98,6 +99,14 @@ def test_with_simulator_false_leaves_the_simulator_out_and_an_arm_goes_to_every_
     assert [s.executable for s in starts] == ["observer", "controller"]
     assert [merged(s) for s in starts] == [{"arm": "one_link"}] * 2
     assert {s.log_level for s in starts} == {"debug"}
+
+
+def test_an_arm_of_ones_own_has_no_controller_file_and_a_shipped_one_has_its_own():
+    for arm, file in (("my_arm.yaml", None), ("two_link", "two_link"), ("P3", "composite")):
+        for start in launching.one_arm(values(launching.ONE_ARM, arm=arm)):
+            first = [str(parameter_files.find(file))] if file else []
+            assert start.parameters[: len(first)] == first and merged(start)["arm"] == arm
+            assert len([p for p in start.parameters if isinstance(p, str)]) == len(first)
 
 
 def test_two_arms_have_all_their_nodes_in_namespaces_of_their_own():

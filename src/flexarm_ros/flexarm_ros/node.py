@@ -5,16 +5,20 @@ import gc
 import re
 import signal
 import sys
+import time
 import traceback
 from collections import deque
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
 from functools import partial
+from threading import Thread
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.signals import SignalHandlerOptions
@@ -40,6 +44,8 @@ TRANSITIONS = {
 }
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 REPORT_EVERY = 10_000_000_000  # [ns]
+#: Work that the configuration waits for is in the log after the first of these times, then every second of them [s].
+FIRST_NOTICE, NEXT_NOTICE = 0.5, 10.0
 
 ARM = parameter("arm", "", read_only=True).described(
     "Arm file: a shipped name, such as R or two_link, or a path."
@@ -73,6 +79,7 @@ class ArmNode(LifecycleNode):
         scheduling.apply(
             given["cpu_affinity"], given["realtime_priority"], self.get_logger().warning
         )
+        self.stopped = ()  # holds something once the process is to end
         self.active = False
         self.control_path = None  # while active
         self._control_path = None
@@ -97,6 +104,51 @@ class ArmNode(LifecycleNode):
     def diagnose(self):
         """Return (level, message, {key: value}) for `/diagnostics`."""
         return OK, "", {}
+
+    # Long work in `build` --------------------------------------------------------------------
+
+    def wait_for(self, work, what):
+        """In `build`: what the function `work` returns, which takes long and is called in a thread of its own.
+
+        Meanwhile log and diagnostics state `what` the node does and for how long, and, where it starts by itself, its
+        parameters and life cycle are served.
+
+        Raises
+        ------
+        FlexarmError
+            When the process is to end; the thread goes on. Else what `work` raises.
+        """
+        future = _in_thread(work)
+        began, notice, shown = time.monotonic(), FIRST_NOTICE, 0.0
+        with self._served() as serve:
+            while not future.done():
+                serve(future)
+                if self.stopped or not self.context.ok():
+                    raise FlexarmError(f"stopped while {what}")
+                so_far = time.monotonic() - began
+                if so_far >= notice and not future.done():
+                    self.get_logger().info(f"{what}, {so_far:.0f} s so far: no torque meanwhile")
+                    notice = so_far + NEXT_NOTICE
+                if so_far >= shown + 1.0:
+                    shown = so_far
+                    self._publish_status(WARN, f"{what}, {so_far:.0f} s so far", {})
+        if notice != FIRST_NOTICE:
+            self.get_logger().info(f"{what}: done after {time.monotonic() - began:.0f} s")
+        return future.result()
+
+    @contextmanager
+    def _served(self):
+        """A function that waits a moment for a `Future`; it serves the node where nothing else does."""
+        if self.executor is not None:  # a transition that was asked for: its answer waits, too
+            yield lambda future: wait([future], 0.05)
+            return
+        executor = SingleThreadedExecutor(context=self.context)
+        executor.add_node(self)
+        try:
+            yield lambda future: executor.spin_once(timeout_sec=0.05)
+        finally:
+            executor.remove_node(self)
+            executor.shutdown()
 
     # Made and unmade with the configuration ----------------------------------------------------
 
@@ -257,7 +309,10 @@ class ArmNode(LifecycleNode):
     # Diagnostics -----------------------------------------------------------------------------
 
     def _publish_diagnostics(self):
-        level, message, values = self._with_mismatches(*self.diagnose())
+        self._publish_status(*self.diagnose())
+
+    def _publish_status(self, level, message, values):
+        level, message, values = self._with_mismatches(level, message, values)
         status = DiagnosticStatus(
             level=level,
             name=self.get_fully_qualified_name().lstrip("/"),
@@ -294,6 +349,20 @@ class ArmNode(LifecycleNode):
             self.get_logger().warning(text)
 
 
+def _in_thread(work):
+    """The `Future` of a function that is called in a thread, which does not keep the process from ending."""
+    future = Future()
+
+    def call():
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=call, name="work", daemon=True).start()
+    return future
+
+
 def run(node_class, args=None):
     """Run a node, or several in one process, until SIGINT or SIGTERM; the process's exit code.
 
@@ -321,8 +390,10 @@ def run(node_class, args=None):
             return 1
         made = node_class()
         nodes = list(made) if isinstance(made, (list, tuple)) else [made]
+        for node in nodes:
+            node.stopped = stopped
         if not all(node.autostart() for node in nodes):
-            return 1
+            return 0 if stopped else 1
         spin(nodes, stopped)
         return 0
     except (FlexarmError, ParameterException) as error:

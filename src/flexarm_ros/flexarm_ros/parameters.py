@@ -10,6 +10,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterValueException
+from rclpy.parameter import Parameter
 
 from flexarm_dynamics.errors import ParameterError
 
@@ -59,6 +60,12 @@ class NodeParameters:
     ------
     ParameterError
         When a value given at the start can't be used.
+
+    Attributes
+    ----------
+    given : set of str
+        Full names of the parameters that the user has set, at the start or later; of a file for all nodes also those
+        that this one has not.
     """
 
     def __init__(self, node, groups):
@@ -75,6 +82,7 @@ class NodeParameters:
                 # A scalar out of range: our own check says it with the unit.
                 parameter.check(node._parameter_overrides[name].value, prefix=prefix)
                 raise ParameterError(f"{name}: {error}") from None
+        self.given = set(node._parameter_overrides)
         self._warn_unknown()
         self._values = self._checked(self._given())
         node.add_on_set_parameters_callback(self._on_set)
@@ -104,6 +112,24 @@ class NodeParameters:
         """
         self._sizes = dict(sizes)
         self._values = self._checked(self._given())
+
+    def adopt(self, values):
+        """Take `values` by full names for all parameters that the user has not set; no listener is called.
+
+        Raises
+        ------
+        ParameterError
+            For a value that can't be used.
+        """
+        new = {k: v for k, v in values.items() if k in self._declared and k not in self.given}
+        new = [Parameter(k, value=v) for k, v in new.items() if v != self._values[k]]
+        listener, given, self._listener = self._listener, set(self.given), None
+        try:
+            done = self._node.set_parameters_atomically(new)
+        finally:
+            self._listener, self.given = listener, given
+        if not done.successful:
+            raise ParameterError(done.reason)
 
     def on_change(self, listener):
         """Call ``listener(set of changed names)`` after a set has been taken."""
@@ -153,5 +179,6 @@ class NodeParameters:
         if not changed:
             return
         self._values = {**self._values, **changed}
+        self.given |= set(changed)
         if self._listener is not None:
             self._listener(set(changed))

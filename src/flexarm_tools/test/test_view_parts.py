@@ -123,6 +123,7 @@ def test_arm_and_controller_belong_together_unless_both_are_given():
     assert (path.stem, arm) == ("two_link", "two_link")
     path, arm = command.files(None, "R")
     assert (path.stem, arm) == ("composite", "R")
+    assert command.files(None, "results/mine.yaml") == (None, "results/mine.yaml")
     path, arm = command.files("long_reach", None)
     assert (path.stem, arm) == ("long_reach", "long_reach")
     path, arm = command.files("composite", "one_link")

@@ -5,6 +5,7 @@ from concurrent.futures import CancelledError
 
 from flexarm_dynamics.models.model import build
 
+from ..robust import default
 from .assembly import control
 from .design_process import AwayError, DesignProcess
 
@@ -16,6 +17,11 @@ def ready(model):
 def prepare(model, feedforward, trajectory, start):
     """``feedforward.prepare(trajectory, start)``, callable in the design process; its `model` is not needed."""
     return feedforward.prepare(trajectory, start)
+
+
+def find(model, settings, uncertainty):
+    """`default.find` for the model's arm, callable in the design process."""
+    return default.find(model.arm, settings, uncertainty)
 
 
 class Designer:
@@ -63,6 +69,13 @@ class Designer:
             return self._in_process(prepare, feedforward, trajectory, start)
         except AwayError:
             return feedforward.prepare(trajectory, start)
+
+    def find(self, settings, uncertainty):
+        """What `default.find` makes of the same `settings` and `uncertainty`; a `CancelledError` after `close`."""
+        try:
+            return self._in_process(find, settings, uncertainty)
+        except AwayError:
+            return find(self.model, settings, uncertainty)
 
     def _in_process(self, function, *arguments):
         """``function(model, *arguments)`` in the process; an `AwayError`, with a warning, where that can't be."""

@@ -22,6 +22,7 @@ from ..composite import assembly
 from ..composite.designer import Designer
 from ..loop.arm_controller import ArmController
 from ..loop.samples import ArmSample
+from ..robust.default import default, is_wanted, task
 from . import controller_parameters
 from .controller_designs import Designs
 from .controller_report import Report
@@ -47,6 +48,11 @@ class ControllerNode(ArmNode):
         self.arm = arm = arm_file.load(parameters["arm"])
         self.model = model.build(arm)
         parameters.resolve(sizes(self.model))
+        self._close_workers()
+        process = parameters["design_process"]
+        designer = Designer(self.model, log.warning, process, scheduling.spare())
+        self._workers = (designer,)
+        self.design = self._default(designer)
         values = parameters.values()
         law = assembly.control(self.model, values)
         for warning in law.warnings():
@@ -55,7 +61,8 @@ class ControllerNode(ArmNode):
         self.core = ArmController(self.model, law, limits, parameters["start_tolerance"])
         self.core.warm_up()
         self._report = Report(self, self.core)
-        self._make_workers()
+        self._inbox = TrajectoryInbox(self, self.core, designer)
+        self._workers = designer, Designs(self, self.core, designer), self._inbox
         self._reader = StateReader(arm)
         self._sample = ArmSample(len(arm.joints), len(arm.modes))
         self._torque = TorqueWriter(arm)
@@ -65,12 +72,19 @@ class ControllerNode(ArmNode):
         self._ticks, self._seen = 0, False
         self._make_topics()
 
-    def _make_workers(self):
-        self._close_workers()
-        warn, process = self.get_logger().warning, self.parameters["design_process"]
-        designer = Designer(self.model, warn, process, scheduling.spare())
-        self._inbox = TrajectoryInbox(self, self.core, designer)
-        self._workers = designer, Designs(self, self.core, designer), self._inbox
+    def _default(self, designer):
+        """The `Default` for an arm without laws, once there is one, its parameters adopted; None for one with laws."""
+        parameters, arm = self.parameters, self.arm
+        if not is_wanted(parameters["arm"], parameters.given, parameters["design.type"]):
+            return None
+        wanted = task(arm, parameters.values())
+
+        def make():
+            return default(arm, *wanted, lambda _, *task: designer.find(*task))
+
+        found = self.wait_for(make, f"designing the control of {arm.name}")
+        parameters.adopt(found.parameters)
+        return found
 
     def _close_workers(self):
         for worker in self._workers:
@@ -174,7 +188,8 @@ class ControllerNode(ArmNode):
         self._inbox.warm_up()
         slow, fast = self.parameters["slow.type"], self.parameters["fast.type"]
         self.get_logger().info(
-            f"arm {self.arm.name}, slow {slow}, fast {fast}: torque with the first valid state"
+            f"arm {self.arm.name}, {'designed: ' if self.design else ''}slow {slow}, fast {fast}: torque with the first"
+            " valid state"
         )
 
     def stop(self):

@@ -8,6 +8,7 @@ from ..composite import assembly
 from ..composite.design import PARAMETERS as DESIGN
 from ..loop.arm_controller import PARAMETERS as CONTROLLER
 from ..loop.arm_controller import START_TOLERANCE
+from ..robust import default
 
 STATE_TIMEOUT = parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
     "Without a state for so long the torque is disabled: a fault."
@@ -25,7 +26,10 @@ _DESIGN = frozenset(p.name for p in DESIGN)
 def groups():
     """Declared parameters of the controller node, by prefix."""
     return {
-        "": (ARM, *CONTROLLER, START_TOLERANCE, STATE_TIMEOUT, DESIGN_PROCESS, *DESIGN),
+        "": (
+            *(ARM, *CONTROLLER, START_TOLERANCE, STATE_TIMEOUT, DESIGN_PROCESS),
+            *(*DESIGN, *default.PARAMETERS),
+        ),
         **{f"{name}.": assembly.declarations(name) for name in assembly.CONTROL},
     }
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer node: `arm_state` in, `arm_state_estimate` and `observer/state` out."""
 
+from dataclasses import replace
 from time import perf_counter
 
 from std_srvs.srv import Trigger
@@ -17,12 +18,20 @@ from flexarm_ros.start import leave
 from ..composite import assembly
 from ..loop.samples import ArmSample
 from ..observers import arm_observer, gauge_health
+from ..robust import default
 from .observer_statistics import ObserverStatistics
+
+RATE = replace(default.RATE, read_only=True).described(
+    "Samples per second that the driver or simulator sends: the controller's parameter of this name."
+)
 
 
 def parameter_groups():
     """Declared parameters of this node, by prefix."""
-    return {"": (ARM,), "observer.": assembly.declarations("observer")}
+    return {
+        "": (ARM, RATE, *default.PARAMETERS),
+        "observer.": assembly.declarations("observer"),
+    }
 
 
 class ObserverNode(ArmNode):
@@ -36,6 +45,11 @@ class ObserverNode(ArmNode):
         self.arm = arm_file.load(parameters["arm"])
         self.model = model.build(self.arm)
         parameters.resolve(sizes(self.model))
+        kind = parameters["design.type"]
+        self.designed = default.is_wanted(parameters["arm"], parameters.given, kind)
+        if self.designed:
+            settings, _ = default.task(self.arm, parameters.values())
+            parameters.adopt(default.for_observer(self.model, settings))
         self._new_core().warm_up()
         self.core = self._new_core()
         parameters.on_change(self._changed)
@@ -61,7 +75,9 @@ class ObserverNode(ArmNode):
             self.core.observer = observer
 
     def start(self):
-        self.get_logger().info(f"arm {self.arm.name}, observer {self.parameters['observer.type']}")
+        designed = "designed: " if self.designed else ""
+        kind = self.parameters["observer.type"]
+        self.get_logger().info(f"arm {self.arm.name}, {designed}observer {kind}")
 
     def _on_state(self, msg):
         if not self.active:

@@ -31,7 +31,7 @@ TYPES = {
 AUTO, ROBUST, NONE = "auto", "robust", "none"
 PREFIX = "design."
 
-_RATE = next(p for p in DESIGN if p.name == "rate")
+RATE = next(p for p in DESIGN if p.name == "rate")
 
 
 def _factors(name, what):
@@ -184,7 +184,7 @@ def wanted_task(name, arm, values):
     values : mapping
         Flat parameters, those of `PARAMETERS` among them.
     """
-    declared = (*PARAMETERS, _RATE)
+    declared = (*PARAMETERS, RATE)
     names = {p.name for p in declared}
     checked = check_all(declared, {k: v for k, v in values.items() if k in names})
     return task(arm, checked) if is_wanted(name, values, checked["design.type"]) else None

@@ -6,6 +6,7 @@ from pathlib import Path
 import yaml
 
 from flexarm_control.composite import assembly
+from flexarm_control.robust.default import PAPER_ARMS
 from flexarm_dynamics.arm.arm_file import arms_directories
 from flexarm_dynamics.errors import ParameterError
 
@@ -27,6 +28,14 @@ def find(name):
     raise ParameterError(
         "is neither a file nor shipped", field="controller file", value=str(name), limit=shipped
     )
+
+
+def of_arm(arm):
+    """Path of the shipped controller file of an arm, by its name or path; None for one that gets a design instead."""
+    if arm in PAPER_ARMS:
+        return find("composite")
+    shipped = directory() / f"{arm}.yaml"
+    return shipped if shipped.is_file() else None
 
 
 def load(name):

@@ -43,7 +43,7 @@ def add_arguments(parser):
     add(
         "--controller",
         metavar="FILE",
-        help="parameter file of the nodes: a shipped name or a path (default: the arm's own, or composite)",
+        help="parameter file of the nodes: a shipped name or a path (default: the arm's own, or a design)",
     )
     add(
         "--attach",
@@ -112,7 +112,7 @@ def check(options):
 
 
 def files(controller, arm):
-    """Controller file and arm of the nodes to start, where one or both are not given.
+    """Controller file and arm of the nodes to start, where one or both are not given; no file: a design is made.
 
     Raises
     ------
@@ -121,8 +121,7 @@ def files(controller, arm):
     """
     if controller is None:
         arm = arm or "two_link"
-        shipped = parameter_files.directory() / f"{arm}.yaml"
-        return parameter_files.find(arm if shipped.is_file() else "composite"), arm
+        return parameter_files.of_arm(arm), arm
     path = parameter_files.find(controller)
     return path, arm or parameter_files.load(path)["controller"].get("arm", "two_link")
 

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes with an arm file and no other parameter: they make the arm's design, once, and agree on it."""
+
+import signal
+import threading
+
+import pytest
+from in_process import InProcess
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from flexarm_control.motions import profiles
+from flexarm_control.robust import cache, default
+from flexarm_dynamics.arm import arm_file
+from flexarm_ros.node import WARN
+from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
+from flexarm_studies.random_arms import generator
+from flexarm_tools.running import lockstep
+
+#: A design that is quickly made.
+QUICK = {"rate": 500.0, "design.effort": 0.1}
+PATIENT = {"state_timeout": 60.0, "design_process": False}
+
+
+@pytest.fixture(autouse=True)
+def empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "cache_directory", lambda: tmp_path)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """File of an arm that is not shipped."""
+    file = tmp_path / "arm.yaml"
+    file.write_text(generator.arm(0).text)
+    return str(file)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Counts the designs that are made."""
+    count, real = [], default.design
+    monkeypatch.setattr(default, "design", lambda *a: count.append(a) or real(*a))
+    return count
+
+
+def test_an_arm_file_is_all_that_the_nodes_need(path, made):
+    model = arm_file.load(path)
+    with InProcess() as nodes:
+        nodes.start("simulator", {"arm": path, "rate": 500.0, "lockstep": True})
+        nodes.start("observer", {"arm": path, **QUICK})
+        nodes.start("controller", {"arm": path, **QUICK, **PATIENT})
+        control, watch = (nodes.nodes[k].parameters.values() for k in ("controller", "observer"))
+        designed = nodes.nodes["controller"].design.parameters
+        assert designed["slow.type"] == "joint_pid" and len(made) == 1
+        for name, value in designed.items():
+            assert (watch if name.startswith("observer.") else control)[name] == value, name
+        assert "designed: slow joint_pid, fast fixed_gain" in nodes.log("controller")
+        assert "designed: observer filtered_derivative" in nodes.log("observer")
+        profile = profiles.quintic(0.0, 0.5, 1.0)
+        message = lockstep.trajectory_message(model.joint_names, profile, 51, TRAJECTORY_START_NS)
+        nodes.record(message, 2.0)
+        assert nodes.nodes["controller"].core.state.name == "HOLDING"
+        error = nodes.nodes["controller"].core.position_error.copy()
+    assert abs(error[0]) < 2e-3
+
+
+def test_each_parameter_given_by_hand_stays_and_a_design_is_made_once(path, made):
+    with InProcess() as nodes:
+        for key, own in {"plain": {}, "damped": {"slow.damping": [3.0]}}.items():
+            nodes.start("controller", {"arm": path, **QUICK, **PATIENT, **own}, key=key)
+        first, second = (nodes.nodes[k].parameters.values() for k in ("plain", "damped"))
+        assert {k for k in first if first[k] != second[k]} == {"slow.damping"}
+        assert second["slow.damping"] == [3.0] and len(made) == 1
+        assert nodes.nodes["damped"].core.law.slow.parameters["damping"] == [3.0]
+
+
+def test_a_node_that_is_configured_anew_takes_its_design_again(path, made):
+    with InProcess() as nodes:
+        nodes.start("controller", {"arm": path, **QUICK, **PATIENT})
+        node = nodes.nodes["controller"]
+        before = node.parameters.values()
+        changed = [Parameter("slow.damping", value=[3.0])]
+        assert node.set_parameters_atomically(changed).successful
+        for trigger in ("deactivate", "cleanup", "configure", "activate"):
+            assert getattr(node, f"trigger_{trigger}")() == TransitionCallbackReturn.SUCCESS
+        assert node.parameters.values() == before | {"slow.damping": [3.0]}
+        assert len(made) == 1
+        del node
+
+
+def test_laws_chosen_by_hand_and_the_papers_arms_need_no_design(path, made):
+    with InProcess() as nodes:
+        chosen = {"slow.type": "model_following", "fast.type": "none"}
+        nodes.start("controller", {"arm": path, **PATIENT, **chosen}, key="chosen")
+        nodes.start("observer", {"arm": path, **chosen}, key="watch")
+        nodes.start("controller", {"arm": "R", **PATIENT}, key="R")
+        assert nodes.nodes["R"].parameters["fast.type"] == "lqr"
+        assert nodes.nodes["watch"].parameters["observer.bandwidth"] == 1000.0
+    assert not made
+
+
+def test_what_no_gains_hold_is_no_configuration(path):
+    with InProcess() as nodes:
+        own = {**QUICK, **PATIENT, "design.gain": [0.001, 1000.0], "autostart": False}
+        nodes.start("controller", {"arm": path, **own})
+        nodes.nodes["controller"].trigger_configure()
+        failure = nodes.nodes["controller"].failure
+        assert "no gains hold all of it" in failure and "gain x 1000" in failure
+        assert not hasattr(nodes.nodes["controller"], "core")
+
+
+def test_while_a_design_is_made_the_node_says_so_and_answers(path, monkeypatch):
+    go_on, answers = threading.Event(), []
+    real = default.design
+
+    def slow(*task):
+        assert go_on.wait(30.0)
+        return real(*task)
+
+    monkeypatch.setattr(default, "design", slow)
+    with InProcess() as nodes:
+        nodes.start("controller", {"arm": path, **PATIENT, **QUICK, "autostart": False})
+
+        def diagnostics(array):
+            answers.append(array.status[0])
+            go_on.set()
+
+        nodes.nodes["controller"]._diagnostics.publish = diagnostics
+        nodes.nodes["controller"].trigger_configure()
+        assert answers[0].level == WARN and "designing the control of" in answers[0].message
+        assert "1 s so far" in answers[0].message
+        assert "no torque meanwhile" in nodes.log("controller")
+
+
+def test_a_node_that_designs_serves_and_ends(bench, tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(generator.arm(3).text)
+    # A search that takes minutes.
+    bench.start("controller", {"arm": str(path), "design.effort": 100.0})
+    bench.wait_for("the log", lambda: "so far: no torque meanwhile" in bench.log("controller"))
+    assert bench.lifecycle("controller") == "configuring"
+    assert bench.stop("controller", signal.SIGINT) == 0
