@@ -283,6 +283,9 @@ LAWS = [
             "(middle, high) if stable(middle)",
             "(low, high) if stable(middle)",
         ),
+        ("card", "half of the phase", "np.exp(-1j * phase)", "np.exp(-0.5j * phase)"),
+        ("tip", "the gains' sign", "np.linalg.solve(A - B @ K", "np.linalg.solve(A + B @ K"),
+        ("tip", "settling looked for to 20 %", "SETTLED = 0.02", "SETTLED = 0.2"),
     ),
     *of(
         "flexarm_control",

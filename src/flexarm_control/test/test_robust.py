@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
-from flexarm_control.robust.card import card
+from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Slowest, Wanted, eigenvalues, gradient
 from flexarm_control.robust.design import Settings, design, units
 from flexarm_control.robust.loop import Sampling, sampled_loop
@@ -190,6 +190,76 @@ def test_the_card_ends_where_the_loop_becomes_unstable(designed):
     assert slowest(0.99 * bears.delay) < 1.0 < slowest(1.01 * bears.delay)
     assert bears.delay > 0.004 and bears.gain[0] < 0.5 and bears.gain[1] > 2.0
     assert bears.payload[1] > 2.0 and bears.stiffness[0] < 0.6
+
+
+@pytest.fixture(scope="module")
+def stated_loop(designed):
+    """The loop with the arm as in its file, one mode richer."""
+    plant = build(richer(designed.arm))
+    return sampled_loop(
+        build(designed.arm), plant, designed.configurations[0], designed.sampling
+    ), plant
+
+
+def pushed(designed, stated_loop, K, samples):
+    """The tip's displacement across its link under 1 N from the first sample on, with gains K [m]."""
+    loop, plant = stated_loop
+    link, q = designed.arm.links[0], designed.configurations[0]
+    across = np.append(link.length, plant.mode_shapes(link.name, "y")(1.0))
+    A, _ = linear_plant(plant, q, coulomb=False)
+    half = len(A) // 2
+    force = np.append(np.zeros(half), np.linalg.solve(plant.terms(q, np.zeros(1)).M, across))
+    push, X, tip = np.zeros(len(loop.F)), np.zeros(len(loop.F)), []
+    push[: len(A)] = sampled(A, force[:, None], loop.period)[1][:, 0]
+    closed = loop.F - loop.G @ (K @ loop.N)
+    for _ in range(samples):
+        tip.append(across @ X[:half])
+        X = closed @ X + push
+    return np.array(tip)
+
+
+def test_the_phase_margin_is_that_of_the_loop_cut_at_the_torque(designed, stated_loop):
+    loop, _ = stated_loop
+    omega = np.geomspace(0.3, np.pi * 500.0, 20000)
+    z = np.exp(1j * omega * loop.period)[:, None, None]
+    L = designed.K @ loop.N @ np.linalg.solve(z * np.eye(len(loop.F)) - loop.F, loop.G + 0j * z)
+    crossings = np.flatnonzero(np.diff(np.sign(np.abs(L[:, 0, 0]) - 1.0)))
+    margins = np.abs(np.angle(-L[crossings, 0, 0]))
+    assert_allclose(card(designed).phase, margins.min(), rtol=2e-3)
+
+
+def test_the_tip_is_as_stiff_as_links_and_joints_are(designed, stated_loop):
+    bears, link = card(designed), designed.arm.links[0]
+    # A cantilever's 3 EI / L^3; a few modes are a little stiffer.
+    assert_allclose(bears.tip_stiffness, 3.0 * link.stiffness["y"] / link.length**3, rtol=0.01)
+    without = designed.K.copy()
+    without[:, 2] = 0.0
+    for K, stiffness in (
+        (designed.K, bears.tip_stiffness),
+        (without, bears.tip_stiffness_proportional),
+    ):
+        assert_allclose(stiffness, 1.0 / pushed(designed, stated_loop, K, 8000)[-1], rtol=1e-4)
+    assert bears.tip_stiffness_proportional < 0.8 * bears.tip_stiffness
+
+
+def test_settling_is_that_of_the_sampled_loop_under_a_step_of_force(designed, stated_loop):
+    tip = pushed(designed, stated_loop, designed.K, 8000)
+    away = np.abs(tip - tip[-1])
+    last = np.flatnonzero(away > 0.02 * away.max())[-1]
+    bears = card(designed)
+    assert_allclose(bears.settling, (last + 1) * designed.sampling.period, rtol=0.01)
+    assert bears.settling < bears.slowest < 3.0
+
+
+def test_a_rigid_arm_gives_way_at_its_joints_alone():
+    arm = arm_file.load("rigid")
+    found = design(arm, replace(QUICK, effort=0.05))
+    bears = card(found)
+    assert np.isinf(bears.tip_stiffness) and 0.0 < bears.tip_stiffness_proportional < 1e5
+    assert 0.0 < bears.settling < 5.0
+    assert len(poles(found)) == len(found.slowest)
+    for (name, _, s), (same, slowest, _) in zip(poles(found), found.slowest, strict=True):
+        assert name == same and np.abs(s - slowest).min() < 1e-6
 
 
 def test_a_mode_that_no_torque_reaches_is_left_to_itself():

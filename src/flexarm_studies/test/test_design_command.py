@@ -4,6 +4,8 @@
 import json
 import re
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
 from flexarm_bringup import cli
@@ -71,6 +73,30 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
     assert "exists already" in capsys.readouterr().err
 
 
+def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
+    held = []
+    monkeypatch.setattr(plt, "close", held.append)
+    path = tmp_path / "card.svg"
+    words = ["design", "R", *LOOP, "--effort", "0.1", "--figure", str(path), "--json"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert found["tip_stiffness_N_m"] > found["tip_stiffness_without_integral_N_m"] > 0.0
+    assert 0.0 < found["phase_rad"] < 3.2 and found["settling_s"] > 0.0
+    assert found["payload"][1] is None or found["payload"][1] > 1.3
+    assert "<svg" in path.read_text()
+    poles, decays, borne, noise = held[0].axes
+    slowest = [-row["value"] for row in found["slowest"]]
+    np.testing.assert_allclose([bar.get_width() for bar in decays.patches], slowest)
+    drawn = np.concatenate([line.get_ydata() for line in poles.get_lines()[: len(slowest)]])
+    for row in found["slowest"]:
+        assert np.abs(drawn + row["pole"][0]).min() < 1e-6
+    ends = [line.get_xdata() for line in borne.get_lines() if len(line.get_xdata()) == 2]
+    low, high = found["gain"]
+    np.testing.assert_allclose(ends[0], (low or 1.0 / 16.0, high or 16.0))
+    np.testing.assert_allclose(noise.patches[0].get_width(), 100.0 * found["noise"][0])
+    assert any(f"{np.degrees(found['phase_rad']):.2g} deg" in t.get_text() for t in noise.texts)
+
+
 def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
     # No arm bears a torque that may be a hundredth or a hundred times what is sent.
     wide = ["--gain", "0.01:100", "--effort", "0.1"]
@@ -90,6 +116,7 @@ def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
         ("--payload", "1.1:1.3", "no range of factors"),
         ("--rate", "1", "out of range"),
         ("--speed", "2", "out of range"),
+        ("--figure", "card.doc", "wrong suffix"),
         ("--at", "0,1", "wrong number of angles"),
     ],
 )

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a design bears: how far gain, delay, payload and stiffness may be off until a loop becomes unstable."""
+"""What a design bears: how far gain, phase, delay, payload and stiffness may be off until a loop becomes unstable."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import eigvals
 
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models.model import build
 
-from .decay import Slowest, Wanted
-from .loop import sampled_loop
-from .uncertain import own_damping, richer
+from .decay import eigenvalues
+from .loop import measured_amplitudes, sampled_loop
+from .tip import Tip, softest
+from .uncertain import richer, uncertain_loops
 
 #: Bisections of a limit, and the farthest that is looked: factors, and periods of delay.
 BISECTIONS, FARTHEST, LATEST = 12, 16.0, 40.0
+#: A pole with the decay d has 2 % left after this over d.
+LEFT = 4.0
 
 
 @dataclass(frozen=True)
@@ -27,25 +31,36 @@ class Card:
         Least and greatest factor; 0 and infinite: none was found within `FARTHEST` [-].
     delay : float
         Longest delay [s]; infinite: beyond `LATEST` periods.
+    phase : float
+        Phase margin: by so much the torques of all joints may lag or lead [rad].
     damping : float
         Least damping ratio of the poles below omega_c, the arm as in its file [-].
     settling : float
-        After this time the slowest of the uncertain loops has 2 % left [s].
+        Time after which a tip that a constant force has moved and that is let go has 2 % left, the arm as in its file,
+        in the slowest configuration [s].
+    slowest : float
+        After this time the slowest pole of the uncertain loops has 2 % left [s].
+    tip_stiffness, tip_stiffness_proportional : float
+        Of the tip against a static force, in the softest direction and configuration: when the integral has brought
+        the joints back, so that the links alone bend, and without the integral [N/m].
     """
 
     gain: tuple
     payload: tuple
     stiffness: tuple
     delay: float
+    phase: float
     damping: float
     settling: float
+    slowest: float
+    tip_stiffness: float
+    tip_stiffness_proportional: float
 
 
 def card(design):
     """The `Card` of a design."""
     arm, sampling, nominal = richer(design.arm), design.sampling, build(design.arm)
-    wanted = Wanted(design.omega_1, np.inf, own_damping(design.arm, design.uncertainty))
-    plants = {}
+    plants, K = {}, design.K
 
     def loops(payload=1.0, stiffness=1.0, gain=1.0, delay=None):
         key = payload, stiffness
@@ -55,15 +70,13 @@ def card(design):
         for q in design.configurations:
             yield sampled_loop(nominal, plants[key], q, late, gain)
 
-    def stable(**off):
+    def stable(phase=0.0, **off):
+        # A loop with real numbers and a lag is as stable as one with the same lead.
+        turned = K * np.exp(-1j * phase) if phase else K
         try:
-            for loop in loops(**off):
-                one = Slowest([loop], wanted, np.ones(design.K.shape))
-                if one.values(design.K[one.free])[0][3].max() >= 0.0:
-                    return False
+            return all(np.abs(_poles(loop, turned)).max() < 1.0 for loop in loops(**off))
         except ModelError:  # it does not rest there
             return False
-        return True
 
     def limits(name):
         if not stable():
@@ -72,23 +85,51 @@ def card(design):
         high = _limit(lambda f: stable(**{name: f}), 1.0, FARTHEST)
         return (0.0 if np.isinf(low) else 1.0 / low), high
 
-    damping = np.inf
-    for loop in loops():
-        one = Slowest([loop], wanted, np.ones(design.K.shape))
-        s = np.log(one.values(design.K[one.free])[0][2]) / loop.period
+    damping, stated = np.inf, list(loops())
+    for loop in stated:
+        s = np.log(eigenvalues(loop, K)[1]) / loop.period
         s = s[(np.abs(s) < design.omega_c) & (s.imag > 0.0)]
         damping = min(damping, float((-s.real / np.abs(s)).min(initial=np.inf)))
     period = sampling.period
     latest = _limit(lambda late: stable(delay=late * period), sampling.delay / period, LATEST)
-    decay = design.decay * design.omega_1
+    phase = _limit(lambda angle: stable(phase=angle), 0.0, np.pi)
+    slowest = min(-pole.real for _, pole, _ in design.slowest)
+    tips = [Tip(plants[1.0, 1.0], q) for q in design.configurations]
+    n, m, more = nominal.n_joints, nominal.n_modes, plants[1.0, 1.0]
+    given = np.hstack([K[:, :n], K[:, 3 * n : 3 * n + m] @ measured_amplitudes(nominal, more)])
+    settling = np.inf
+    if stable():
+        settling = max(
+            tip.settling(loop, K, softest(tip.compliance(given))[1])
+            for tip, loop in zip(tips, stated, strict=True)
+        )
     return Card(
         limits("gain"),
         limits("payload"),
         limits("stiffness"),
         latest * period,
+        min(phase, np.pi),
         damping,
-        4.0 / decay if decay > 0.0 else np.inf,
+        settling,
+        LEFT / slowest if slowest > 0.0 else np.inf,
+        min(softest(tip.compliance())[0] for tip in tips),
+        min(softest(tip.compliance(given))[0] for tip in tips),
     )
+
+
+def poles(design):
+    """Poles of all loops that a design is for: (name, fraction of the decay that is asked, s (k,)) of each [1/s]."""
+    found = uncertain_loops(
+        build(design.arm), design.configurations, design.sampling, design.uncertainty
+    )
+    return [
+        (loop.name, loop.fraction, np.log(eigenvalues(loop, design.K)[1]) / loop.period)
+        for loop in found
+    ]
+
+
+def _poles(loop, K):
+    return eigvals(loop.F - loop.G @ (K @ loop.N), check_finite=False)
 
 
 def _limit(stable, low, high):

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
 
-from .options import add_arm_arguments, angles, in_range, new_path, numbers, show
+from .options import add_arm_arguments, angles, check_file, in_range, new_path, numbers, show
 
 #: Comments of the controller file, by the start of a parameter's name.
 COMMENTS = {
@@ -45,6 +45,7 @@ def add_arguments(parser):
     add = parser.add_argument
     add_arm_arguments(parser, "the design and what it bears as JSON")
     add("--out", metavar="FILE", help="controller file to write; not given: printed")
+    add("--figure", metavar="FILE.png", help="draw it: poles, decay, what is borne, noise")
     add("--rate", type=float, default=1000.0, help="samples per second (1000)")
     add(
         "--delay",
@@ -89,6 +90,7 @@ def design(options):
 
     arm = arm_file.load(options.arm)
     out = None if options.out is None else new_path(options.out, "--out")
+    figure = None if options.figure is None else check_file(options.figure, "--figure")
     rate = in_range("--rate", options.rate, 10.0, 20000.0)
     delay = None if options.delay is None else in_range("--delay", options.delay, 0.0, 0.1)
     at = tuple(tuple(angles(text, arm, "--at").tolist()) for text in options.at or ())
@@ -134,12 +136,31 @@ def design(options):
         "stiffness": list(bears.stiffness),
         "delay_s": bears.delay,
         "damping": bears.damping,
+        "phase_rad": bears.phase,
         "settling_s": bears.settling,
+        "slowest_settling_s": bears.slowest,
+        "tip_stiffness_N_m": bears.tip_stiffness,
+        "tip_stiffness_without_integral_N_m": bears.tip_stiffness_proportional,
     }
     lines = card_lines(found, bears)
     lines += ["", f"written to {out}" if out else text]
-    show(options, result, lines, default=float)
+    if figure is not None:
+        from .design_figure import draw
+
+        lines += [f"figure {draw(found, bears, figure)}"]
+    show(options, _finite(result), lines, allow_nan=False)
     return 0
+
+
+def _finite(value):
+    """A value for JSON: null for what is without limit."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(one) for one in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
 
 
 def _factors(option, text):
@@ -159,12 +180,16 @@ def card_lines(found, bears):
         f" {len(found.configurations)} configurations, {found.settings.rate:g} Hz, delay"
         f" {1e3 * found.settings.delay:.3g} ms",
         f"  worst decay         {-pole.real:.3g} 1/s ({found.decay:.2f} of what is asked): {name}",
-        f"  expected settling   {bears.settling:.2g} s to 2 %, in the worst of these loops",
+        f"  expected settling   {bears.settling:.3g} s after a push at the tip, to 2 %, with the file's numbers;"
+        f" slowest pole of all loops: {bears.slowest:.3g} s",
+        f"  tip stiffness       {_number(bears.tip_stiffness)} N/m when the integral has acted, the links alone bend;"
+        f" {_number(bears.tip_stiffness_proportional)} N/m without it",
         f"  damping ratio       {bears.damping:.2g} at least, with the file's numbers",
         f"  bears gain          x {_span(bears.gain)}",
         f"  bears payload       x {_span(bears.payload)}",
         f"  bears stiffness     x {_span(bears.stiffness)}",
         f"  bears delay         {_number(1e3 * bears.delay)} ms",
+        f"  phase margin        {np.degrees(bears.phase):.2g} deg",
         f"  noise in the torque {', '.join(f'{100.0 * share:.2g} %' for share in found.noise)} of the limit, rms",
     ]
     if found.left:
