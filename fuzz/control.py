@@ -44,7 +44,7 @@ def healthy(arm, law, samples):
         fast,
         {"type": "luenberger"},
         {"publish_rates": True},
-        {"feedforward": "none"},
+        {"feedforward": "none", "trajectory_torque_margin": 0.0},
         manifold,
     )
     measured, estimated = [], []
@@ -224,6 +224,7 @@ class Controllers(_Path):
         slow, fast, manifold = law
         made = design(arm_model, slow, fast, manifold, {"feedforward": feedforward})
         limits = {"torque_limit": [2.0], "torque_rate_limit": [500.0]}
+        limits["trajectory_torque_margin"] = 0.0  # motions at that limit, and beyond it
         settings = check_all(PARAMETERS, limits, sizes(arm_model))
         core = ArmController(arm_model, made, settings)
         return core, CompositeStateWriter(arm_model)

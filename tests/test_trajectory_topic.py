@@ -20,7 +20,9 @@ MS = 1_000_000
 def standing_loop(bench):
     """The three nodes in lockstep, paused at 10 ms, with an arm that has limits."""
     lockstep = {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02}
-    bench.start_loop(lockstep, controller={**PATIENT, "fast.type": "none"}, arm="one_link")
+    # Some of the motions here take more torque than the arm has.
+    controller = {**PATIENT, "fast.type": "none", "trajectory_torque_margin": 0.0}
+    bench.start_loop(lockstep, controller=controller, arm="one_link")
     arm = Arm(bench, pauses_at=10)
     arm.wait_standing()
     return arm
@@ -201,6 +203,27 @@ def test_a_refused_trajectory_leaves_the_one_that_is_followed(arm):
     samples = arm.run(0.4)
     assert arm.state.accepted_trajectory_id == number
     follows(samples, start, quintic, 0.4)
+
+
+def test_what_needs_more_torque_than_the_arm_has_is_refused_and_the_motion_goes_on(arm):
+    (result,) = arm.bench.set("controller", trajectory_torque_margin=1.0)
+    assert result.successful, result.reason
+    try:
+        quintic = profiles.quintic(0.0, 0.1, 0.4)
+        number = arm.offer(trajectory(J, (0.4, [0.1], [0.0], [0.0])))
+        start = arm.now + MS
+        arm.run(0.1)
+        reason = arm.refused(trajectory(J, (0.4, [2.0], [0.0], [0.0])))
+        assert re.search(
+            r"points\[0\]: torque of joint joint1 at 0\.\d+ s: -?\d+\.\d+ N m are needed there, more than the"
+            r" torque limit \(13\.5\); give it \d\.\d+ times the time",
+            reason,
+        )
+        samples = arm.run(0.4)
+        assert arm.state.accepted_trajectory_id == number
+        follows(samples, start, quintic, 0.4)
+    finally:
+        arm.bench.set("controller", trajectory_torque_margin=0.0)
 
 
 def follows(samples, start, profile, duration, atol=1e-12):

@@ -459,7 +459,32 @@ LAWS = [
     ),
 ]
 
+TORQUE = TESTS + "test_trajectory_torque.py"
+
 LIMITS = [
+    *of(
+        "flexarm_control",
+        "trajectory",
+        TORQUE,
+        (
+            "torque",
+            "torque of a trajectory: without its velocity",
+            "slow_torque(model.terms(q, qd), qdd)",
+            "slow_torque(model.terms(q, 0.0 * qd), qdd)",
+        ),
+        (
+            "torque",
+            "torque of a trajectory: the start is not taken",
+            "        path.begin(0, start)\n",
+            "        pass\n",
+        ),
+        (
+            "torque",
+            "torque of a trajectory: the hold at its end",
+            "    hold[0, 0] = path.end\n",
+            "    pass\n",
+        ),
+    ),
     *of(
         "flexarm_control",
         "loop",
@@ -571,6 +596,13 @@ LIMITS = [
             "a driver that confirms no longer",
             "return not confirmed and (self._confirms or sample.controller_id != 0)",
             "return not confirmed and sample.controller_id != 0",
+        ),
+        (
+            "arm_controller",
+            "a trajectory's torque is not judged",
+            "None if judged else self._judge_torque",
+            "None",
+            TORQUE,
         ),
         (
             "arm_controller",

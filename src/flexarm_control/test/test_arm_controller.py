@@ -41,8 +41,8 @@ def sample(k=0, position=0.0, session=1, n=1, **fields):
     return s
 
 
-#: Torque at once and at any rate: what the law gives is what is sent.
-AT_ONCE = {"return_time": 0.0, "torque_rate_limit": [1e9]}
+#: Torque at once and at any rate: what the law gives is what is sent. Motions may be shorter than an arm could do.
+AT_ONCE = {"return_time": 0.0, "torque_rate_limit": [1e9], "trajectory_torque_margin": 0.0}
 
 
 def controller(model, law=None, **settings):

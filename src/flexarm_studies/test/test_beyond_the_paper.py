@@ -101,7 +101,8 @@ def test_an_unknown_payload(payload):
 
 
 def test_a_plan_that_the_torque_does_not_allow_is_reported_and_skipped():
-    loop = default_loop({"feedforward": "preview", "torque_limit": [2.0]})
+    settings = {"feedforward": "preview", "torque_limit": [2.0], "trajectory_torque_margin": 0.0}
+    loop = default_loop(settings)
     loop.follow(case_study.paper_trajectory(loop.model.joint_names), 0.2)
     assert (
         "no motion within the torque limits" in loop.unprepared and "([2.0] N m)" in loop.unprepared

@@ -30,7 +30,9 @@ NONE = {"type": "none"}
 TRUE_RATES = {"type": "true_rates"}
 PUBLISH = {"publish_rates": True}
 #: The laws' torque as it is, however fast it changes.
-UNBOUNDED = {"torque_rate_limit": [1e9]}
+#: Motions that take more torque than the arm has are accepted.
+SHORT = {"trajectory_torque_margin": 0.0}
+UNBOUNDED = SHORT | {"torque_rate_limit": [1e9]}
 TRUE = [run for run in RUNS if run.rates == "true"]
 
 
@@ -149,7 +151,7 @@ def motion(loop, stamp_ns=0, duration=0.1, end=0.05):
 
 
 def test_time_zero_of_a_record_is_where_a_trajectory_stamped_zero_starts():
-    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, PUBLISH)
+    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, PUBLISH, SHORT)
     record = loop.run(motion(loop), 0.2)
     moving = record.time[np.flatnonzero(record.reference[:, 0])]
     assert_allclose(moving[0], 1e-3, rtol=1e-9)  # at time zero it is still at its start
@@ -166,7 +168,9 @@ def test_the_loop_waits_under_the_safe_action_until_the_observer_has_converged()
 
 
 def test_a_loop_that_never_gets_ready_says_why():
-    loop = ClosedLoop("R", SLOW, NONE, {"type": "filtered_derivative", "bandwidth": 1.0})
+    loop = ClosedLoop(
+        "R", SLOW, NONE, {"type": "filtered_derivative", "bandwidth": 1.0}, None, SHORT
+    )
     loop.MAX_START = 0.1
     with pytest.raises(MessageError, match=r": modal_rate is not known yet"):
         loop.run(motion(loop), 0.1)
@@ -186,7 +190,7 @@ def test_a_missing_type_is_refused_by_name():
 
 
 def test_the_controllers_limits_hold_in_the_loop():
-    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, PUBLISH, {"torque_limit": [0.5]})
+    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, PUBLISH, SHORT | {"torque_limit": [0.5]})
     record = loop.run(motion(loop, end=0.01), 0.2)
     assert np.abs(record.torque).max() == 0.5
     assert np.abs(record.slow_torque).max() > 0.5
@@ -201,7 +205,7 @@ def test_an_arm_without_gauges_gives_no_made_up_amplitudes(changed_arm):
 
 def test_without_joint_velocities_the_loop_reconstructs_them():
     simulator = PUBLISH | {"publish_joint_velocity": False}
-    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, simulator)
+    loop = ClosedLoop("R", SLOW, NONE, TRUE_RATES, simulator, SHORT)
     record = loop.run(motion(loop), 0.3)
     slopes = np.diff(record.position, axis=0) / 1e-3
     decay = np.exp(-500.0 * 1e-3)  # of joint_velocity_bandwidth

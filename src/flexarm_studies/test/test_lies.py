@@ -40,6 +40,7 @@ class LyingLoop(ClosedLoop):
             {"type": "lqr", **fast},
             {"type": observer, **options.pop("observer", {})},
             simulator | options.pop("simulator", {}),
+            {"trajectory_torque_margin": 0.0} | options.pop("controller", {}),
             **options,
         )
         self.lie, self.memory, self.named = lie, {}, None

@@ -101,7 +101,7 @@ def test_a_bag_of_the_loop_says_which_arm_it_is(recorded, runs):
 
 
 def test_a_network_shows_in_the_bag_as_states_without_an_answer(tmp_path):
-    motion = "quintic:to=0.1,duration=0.2"
+    motion = "quintic:to=0.05,duration=0.2"
     of = scenario_of("composite", trajectory=motion, rate=500.0, loss=0.2, window=0.1)
     _, _, loop = scenario.run_loop(of, partial(LoopBag, tmp_path / "lossy"))
     (run,) = command.read([tmp_path / "lossy"])
@@ -799,7 +799,7 @@ def test_simulate_takes_a_bag_only_with_a_motion(flexarm):
 def test_an_arm_that_was_read_has_no_name_in_its_bag(tmp_path):
     of = scenario_of(
         arm=replace(arm_file.load("R")),
-        trajectory="quintic:to=0.05,duration=0.1",
+        trajectory="quintic:to=0.01,duration=0.1",
         rate=200.0,
         window=0.0,
     )

@@ -130,6 +130,11 @@ class DesignProcess:
         except NOT_SENT as error:
             raise AwayError(f"this design can't be sent to another process: {error}") from error
 
+    @property
+    def running(self):
+        """Whether the process has been started."""
+        return self._pool is not None
+
     def _running(self):
         with self._starting:
             if self._pool is None:

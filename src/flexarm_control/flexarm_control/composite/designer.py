@@ -6,6 +6,7 @@ from concurrent.futures import CancelledError
 from flexarm_dynamics.models.model import build
 
 from ..robust import default
+from ..trajectory import refuse_torque
 from .assembly import control
 from .design_process import AwayError, DesignProcess
 
@@ -22,6 +23,11 @@ def prepare(model, feedforward, trajectory, start):
 def find(model, settings, uncertainty):
     """`default.find` for the model's arm, callable in the design process."""
     return default.find(model.arm, settings, uncertainty)
+
+
+def judge(model, trajectory, start, limit):
+    """`refuse_torque`, callable in the design process."""
+    refuse_torque(model, trajectory, start, limit)
 
 
 class Designer:
@@ -44,6 +50,7 @@ class Designer:
 
     def __init__(self, model, warn, process=True, cpus=()):
         self.model, self._warn, self.closed = model, warn, False
+        self._own = None
         self._process = DesignProcess(model, cpus=cpus) if process else None
 
     def warm_up(self):
@@ -76,6 +83,17 @@ class Designer:
             return self._in_process(find, settings, uncertainty)
         except AwayError:
             return find(self.model, settings, uncertainty)
+
+    def judge(self, trajectory, start, limit):
+        """As `refuse_torque`: in the process where one runs, else in this thread, which is soon done."""
+        if self._process is not None and self._process.running:
+            try:
+                return self._in_process(judge, trajectory, start, limit)
+            except AwayError:
+                pass
+        if self._own is None:
+            self._own = build(self.model.arm)  # the control path uses the other one
+        refuse_torque(self._own, trajectory, start, limit)
 
     def _in_process(self, function, *arguments):
         """``function(model, *arguments)`` in the process; an `AwayError`, with a warning, where that can't be."""

@@ -6,7 +6,7 @@ import numpy as np
 from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
-from ..trajectory import ReferenceGenerator, Verdict, validate
+from ..trajectory import ReferenceGenerator, Verdict, refuse_torque, validate
 from ..trajectory.reference import GENTLE
 from . import applied, authority, supervisor
 from .applied import Applied
@@ -33,6 +33,10 @@ PARAMETERS = (
     parameter("resume_gap", 0.05, "s", 1e-3, 1e4).described(
         "After a longer time without a state the motion is given up, and torque returns in a ramp; set it to the"
         " driver's torque_timeout. A gap of up to five periods is none."
+    ),
+    parameter("trajectory_torque_margin", 1.0, "-", 0.0, 1e3).described(
+        "Largest torque that a trajectory may need, as a multiple of the torque limit: rigid arm with weight and"
+        " friction, payload of the arm file; what needs more is refused. 0.0: not judged."
     ),
     *supervisor.PARAMETERS,
 )
@@ -190,8 +194,21 @@ class ArmController:
             return None
         return self.law.feedforward.prepare(trajectory, start)
 
-    def offer(self, trajectory, plan=None):
+    @property
+    def torque_allowed(self):
+        """Largest torque that a trajectory may need, shape (n,) [N m]; infinite: it is not judged."""
+        margin = self.supervisor.settings["trajectory_torque_margin"]
+        if margin == 0.0 or self.law.free:
+            return np.full(self.model.n_joints, np.inf)
+        return margin * self.torque_limit
+
+    def _judge_torque(self, trajectory, start):
+        refuse_torque(self.model, trajectory, start, self.torque_allowed)
+
+    def offer(self, trajectory, plan=None, judged=False):
         """Offer a `trajectory`, with the `plan` that `prepare` made for it; a refusal is kept in `reason`.
+
+        The torque that it needs is judged here, which takes a while, unless that has been done: `judged`.
 
         While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
         explicit start passes before that is given up.
@@ -207,7 +224,7 @@ class ArmController:
         elif self._doubt:
             verdict = Verdict(False, f"a sensor is in doubt: {self._doubt}", 0)
         else:
-            verdict = self.reference.offer(trajectory)
+            verdict = self.reference.offer(trajectory, None if judged else self._judge_torque)
         if verdict.accepted:
             self._trajectory_reason = ""
             if self.law.feedforward is not None:
@@ -325,7 +342,7 @@ class ArmController:
             sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
             other.step(sample)
             if k == 0:
-                other.offer(validate(names, names, 0, [point]))
+                other.offer(validate(names, names, 0, [point]), judged=True)
         self.law.reset()
 
     # Stops, recovery and switches ---------------------------------------------------------------

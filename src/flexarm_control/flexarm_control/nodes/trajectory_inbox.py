@@ -3,6 +3,7 @@
 
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 
+import numpy as np
 from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
@@ -75,8 +76,11 @@ class TrajectoryInbox:
         """In a thread: make a message ready to be offered."""
         try:
             data = read(raw, self._core.model.arm)
+            self._judge_torque(data)
         except TrajectoryError as error:
             self._node.hand_over(self._refuse, str(error))
+            return
+        except CancelledError:
             return
         plan, start = None, self._core.reference.resting
         try:
@@ -91,12 +95,18 @@ class TrajectoryInbox:
             self._node.get_logger().warning(f"trajectory without preview: {kind}{error}")
         self._node.hand_over(self._offer, data, plan)
 
+    def _judge_torque(self, data):
+        """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""
+        reference, limit = self._core.reference, self._core.torque_allowed
+        if not (np.isinf(limit).all() or reference.repeats(data)):
+            self._designer.judge(data, reference.start_of(data.stamp_ns), limit)
+
     def _refuse(self, reason):
         self._core.refuse(reason)
         self._node.get_logger().warning(f"trajectory refused: {reason}")
 
     def _offer(self, data, plan):
-        verdict = self._core.offer(data, plan)
+        verdict = self._core.offer(data, plan, judged=True)
         if verdict.accepted:
             text = f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}"
             self._node.get_logger().info(text)

@@ -16,13 +16,15 @@ acceleration), so that a new trajectory takes over smoothly. After the last poin
 holds its position.
 
 This package is stricter than the joint_trajectory_controller: it refuses partial joint goals,
-velocities without positions, fields that some points lack, and a start in the past.
+velocities without positions, fields that some points lack, a start in the past, and what needs more torque
+than the joints have.
 
 Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 """
 
 from .reference import ReferenceGenerator, Verdict
 from .request import JointTrajectoryData, validate
+from .torque import refuse_torque
 from .values import MAX_MAGNITUDE, MAX_POINTS
 
 __all__ = [
@@ -31,5 +33,6 @@ __all__ = [
     "JointTrajectoryData",
     "ReferenceGenerator",
     "Verdict",
+    "refuse_torque",
     "validate",
 ]

@@ -163,6 +163,31 @@ class Path:
         first = self._knots_ns[1:2, None] / SECOND
         return np.maximum(_peaks(self._coefficients[:1], first), self._rest_peaks)
 
+    @property
+    def starts(self):
+        """Where each polynomial begins, from the start of the path, (k,) [s]."""
+        return self._knots_ns[:-1] / SECOND
+
+    @property
+    def lengths(self):
+        """Duration of each polynomial, (k,) [s]."""
+        return np.diff(self._knots_ns) / SECOND
+
+    @property
+    def end(self):
+        """Position that is held after the end, (n,) [rad]."""
+        return self._end[0]
+
+    def at_places(self, pieces, fractions):
+        """Position, velocity and acceleration, (k, p, 3, n), of k `pieces` at p `fractions` of their lengths."""
+        c, lengths = self._coefficients[pieces], self.lengths[pieces][:, None]
+        out = np.empty((len(c), len(fractions), 3, c.shape[2]))
+        for i, fraction in enumerate(fractions):
+            x = fraction * lengths
+            out[:, i, 0] = sum(c[:, k] * x**k for k in range(c.shape[1]))
+            out[:, i, 1], out[:, i, 2], _ = _derivatives(c, x)
+        return out
+
     def derivatives(self, elapsed):
         """Velocity, acceleration and jerk, (3, k, n), at times (k,) from the start [s]; zero after the end."""
         elapsed_ns = np.clip(np.rint(elapsed * SECOND), 0.0, self.duration_ns).astype(np.int64)

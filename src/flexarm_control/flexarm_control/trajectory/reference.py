@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generates the reference of the joints: holds, trajectories and stops."""
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,17 +158,37 @@ class ReferenceGenerator:
             self._path, self.stopping = path, True
         self._last_ns = stamp_ns
 
-    def offer(self, trajectory: JointTrajectoryData) -> Verdict:
-        """Accept a validated trajectory, or return why it is refused; then it changes nothing."""
-        if self._last_accepted is not None and trajectory.repeats(self._last_accepted):
+    def offer(self, trajectory: JointTrajectoryData, judge=None) -> Verdict:
+        """Accept a validated trajectory, or return why it is refused; then it changes nothing.
+
+        ``judge(trajectory, start)`` may refuse it with a `TrajectoryError`, too; `start` as of `start_of`.
+        """
+        if self.repeats(trajectory):
             return Verdict(
                 False, f"repeat of trajectory {self.accepted_id}", self.accepted_id, repeat=True
             )
         try:
             self._check(trajectory)
+            if judge is not None:
+                judge(trajectory, self._scratch.copy())
         except TrajectoryError as error:
             return Verdict(False, str(error), 0)
         return self._accept(trajectory)
+
+    def repeats(self, trajectory):
+        """Whether a trajectory is the last accepted one again."""
+        return self._last_accepted is not None and trajectory.repeats(self._last_accepted)
+
+    def start_of(self, stamp_ns):
+        """State (3, n) that a trajectory with `stamp_ns` (0: now) starts from; None while there is none.
+
+        On a copy, so that any thread may ask. For stamp 0 the reference goes on until the trajectory is offered.
+        """
+        if self._last_ns is None:
+            return None
+        other = copy.deepcopy(self)
+        other._reference_at_start(stamp_ns)
+        return other._scratch
 
     @property
     def path(self):

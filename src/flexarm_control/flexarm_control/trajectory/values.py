@@ -14,6 +14,8 @@ BRAKING_STEP = 0.01  # [s]
 MAX_BRAKING = 3600.0  # [s] of a stop: a longer one is a wrong deceleration
 # Speeds derived from differences carry rounding; a limit met exactly must not be refused.
 SPEED_ROUNDING = 1e-6  # [-]
+# Motions that are planned for the limit meet it to their own accuracy between the points.
+TORQUE_ROUNDING = 1e-3  # [-]
 
 UNITS = {"positions": "rad", "velocities": "rad/s", "accelerations": "rad/s^2"}
 SECOND = 1_000_000_000  # [ns]

@@ -41,7 +41,9 @@ def dies_out(scenario, q, gain=1.0, watched=WATCHED):
     if joints and deflections, or the torque, move in the last third of the time as much as in the third before; if the
     torque is at its limit in the last third; if the loop loses the arm or is refused.
     """
-    trial = replace(scenario, trajectory=small_motion(q), repeat=1)
+    # The motion is quick on purpose; what is judged comes after it.
+    values = scenario.controller | {"trajectory_torque_margin": 0.0}
+    trial = replace(scenario, controller=values, trajectory=small_motion(q), repeat=1)
     try:
         loop = scenarios.loop_of(trial)
         motion = scenarios.trajectory_of(trial.trajectory, loop.model, loop.simulator.position)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The torque that a trajectory needs: refuses one that the joints do not have.
+
+Judged is the slow subsystem (10), the rigid arm with weight and friction, and the payload of the arm file:
+
+.. math:: \bar u(t) = B^{-1}(q_r, \dot q_r)\,[\ddot q_r - a(q_r, \dot q_r)] .
+
+It is taken at places of every polynomial, at its ends from inside, and for the hold after the last point. Steps of the
+velocity, as between positions alone, have no finite torque; they are left to the tracking, and the rest is judged.
+What the bending adds is left to the fast control.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError, TrajectoryError
+from flexarm_dynamics.singular_perturbation import slow_torque
+
+from .path import Path
+from .values import TORQUE_ROUNDING
+
+#: Places per polynomial: a peak between them is right to half a percent with the most.
+MIN_PLACES, MAX_PLACES = 2, 33
+#: About so many places in all, as long as there are so few polynomials; and at most so many.
+PLACES, MOST = 400, 2000
+
+
+def required_torque(model, motion):
+    """Torque of (10) along a `motion`, states (k, 3, n); shape (k, n) [N m], NaN where the model gives none."""
+    out = np.full((len(motion), model.n_joints), np.nan)
+    for u, (q, qd, qdd) in zip(out, motion, strict=True):
+        try:
+            u[:] = slow_torque(model.terms(q, qd), qdd)
+        except (FlexarmError, np.linalg.LinAlgError):
+            continue
+    return out
+
+
+def refuse_torque(model, trajectory, start, limit):
+    """Refuse a trajectory that needs more torque than there is.
+
+    Parameters
+    ----------
+    model : ArmModel
+    trajectory : JointTrajectoryData
+    start : ndarray, shape (3, n), or None
+        State of the reference that it starts from; None: unknown, its first polynomial is not judged.
+    limit : ndarray, shape (n,)
+        [N m]; infinite where there is none.
+
+    Raises
+    ------
+    TrajectoryError
+        At the place that lacks the most, with joint, time, torque and limit.
+    """
+    if np.isinf(limit).all():
+        return
+    path = Path(trajectory.times_ns, trajectory.fields)
+    if start is not None:
+        path.begin(0, start)
+    point, time, motion = _places(path, len(trajectory.times_ns), start is not None)
+    needed = required_torque(model, motion)
+    excess = np.nan_to_num(np.abs(needed) / limit)
+    worst, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
+    if excess[worst, joint] <= 1.0 + TORQUE_ROUNDING:
+        return
+    name = model.joint_names[joint]
+    raise TrajectoryError(
+        "N m are needed there, more than the torque limit",
+        field=f"points[{point[worst]}]: torque of joint {name} at {time[worst]:.4g} s",
+        value=float(f"{needed[worst, joint]:.4g}"),
+        limit=float(f"{limit[joint]:.6g}"),
+        hint=_hint(model, motion[worst], needed[worst], limit),
+    )
+
+
+def _places(path, points, from_start):
+    """Point that each judged polynomial leads to, time from the start [s], and state (k, 3, n)."""
+    kept = np.arange(0 if from_start else 1, points)
+    kept = kept[path.lengths[kept] > 0.0]
+    each = int(np.clip(PLACES // max(kept.size, 1), MIN_PLACES, MAX_PLACES))
+    if kept.size * each > MOST:
+        # Evenly, and where each joint accelerates most.
+        ends = np.abs(path.at_places(kept, np.array([0.0, 1.0]))[..., 2, :]).max(axis=1)
+        even = np.linspace(0, kept.size - 1, MOST // each).astype(int)
+        kept = kept[np.union1d(even, np.argmax(ends, axis=0))]
+    fractions = np.linspace(0.0, 1.0, each)
+    motion = path.at_places(kept, fractions)
+    time = path.starts[kept][:, None] + path.lengths[kept][:, None] * fractions
+    n = motion.shape[-1]
+    hold = np.zeros((1, 3, n))
+    hold[0, 0] = path.end
+    return (
+        np.append(np.repeat(kept, each), points - 1),
+        np.append(time, path.starts[-1] + path.lengths[-1]),
+        np.concatenate([motion.reshape(-1, 3, n), hold]),
+    )
+
+
+def _hint(model, state, needed, limit):
+    """What to do: slower, as long as the arm can be held there; torques of a motion fall with its time squared."""
+    still = required_torque(model, (state * [[1.0], [0.0], [0.0]])[None])[0]
+    if not (np.abs(still) < limit).all():
+        return "the arm can't be held there: choose other positions"
+    moving = needed - still
+    slower = np.sqrt(np.max(np.abs(moving) / (limit - np.sign(moving) * still)))
+    return f"give it {max(slower, 1.01):.3g} times the time, or more"
