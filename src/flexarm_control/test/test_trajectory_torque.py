@@ -222,3 +222,19 @@ def test_the_designer_judges_as_the_function_does(arm_r):
     with pytest.raises(TrajectoryError, match=r"give it 1\.02 times the time"):
         designer.judge(quintic(1.0, 1.57), rest(0.0), limit)
     designer.close()
+
+
+def test_an_idle_design_process_judges_and_the_error_comes_back_whole(arm_r, monkeypatch):
+    designer = Designer(arm_r, pytest.fail)
+    try:
+        limit = arm_r.arm.torque_limits
+        assert not designer._process.idle
+        designer.warm_up()
+        assert designer._process.idle
+        monkeypatch.setattr("flexarm_control.composite.designer.refuse_torque", pytest.fail)
+        with pytest.raises(
+            TrajectoryError, match=r"joint1 at 0\.\d+ s: .* \(13\.5582\); give it 1\.02"
+        ):
+            designer.judge(quintic(1.0, 1.57), rest(0.0), limit)
+    finally:
+        designer.close()

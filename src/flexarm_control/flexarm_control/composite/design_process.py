@@ -104,6 +104,7 @@ class DesignProcess:
 
     def __init__(self, model, niceness=10, cpus=()):
         self.model, self.niceness, self.cpus, self._pool = model, niceness, cpus, None
+        self._last = None
         self._starting = Lock()
 
     def call(self, function, *arguments):
@@ -120,8 +121,8 @@ class DesignProcess:
         """
         try:
             data = dumps(arguments, self.model.arm)
-            result = self._running().submit(_work, function, data).result()
-            return loads(result, self.model)
+            self._last = last = self._running().submit(_work, function, data)
+            return loads(last.result(), self.model)
         except BrokenProcessPool:
             self.close()
             raise AwayError(
@@ -131,9 +132,10 @@ class DesignProcess:
             raise AwayError(f"this design can't be sent to another process: {error}") from error
 
     @property
-    def running(self):
-        """Whether the process has been started."""
-        return self._pool is not None
+    def idle(self):
+        """Whether the process has been started, and has nothing to do."""
+        last = self._last
+        return self._pool is not None and last is not None and last.done()
 
     def _running(self):
         with self._starting:

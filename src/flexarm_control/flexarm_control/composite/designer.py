@@ -85,8 +85,8 @@ class Designer:
             return find(self.model, settings, uncertainty)
 
     def judge(self, trajectory, start, limit):
-        """As `refuse_torque`: in the process where one runs, else in this thread, which is soon done."""
-        if self._process is not None and self._process.running:
+        """As `refuse_torque`: in the process where one is idle, else in this thread, which is soon done."""
+        if self._process is not None and self._process.idle:
             try:
                 return self._in_process(judge, trajectory, start, limit)
             except AwayError:
