@@ -285,6 +285,7 @@ LAWS = [
         ),
         ("card", "half of the phase", "np.exp(-1j * phase)", "np.exp(-0.5j * phase)"),
         ("tip", "the gains' sign", "np.linalg.solve(A - B @ K", "np.linalg.solve(A + B @ K"),
+        ("trade", "each speed starts anew", "say, gains))", "say, None))"),
         ("tip", "settling looked for to 20 %", "SETTLED = 0.02", "SETTLED = 0.2"),
     ),
     *of(

@@ -10,11 +10,13 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
+from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Slowest, Wanted, eigenvalues, gradient
 from flexarm_control.robust.design import Settings, design, units
 from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
+from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
     Uncertainty,
     configurations,
@@ -167,6 +169,26 @@ def test_a_design_is_the_same_each_time():
     short = replace(QUICK, effort=1e-3)
     first, again = (design(arm_file.load("R"), short).K for _ in range(2))
     assert np.array_equal(first, again)
+
+
+def test_a_design_starts_from_gains_that_are_given_too(designed):
+    short = replace(QUICK, effort=1e-3)
+    alone, near = (design(designed.arm, short, gains=K) for K in (None, designed.K))
+    assert near.decay > 0.98 * designed.decay > 1.02 * alone.decay
+
+
+def test_faster_designs_have_more_decay_and_noise_and_bear_less_delay(monkeypatch):
+    fractions, speeds, given = [], (0.3, 0.1), []
+    monkeypatch.setattr(
+        trade_module, "design", lambda *words: given.append(words[-1]) or design(*words)
+    )
+    found = trade(arm_file.load("R"), speeds, QUICK, progress=lambda f, _: fractions.append(f))
+    assert [one.settings.speed for one in found] == sorted(speeds)
+    slow, fast = found
+    assert fast.decay > 1.5 * slow.decay and fast.noise[0] > slow.noise[0]
+    assert card(fast).delay < card(slow).delay
+    assert given[0] is None and given[1] is slow.K
+    assert fractions == sorted(fractions) and fractions[-1] == 1.0
 
 
 def test_its_parameters_make_the_control(designed):

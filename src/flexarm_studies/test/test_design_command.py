@@ -97,6 +97,23 @@ def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     assert any(f"{np.degrees(found['phase_rad']):.2g} deg" in t.get_text() for t in noise.texts)
 
 
+def test_speed_against_robustness_as_a_table_a_drawing_and_json(tmp_path, capsys):
+    path = tmp_path / "trade.png"
+    words = ["design", "R", *LOOP, "--effort", "0.1", "--speeds", "0.3,0.1", "--figure", str(path)]
+    assert main(words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("| speed | worst decay [1/s] |") and lines[2].startswith("| 0.1 |")
+    assert f"figure {path}" in lines and path.read_bytes().startswith(b"\x89PNG")
+    assert main([*words, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert [row["speed"] for row in rows] == [0.1, 0.3]
+    for line, row in zip(lines[2:4], rows, strict=True):
+        worst = max(row["slowest"], key=lambda one: one["value"])["pole"][0]
+        assert f"| {-worst:.3g} |" in line and f"| {1e3 * row['delay_s']:.3g} |" in line
+    assert main(["design", "R", "--speeds", "0.1,0.3", "--out", str(tmp_path / "x.yaml")]) != 0
+    assert "writes no controller file" in capsys.readouterr().err
+
+
 def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
     # No arm bears a torque that may be a hundredth or a hundred times what is sent.
     wide = ["--gain", "0.01:100", "--effort", "0.1"]
@@ -117,6 +134,8 @@ def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
         ("--rate", "1", "out of range"),
         ("--speed", "2", "out of range"),
         ("--figure", "card.doc", "wrong suffix"),
+        ("--speeds", "0.1,2", "out of range"),
+        ("--speeds", "fast", "no list of finite numbers"),
         ("--at", "0,1", "wrong number of angles"),
     ],
 )

@@ -211,7 +211,7 @@ def sampling_for(nominal, at, settings):
     return Sampling(h, settings.delay, corner, corner), omega_c
 
 
-def design(arm, settings=None, uncertainty=None, progress=None):
+def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     """Gains for an arm file's arm.
 
     Parameters
@@ -221,6 +221,8 @@ def design(arm, settings=None, uncertainty=None, progress=None):
     uncertainty : Uncertainty, optional
     progress : callable, optional
         Called with a fraction of the work and the decay that is reached.
+    gains : ndarray, shape (n, 3n + 2m), optional
+        To start from as well.
 
     Returns
     -------
@@ -251,6 +253,8 @@ def design(arm, settings=None, uncertainty=None, progress=None):
     starts += [
         slowest.scaled(optimal(nominal, at[len(at) // 2], omega_1, decay)) for decay in DECAYS
     ]
+    if gains is not None:
+        starts.append(slowest.scaled(gains))
     search = Search(slowest, noise, speed * FASTEST, settings.effort, settings.seed)
     x = search.best(starts, progress)
     rows, left = [], []

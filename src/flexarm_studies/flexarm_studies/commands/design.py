@@ -10,6 +10,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
 
+from .. import markdown
 from .options import add_arm_arguments, angles, check_file, in_range, new_path, numbers, show
 
 #: Comments of the controller file, by the start of a parameter's name.
@@ -77,6 +78,11 @@ def add_arguments(parser):
         metavar="Q1,Q2,...",
         help="configuration to design for [rad]; may be repeated (drawn from the position limits)",
     )
+    add(
+        "--speeds",
+        metavar="S1,S2,...",
+        help="a table of designs of several speeds: decay, what is borne, noise; writes no controller file",
+    )
     add("--effort", type=float, default=1.0, help="of the search, 0.1 to 100 (1)")
 
 
@@ -85,11 +91,13 @@ def design(options):
     from flexarm_control.robust.card import card
     from flexarm_control.robust.design import Settings
     from flexarm_control.robust.design import design as find
+    from flexarm_control.robust.trade import trade
     from flexarm_control.robust.uncertain import Uncertainty
     from flexarm_dynamics.arm import arm_file
 
     arm = arm_file.load(options.arm)
     out = None if options.out is None else new_path(options.out, "--out")
+    speeds = None if options.speeds is None else _speeds(options)
     figure = None if options.figure is None else check_file(options.figure, "--figure")
     rate = in_range("--rate", options.rate, 10.0, 20000.0)
     delay = None if options.delay is None else in_range("--delay", options.delay, 0.0, 0.1)
@@ -115,6 +123,8 @@ def design(options):
             file=sys.stderr,
         )
 
+    if speeds is not None:
+        return _trade(options, figure, trade(arm, speeds, settings, uncertainty, progress))
     found = find(arm, settings, uncertainty, progress)
     found.check()
     bears = card(found)
@@ -122,7 +132,19 @@ def design(options):
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
-    result = {
+    lines = card_lines(found, bears)
+    lines += ["", f"written to {out}" if out else text]
+    if figure is not None:
+        from .design_figure import draw
+
+        lines += [f"figure {draw(found, bears, figure)}"]
+    show(options, _finite(_result(found, bears)), lines, allow_nan=False)
+    return 0
+
+
+def _result(found, bears):
+    """What is printed as JSON."""
+    return {
         "parameters": found.parameters(),
         "decay": found.decay,
         "omega_1_rad_s": found.omega_1,
@@ -142,14 +164,6 @@ def design(options):
         "tip_stiffness_N_m": bears.tip_stiffness,
         "tip_stiffness_without_integral_N_m": bears.tip_stiffness_proportional,
     }
-    lines = card_lines(found, bears)
-    lines += ["", f"written to {out}" if out else text]
-    if figure is not None:
-        from .design_figure import draw
-
-        lines += [f"figure {draw(found, bears, figure)}"]
-    show(options, _finite(result), lines, allow_nan=False)
-    return 0
 
 
 def _finite(value):
@@ -161,6 +175,56 @@ def _finite(value):
     if isinstance(value, (float, np.floating)):
         return float(value) if np.isfinite(value) else None
     return value
+
+
+def _speeds(options):
+    if options.out is not None:
+        hint = "leave one of them out; --speed S --out FILE makes the file of one speed"
+        raise FlexarmError("writes no controller file", field="--speeds with --out", hint=hint)
+    return [in_range("--speeds", v, 0.0, 1.0) for v in numbers("--speeds", options.speeds)]
+
+
+#: Columns of the table of `--speeds`.
+COLUMNS = (
+    "speed", "worst decay [1/s]", "settling [s]", "gain x", "payload x", "delay [ms]", "phase margin [deg]",
+    "noise [%]",
+)  # fmt: skip
+
+
+def _trade(options, figure, designs):
+    """Print, and draw, what designs of several speeds bear."""
+    from flexarm_control.robust.card import card
+
+    designs[-1].check()
+    rows = [(found, card(found)) for found in designs if found.holds]
+    lines = markdown.table(
+        COLUMNS,
+        (
+            (
+                f"{found.settings.speed:g}",
+                worst_decay(found),
+                bears.settling,
+                _span(bears.gain),
+                _span(bears.payload),
+                _number(1e3 * bears.delay),
+                float(np.degrees(bears.phase)),
+                100.0 * max(found.noise),
+            )
+            for found, bears in rows
+        ),
+    )
+    if figure is not None:
+        from .design_figure import draw_trade
+
+        lines += ["", f"figure {draw_trade(rows, figure)}"]
+    result = [{"speed": found.settings.speed} | _result(found, bears) for found, bears in rows]
+    show(options, _finite(result), lines, allow_nan=False)
+    return 0
+
+
+def worst_decay(found):
+    """Decay of the pole that is slowest over what is asked of it [1/s]."""
+    return -max(found.slowest, key=lambda row: row[2])[1].real
 
 
 def _factors(option, text):

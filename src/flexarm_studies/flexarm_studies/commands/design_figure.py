@@ -2,6 +2,7 @@
 """Draws what `flexarm design` found: poles and decay of all loops, what they bear, and the noise in the torque."""
 
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 from flexarm_control.robust.card import FARTHEST, poles
 from flexarm_control.robust.decay import Wanted
@@ -31,6 +32,74 @@ def draw(found, bears, path):
             fontsize=12,
         )
         return save(figure, path)
+
+
+def draw_trade(rows, path):
+    """Draw what designs of several speeds reach and bear; `rows` are (`Design`, `Card`), the file is returned."""
+    speed = [found.settings.speed for found, _ in rows]
+    found, bears = (list(column) for column in zip(*rows, strict=True))
+    with plt.rc_context(STYLE | {"axes.titlesize": 10, "font.size": 9}):
+        figure, axes = plt.subplots(2, 2, figsize=(10.0, 6.4), layout="constrained", sharex=True)
+        (decay, factors), (margins, noise) = axes
+        decay.plot(
+            speed,
+            [-max(f.slowest, key=lambda r: r[2])[1].real for f in found],
+            "o-",
+            color=DESIGNED,
+        )
+        decay.set_title("Slowest pole in the worst loop")
+        decay.set_ylabel("decay [1/s]")
+        decay.set_ylim(bottom=0.0)
+        for name, colour in (("gain", COMPOSITE), ("payload", DESIGNED), ("stiffness", SLOW)):
+            low, high = np.clip([getattr(b, name) for b in bears], 1.0 / FARTHEST, FARTHEST).T
+            factors.plot(speed, high, "o-", color=colour, label=name)
+            factors.plot(speed, low, "o-", color=colour)
+        factors.set_yscale("log")
+        _factor_ticks(factors.yaxis)
+        factors.set_title(
+            f"Stable between the curves (at 1/{FARTHEST:g} or {FARTHEST:g}: no limit found)"
+        )
+        factors.set_ylabel("factor [-]")
+        factors.legend(fontsize=8)
+        margins.plot(
+            speed, [1e3 * b.delay for b in bears], "o-", color=COMPOSITE, label="longest delay [ms]"
+        )
+        margins.plot(
+            speed,
+            [np.degrees(b.phase) for b in bears],
+            "o-",
+            color=SLOW,
+            label="phase margin [deg]",
+        )
+        margins.set_ylim(bottom=0.0)
+        margins.set_title("Longest delay in all, and phase margin")
+        margins.legend(fontsize=8)
+        noise.plot(speed, [100.0 * max(f.noise) for f in found], "o-", color=DESIGNED)
+        noise.plot(
+            speed, [100.0 * NOISIEST * s for s in speed], "--", color=REFERENCE, label="allowed"
+        )
+        noise.set_title("Sensor noise in the torque")
+        noise.set_ylim(bottom=0.0)
+        noise.set_ylabel("rms over the torque limit [%]")
+        noise.legend(fontsize=8)
+        for ax in axes[1]:
+            ax.set_xlabel("--speed [-]")
+        first = found[0]
+        figure.suptitle(
+            f"Speed against robustness: {first.arm.name}, {first.settings.rate:g} Hz, delay"
+            f" {1e3 * first.settings.delay:.3g} ms",
+            fontsize=12,
+        )
+        return save(figure, path)
+
+
+def _factor_ticks(axis):
+    up = [2, 4, 8, int(FARTHEST)]
+    axis.set_ticks(
+        [1 / k for k in reversed(up)] + [1, *up],
+        [*(f"1/{k}" for k in reversed(up)), "1", *map(str, up)],
+    )
+    axis.set_minor_locator(NullLocator())
 
 
 def _kind(name, fraction):
@@ -113,10 +182,7 @@ def _borne(axes, found, bears):
     axes.axvline(1.0, color=REFERENCE, linewidth=1.0)
     axes.set_xscale("log")
     axes.set_xlim(1.0 / FARTHEST, FARTHEST)
-    up = [2, 4, 8, int(FARTHEST)]
-    ticks = [1 / k for k in reversed(up)] + [1, *up]
-    axes.set_xticks(ticks, [*(f"1/{k}" for k in reversed(up)), "1", *map(str, up)])
-    axes.minorticks_off()
+    _factor_ticks(axes.xaxis)
     axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
