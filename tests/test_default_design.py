@@ -3,11 +3,13 @@
 
 import signal
 import threading
+from collections import deque
 
 import pytest
 from in_process import InProcess
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool
 
 from flexarm_control.motions import profiles
 from flexarm_control.robust import cache, default
@@ -72,6 +74,49 @@ def test_each_parameter_given_by_hand_stays_and_a_design_is_made_once(path, made
         assert {k for k in first if first[k] != second[k]} == {"slow.damping"}
         assert second["slow.damping"] == [3.0] and len(made) == 1
         assert nodes.nodes["damped"].core.law.slow.parameters["damping"] == [3.0]
+
+
+@pytest.mark.parametrize("periods", [0, 2, 3])
+def test_the_delay_of_the_loop_is_measured_and_compared_with_what_the_design_bears(path, periods):
+    with InProcess() as nodes:
+        nodes.start("simulator", {"arm": path, "rate": 500.0, "lockstep": True})
+        sim = nodes.nodes["simulator"].sim
+        advance, way = sim.advance, deque([None] * periods)
+
+        def late(torque):
+            way.append(None if torque is None else torque.copy())
+            advance(way.popleft())
+
+        sim.advance = late
+        nodes.start("observer", {"arm": path, **QUICK})
+        nodes.start("controller", {"arm": path, **QUICK, **PATIENT})
+        bears = nodes.nodes["controller"].design.bears_delay
+        assert 0.004 < bears < 0.006
+        profile = profiles.quintic(0.0, 0.1, 0.5)
+        names = arm_file.load(path).joint_names
+        message = lockstep.trajectory_message(names, profile, 51, TRAJECTORY_START_NS)
+        nodes.record(message, 0.2)
+        level, text, values = nodes.nodes["controller"].diagnose()
+    assert float(values["torque delay p50 [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
+    assert float(values["torque delay max [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
+    assert values["designed for a delay of [ms]"] == "3.000"
+    assert values["bears a delay of [ms]"] == f"{1e3 * bears:.3f}"
+    if 0.002 * periods > bears:
+        assert level == WARN and "torque acts 6.000 ms after its measurement" in text
+        assert "start with design.delay 0.006" in text
+    else:
+        assert "torque acts" not in text
+
+
+def test_states_at_another_rate_than_the_designs_are_a_warning(path):
+    with InProcess() as nodes:
+        nodes.start("simulator", {"arm": path, "rate": 1000.0, "lockstep": True, "pause_at": 0.05})
+        nodes.start("observer", {"arm": path, **QUICK})
+        nodes.start("controller", {"arm": path, **QUICK, **PATIENT})
+        nodes.call(SetBool, "simulator/pause", data=False)
+        nodes.wait_for("samples", lambda: nodes.nodes["simulator"].sim.sequence > 40)
+        level, text, _ = nodes.nodes["controller"].diagnose()
+    assert level == WARN and "1000 states per second, the control is designed for 500" in text
 
 
 def test_a_node_that_is_configured_anew_takes_its_design_again(path, made):

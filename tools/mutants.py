@@ -290,6 +290,37 @@ LAWS = [
     ),
     *of(
         "flexarm_control",
+        "robust",
+        TESTS + "test_default.py",
+        (
+            "cache",
+            "loops of another rate share a design",
+            "[content, asdict(settings), asdict(uncertainty)",
+            "[content, asdict(uncertainty)",
+        ),
+        ("cache", "damaged designs are used", 'found["sum"] == _hash', '"sum" in found or _hash'),
+        ("default", "what is given is lost", "made.parameters | rest", "rest | made.parameters"),
+    ),
+    *of(
+        "flexarm_control",
+        "loop",
+        TESTS + "test_torque_delay.py",
+        ("torque_delay", "whole periods only", "float((k + f[k])", "float((k + 0.0 * f[k])"),
+        (
+            "torque_delay",
+            "lost samples take no time",
+            "range(min(count - 1, SENT))",
+            "range(min(count - count, SENT))",
+        ),
+        (
+            "torque_delay",
+            "torques from before an interruption",
+            "if first > LAGS + 1 and",
+            "if first > 0 and",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "fast",
         TESTS + "test_fast_laws.py",
         (

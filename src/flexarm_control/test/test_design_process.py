@@ -4,6 +4,7 @@
 import os
 import pickle
 import signal
+from threading import Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from flexarm_control.composite import design_process
 from flexarm_control.composite.design import design
 from flexarm_control.composite.design_process import AwayError, DesignProcess
+from flexarm_control.composite.designer import Designer
 from flexarm_dynamics import processes
 from flexarm_dynamics.errors import ParameterError
 
@@ -49,6 +51,10 @@ def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
     assert travelled.model is arm_r
     np.testing.assert_array_equal(torques(travelled, 1, arm_r.n_modes), expected)
     assert np.ptp(expected) > 0.0
+
+
+def pid(model):
+    return os.getpid()
 
 
 def scheduled(model):
@@ -95,6 +101,21 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         assert worker.call(design, slow, FAST).feedforward is None
     finally:
         worker.close()
+
+
+@pytest.mark.slow
+def test_a_process_that_was_started_outlives_the_thread_that_designs(arm_r):
+    designer = Designer(arm_r, lambda text: pytest.fail(text))
+    try:
+        designer.start()
+        pids = []
+        for _ in range(2):
+            thread = Thread(target=lambda: pids.append(designer._process.call(pid)))
+            thread.start()
+            thread.join()
+        assert pids[0] == pids[1] != os.getpid()
+    finally:
+        designer.close()
 
 
 def test_a_law_of_many_links_travels(two_link):

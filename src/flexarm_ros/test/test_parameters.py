@@ -248,3 +248,26 @@ def test_a_name_that_two_laws_share_is_one_parameter_and_must_mean_one_thing():
     other = Parameter("kp", "float_array", [1.0], "Something else.", unit="N m", length="joints")
     with pytest.raises(ParameterError, match=r"kp: is declared twice.*\[1/s\^2\].*\[N m\]"):
         merge((KP,), (other,))
+
+
+# Values that follow from others ------------------------------------------------------------------
+
+
+def test_what_is_adopted_leaves_what_the_user_has_set(make):
+    node, parameters = make(fast__alpha=7.0)
+    seen = []
+    parameters.on_change(seen.append)
+    assert set_one(node, "count", 3).successful
+    parameters.adopt({"fast.alpha": 1.0, "count": 1, "slow.kp": [9.0], "of.others": 1.0})
+    assert (parameters["fast.alpha"], parameters["count"]) == (7.0, 3)
+    assert parameters["slow.kp"] == [9.0] == list(node.get_parameter("slow.kp").value)
+    assert seen == [{"count"}] and "slow.kp" not in parameters.given
+    parameters.adopt({"slow.kp": [4.0]})  # a second time
+    assert parameters["slow.kp"] == [4.0]
+
+
+def test_what_can_not_be_adopted_is_refused(make):
+    _, parameters = make()
+    with pytest.raises(ParameterError, match=r"slow.kp\[0\]: -1.0 .*below its lower limit"):
+        parameters.adopt({"slow.kp": [-1.0]})
+    assert parameters["slow.kp"] == [6.25]

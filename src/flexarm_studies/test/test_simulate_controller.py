@@ -578,3 +578,18 @@ def test_a_lost_arm_is_exit_code_1_with_the_reason_and_the_figures(flexarm, chan
 def test_noise_that_the_arm_file_does_not_state_is_a_warning(flexarm):
     code, _, err = flexarm("simulate", "R", *CONTROLLED, "--window", 0.05, "--noise")
     assert code == 0 and "--noise: the arm file of R states none" in err
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0016, 0.003])
+def test_the_controller_measures_the_delay_of_its_loop(delay):
+    loop = loop_of(Scenario("R", delay=delay))
+    trajectory = trajectory_of("quintic:to=0.2,duration=0.5", loop.model, np.zeros(1))
+    for k in range(300):
+        sample = loop.estimate(loop.measure())
+        sample.torque[:] = loop.simulator.torque
+        enabled = loop.controller.step(sample)
+        if k == 20:
+            loop.controller.offer(trajectory)
+        loop._advance(loop.controller.torque if enabled else None)
+    assert loop.controller.torque_delay.delay == pytest.approx(delay, abs=1e-8)
+    assert loop.controller.period == pytest.approx(1e-3)

@@ -137,6 +137,10 @@ class DesignProcess:
         last = self._last
         return self._pool is not None and last is not None and last.done()
 
+    def start(self, function):
+        """Call ``function(model)`` in the process without waiting; the process ends with the thread that calls this."""
+        self._last = self._running().submit(_work, function, dumps((), self.model.arm))
+
     def _running(self):
         with self._starting:
             if self._pool is None:

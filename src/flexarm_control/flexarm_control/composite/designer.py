@@ -53,6 +53,11 @@ class Designer:
         self._own = None
         self._process = DesignProcess(model, cpus=cpus) if process else None
 
+    def start(self):
+        """Start the process, which ends with the calling thread; another thread may design then, and end."""
+        if self._process is not None:
+            self._process.start(ready)
+
     def warm_up(self):
         """Start the process, so that the first design need not wait for its imports."""
         if self._process is not None:

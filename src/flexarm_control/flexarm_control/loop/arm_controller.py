@@ -13,6 +13,7 @@ from .applied import Applied
 from .authority import Authority
 from .samples import ArmSample, SampleOrder
 from .supervisor import State, Supervisor
+from .torque_delay import TorqueDelay
 
 #: Time in which the fast control comes back, or goes, when it is switched [s].
 FAST_RAMP = 0.1
@@ -77,6 +78,8 @@ class ArmController:
         Samples that came after a later one, and were left out; that never came; gaps in which torque was lost.
     alive : bool
         Whether the last sample was a sign of life of the source: a new one, or its clock stands still.
+    torque_delay : TorqueDelay
+        How long after a state's stamp its torque acts, from what the driver reports.
     controller_id : int
         Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
     """
@@ -106,6 +109,7 @@ class ArmController:
         self.torque = self._authority.torque
         self.supervisor = Supervisor(model, settings, self.torque_limit)
         self._applied = Applied(model, settings, self.torque_limit)
+        self.torque_delay = TorqueDelay(n)
         self._take_limits(settings)
 
     def replace_law(self, law):
@@ -140,6 +144,11 @@ class ArmController:
     def torque_limit(self):
         """Active limit, shape (n,) [N m]; infinite where neither file nor parameter sets one."""
         return self._authority.limit
+
+    @property
+    def period(self):
+        """Time between the stamps of the last two states [s]; 0 before the second."""
+        return self._period
 
     @property
     def trajectory_id(self):
@@ -312,10 +321,12 @@ class ArmController:
         error = None if law.free else self.position_error
         verdict, why = supervisor.watch(q, qd, sample.amplitude, error, self.saturated, dt)
         refused = self._applied.judge(sample, self.controller_id, dt)
+        self.torque_delay.add(sample.torque, self._count, self._period)
         if verdict == State.FAULT or refused:
             self.fail(refused or why)
             return False
         self._applied.note(self.torque)
+        self.torque_delay.note(self.torque)
         self._position[:] = q
         self.enabled = True
         supervisor.follow(reference)
@@ -470,6 +481,7 @@ class ArmController:
         self.supervisor.begin()
         self._authority.begin(sample.position)
         self._applied.begin(self.torque)
+        self.torque_delay.begin()
         self.law.reset()
 
     def _take_over(self, sample):

@@ -22,7 +22,7 @@ from ..composite import assembly
 from ..composite.designer import Designer
 from ..loop.arm_controller import ArmController
 from ..loop.samples import ArmSample
-from ..robust.default import default, is_wanted, task
+from ..robust.default import default, is_cached, is_wanted, task
 from . import controller_parameters
 from .controller_designs import Designs
 from .controller_report import Report
@@ -60,7 +60,7 @@ class ControllerNode(ArmNode):
         limits = controller_parameters.of_limits(values)
         self.core = ArmController(self.model, law, limits, parameters["start_tolerance"])
         self.core.warm_up()
-        self._report = Report(self, self.core)
+        self._report = Report(self, self.core, self.design)
         self._inbox = TrajectoryInbox(self, self.core, designer)
         self._workers = designer, Designs(self, self.core, designer), self._inbox
         self._reader = StateReader(arm)
@@ -82,6 +82,8 @@ class ControllerNode(ArmNode):
         def make():
             return default(arm, *wanted, lambda _, *task: designer.find(*task))
 
+        if not is_cached(arm, *wanted):
+            designer.start()  # here: it would end with the thread that waits
         found = self.wait_for(make, f"designing the control of {arm.name}")
         parameters.adopt(found.parameters)
         return found

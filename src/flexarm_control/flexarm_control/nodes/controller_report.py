@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the controller node tells its user: the log's lines when the supervisor's state changes, and diagnostics."""
 
+from math import isnan
+
 from flexarm_ros.node import ERROR, OK, WARN
-from flexarm_ros.statistics import Latency
+from flexarm_ros.statistics import Latency, Percentiles
 
 from ..loop.supervisor import State
+
+#: States may come at another rate than the design's by this fraction.
+OTHER_RATE = 0.2
 
 
 class Report:
@@ -15,10 +20,13 @@ class Report:
     node : ArmNode
         Its log and parameters.
     core : ArmController
+    design : Default or None
+        That the control is from; None: its parameters were given.
     """
 
-    def __init__(self, node, core):
-        self._node, self._core = node, core
+    def __init__(self, node, core, design=None):
+        self._node, self._core, self._design = node, core, design
+        self._delays, self._delays_seen = Percentiles(), core.torque_delay.count
         self._latency, self._logged = Latency(), core.state
         self._samples = self._samples_before = 0
         self._saturated = self._saturated_before = self._interruptions = 0
@@ -27,6 +35,10 @@ class Report:
         """Count a sample; `took` is the time from its message to its torque [s]."""
         self._latency.add(took)
         self._samples += 1
+        measured = self._core.torque_delay
+        if measured.count != self._delays_seen:
+            self._delays_seen = measured.count
+            self._delays.add(measured.delay)
         self._saturated += self._core.saturated
         if self._core.interruptions != self._interruptions:
             self._interruptions = self._core.interruptions
@@ -52,6 +64,7 @@ class Report:
         saturated = self._saturated - self._saturated_before
         self._saturated_before = self._saturated
         core, parameters = self._core, self._node.parameters
+        median, longest = self._delays.take(50.0)
         values = {
             "state": core.state.name,
             "slow law": parameters["slow.type"],
@@ -60,6 +73,9 @@ class Report:
             "feed-forward": parameters["feedforward"],
             "samples per second": rate,
             **self._latency.values(),
+            "torque delay p50 [ms]": _milliseconds(median),
+            "torque delay max [ms]": _milliseconds(longest),
+            **self._of_design(),
             "states lost": core.missed,
             "states too late": core.late,
             "interruptions": core.interruptions,
@@ -69,9 +85,35 @@ class Report:
             "saturated samples": self._saturated,
             "trajectory": core.trajectory_id,
         }
-        return *self._level(saturated, rate), values
+        return *self._level(saturated, rate, median), values
 
-    def _level(self, saturated, rate):
+    def _of_design(self):
+        if self._design is None:
+            return {}
+        return {
+            "designed for a delay of [ms]": _milliseconds(self._design.delay),
+            "bears a delay of [ms]": _milliseconds(self._design.bears_delay),
+        }
+
+    def _not_as_designed(self, delay):
+        """How the loop differs from that of the design, beyond what the design bears; `delay` is measured [s]."""
+        design, period = self._design, self._core.period
+        if design is None:
+            return ""
+        if delay > design.bears_delay:
+            return (
+                f"torque acts {_milliseconds(delay)} ms after its measurement, the design bears"
+                f" {_milliseconds(design.bears_delay)}: shorten the way, or start with design.delay {delay:.2g}"
+            )
+        rate = self._node.parameters["rate"]
+        if period and abs(1.0 / period - rate) > OTHER_RATE * rate:
+            return (
+                f"{1.0 / period:.4g} states per second, the control is designed for {rate:g}: start observer and"
+                f" controller with rate {1.0 / period:.1f}"
+            )
+        return ""
+
+    def _level(self, saturated, rate, delay):
         core = self._core
         if not self._node.active:
             return OK, "not active"
@@ -79,6 +121,8 @@ class Report:
             return ERROR, f"{core.supervisor.reason}: fix it, then call ~/recover"
         if core.state == State.INACTIVE:
             return ERROR, core.reason or "no arm_state_estimate yet: start the observer"
+        if why := self._not_as_designed(delay):
+            return WARN, why
         if saturated:
             return WARN, f"torque at its limit in {saturated} of {rate} samples"
         if core.reason:
@@ -86,3 +130,8 @@ class Report:
         if not core.fast_enabled:
             return WARN, "the fast control is off: call ~/enable_fast with data true"
         return OK, ""
+
+
+def _milliseconds(time):
+    """A time [s] in milliseconds, for people; a dash where there is none."""
+    return "-" if isnan(time) else f"{1e3 * time:.3f}"

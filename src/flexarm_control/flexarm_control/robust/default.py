@@ -142,7 +142,7 @@ def find(arm, settings, uncertainty):
         found.check()
     except DesignError as error:
         return {"refused": {"problem": error.problem, "hint": error.hint}}
-    return {"parameters": found.parameters(), "bears_delay": card(found).delay}
+    return {"parameters": found.parameters(), "bears_delay": float(card(found).delay)}
 
 
 def default(arm, settings, uncertainty, make=find):

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""How long after a state's stamp the torque that answers it acts, from the torques that the driver reports.
+
+A driver reports the mean torque over the interval that ends at a sample's stamp. With u_j the answer to sample j, held
+until the next one acts, and a delay of (k + f) periods, 0 <= f < 1, it reports at sample j + 1
+
+.. math:: r_{j+1} = (1 - f)\,u_{j-k} + f\,u_{j-k-1} .
+
+Over a block of samples, f follows for each k by least squares, and the k with the smallest rest is the delay. To a
+state that was lost there is no answer: the torque before it goes on. A torque that hardly changes says nothing about
+the delay; nor does one that fits no k. A driver that reports the torque at the stamp, and not the mean before it, makes
+the delay look shorter by up to a period.
+"""
+
+import numpy as np
+
+#: Longest delay that is looked for, in periods; samples in a block; and periods that are remembered.
+LAGS, BLOCK, SENT = 32, 16, 128
+#: Largest rest, over what the torque changes from sample to sample, both as sums of squares [-].
+FITS = 0.5
+#: Smallest change of the torque from sample to sample, over its size [-].
+CHANGES = 1e-8
+#: Periods that differ by more than this fraction belong to no block [-].
+SAME = 0.2
+
+
+class TorqueDelay:
+    """Measures the delay; see the module.
+
+    Parameters
+    ----------
+    n : int
+        Joints.
+
+    Attributes
+    ----------
+    delay : float
+        Of the last block that shows one [s]; NaN before the first.
+    count : int
+        Blocks that have shown one.
+    """
+
+    def __init__(self, n):
+        self.delay, self.count = np.nan, 0
+        self._sent = np.zeros((SENT, n))  # by periods, the newest at `_now`
+        self._reported, self._at = np.zeros((BLOCK, 1, n)), np.zeros((BLOCK, 1), int)
+        self._ages = np.arange(LAGS + 2)
+        self._u = np.zeros((BLOCK, LAGS + 2, n))
+        self._rest, self._change = np.zeros((2, BLOCK, LAGS + 1, n))
+        self._period = 0.0
+        self.begin()
+
+    def begin(self):
+        """After an interruption: what was sent before it is no measure."""
+        self._now = self._size = 0
+
+    def note(self, torque):
+        """Remember the torque (n,) [N m] that answers the present sample."""
+        self._now += 1
+        self._sent[self._now % SENT] = torque
+
+    def add(self, reported, count, period):
+        """Note what a driver reports at a sample; call it before `note`.
+
+        Parameters
+        ----------
+        reported : ndarray, shape (n,)
+            Torque applied since the sample before [N m].
+        count : int
+            Periods since the last sample that came.
+        period : float
+            [s]
+        """
+        if not abs(period - self._period) <= SAME * self._period:
+            self._period = period
+            self.begin()
+        if not self._now:
+            return
+        for _ in range(min(count - 1, SENT)):
+            self.note(self._sent[self._now % SENT])
+        self._reported[self._size, 0], self._at[self._size] = reported, self._now
+        self._size += 1
+        if self._size == BLOCK:
+            self._size = 0
+            first = int(self._at[0, 0])
+            if first > LAGS + 1 and self._now - first + LAGS + 2 <= SENT:
+                self._judge()
+
+    def _judge(self):
+        """The delay that a whole block shows, if it shows one."""
+        u, r, d = self._u, self._rest, self._change
+        np.take(self._sent, (self._at - self._ages) % SENT, axis=0, out=u)
+        np.subtract(self._reported, u[:, :-1], out=r)
+        np.subtract(u[:, 1:], u[:, :-1], out=d)
+        rest, both, change = (np.einsum("ikn,ikn->k", a, b) for a, b in ((r, r), (r, d), (d, d)))
+        f = np.clip(both / np.maximum(change, 1e-300), 0.0, 1.0)
+        rest -= f * (2.0 * both - f * change)
+        k = int(np.argmin(rest))
+        size = np.vdot(self._reported, self._reported)
+        if change[k] > CHANGES**2 * size and rest[k] <= FITS * change[k]:
+            self.delay = float((k + f[k]) * self._period)
+            self.count += 1
