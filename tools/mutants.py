@@ -262,6 +262,35 @@ LAWS = [
     *of(
         "flexarm_control",
         "robust",
+        TESTS + "test_verdict.py",
+        (
+            "whole",
+            "verdict: the torque reported is another one",
+            "y[-n:, place(whole + 1)] = (1.0 - late / T) * np.eye(n)",
+            "y[-n:, place(1)] = np.eye(n)",
+        ),
+        (
+            "whole",
+            "verdict: a late torque acts at once",
+            "        acts(end, whole)\n",
+            "        acts(end, 0)\n",
+        ),
+        (
+            "whole",
+            "verdict: a jump counts as a slope",
+            "                raise _JumpError\n",
+            "                pass\n",
+        ),
+        (
+            "verdict",
+            "verdict: the phase is not tried",
+            "np.exp(-1j * PHASE)",
+            "1.0 + 0.0j * PHASE",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "robust",
         TESTS + "test_robust.py",
         (
             "loop",

@@ -9,10 +9,16 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_continuous_lyapunov
 
+from flexarm_control.trajectory import specs
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.linear import static_torque
+from flexarm_dynamics.models import model
 from flexarm_studies.analysis import attraction, bound, margins, scales, trial
 from flexarm_studies.analysis import case as cases
-from flexarm_studies.loop.scenario import Scenario, parameters
+from flexarm_studies.analysis.default_motion import default_motion
+from flexarm_studies.loop.judged import verdict_of
+from flexarm_studies.loop.scenario import Scenario, loop_of, parameters
 
 PAPER = parameters("paper_composite")
 #: What a controller has that only knows the paper's gains.
@@ -203,8 +209,10 @@ def test_drives_the_wrong_way_round_are_seen(paper):
 def test_the_command_writes_json_and_figures(result, tmp_path):
     words = ("R", "paper_composite", "--quick", "--configurations", 3)
     found = result("analyze", *words, "--out", tmp_path)
-    parts = "scenario rate_Hz scales gain_sweep bound margins attraction monte_carlo"
+    parts = "verdict scenario rate_Hz scales gain_sweep bound margins attraction monte_carlo"
     assert set(found) == set(parts.split())
+    assert found["verdict"]["text"] == found["verdict"]["word"] == "stable with margin"
+    assert found["scenario"]["trajectory"] == "paper"
     assert found == json.loads((tmp_path / "analysis.json").read_text())
     assert {p.name for p in tmp_path.glob("*.png")} == {"mu.png", "slow_gain.png", "bound.png"}
     assert 0.0 < found["bound"]["bound"] < found["bound"]["redesign_limit"]
@@ -217,7 +225,69 @@ def test_the_command_writes_json_and_figures(result, tmp_path):
 def test_the_report_reads_a_loop_that_leaves_the_joints_free(flexarm):
     free = ("R", "paper_composite", "--set", "slow.type=none", "fast.type=none")
     code, out, _ = flexarm("analyze", *free, "--quick", "--configurations", 3)
-    assert code == 0 and "free" in out
+    assert code == 0 and "unknown: the slow law: leaves the joints free" in out
+
+
+# --------------------------------------------------------------------------- the verdict
+
+
+def judged(arm, values, motion, **changes):
+    case = cases.of(Scenario(arm, values, motion, **changes))
+    return verdict_of(loop_of(case.scenario), case.places, case.scenario.delay)
+
+
+def test_the_default_motion_of_long_reach_is_one_that_it_can_do():
+    values = parameters("long_reach")
+    motion = default_motion(model.build(arm_file.load("long_reach")), values["fast.configuration"])
+    assert motion.startswith("quintic:from=0.5000;0.7000;1.3000;-0.3000,")
+    found = judged("long_reach", values, motion)
+    assert found.word == "stable, fragile" and "to a delay 2 ms longer" in found.text
+
+
+def test_an_arm_in_space_that_can_only_hang_is_analysed_there(changed_arm):
+    def weak(data):
+        for joint, torque in zip(data["joints"], (60.0, 220.0, 120.0, 20.0), strict=True):
+            joint["limits"]["torque"] = torque
+
+    path = changed_arm("long_reach", weak)
+    arm = model.build(arm_file.load(path))
+    motion = default_motion(arm, [0.5, 0.7, 1.3, -0.3])
+    start = specs.load(motion, arm).positions[0]
+    hang = np.abs(static_torque(arm, start))
+    outstretched = np.abs(static_torque(arm, np.zeros(4)))
+    assert (hang < 0.9 * arm.arm.torque_limits).all() and outstretched[1] > 500.0
+    values = {"slow.type": "model_following", "fast.type": "none", "manifold.type": "reference"}
+    found = judged(path, values, motion)
+    assert found.word == "stable with margin" or found.text.startswith(f"{found.word}: ")
+    assert found.word != "unknown"
+
+
+def test_the_verdict_is_that_of_runs():
+    values = parameters("two_link")
+    sure = judged("two_link", values, "paper")
+    assert sure.word == "stable, fragile"
+    assert "to a delay 1 ms longer" in sure.text and "to a bending mode more" in sure.text
+    late = judged("two_link", values, "paper", delay=1.5 * sure.bears.delay)
+    assert late.word == "unstable" and "Hz" in late.text
+    q = np.full(2, np.pi / 2)
+    scenario = Scenario("two_link", values)
+    assert trial.dies_out(replace(scenario, delay=0.7 * sure.bears.delay), q, watched=1.0)
+    assert not trial.dies_out(replace(scenario, delay=1.5 * sure.bears.delay), q, watched=1.0)
+
+
+def test_a_part_that_fails_leaves_the_others(result):
+    found = result(
+        "analyze",
+        "rigid",
+        "composite",
+        "--set",
+        "slow.type=model_following",
+        "--quick",
+        "--configurations",
+        2,
+    )
+    assert "no modes" in found["scales"]["reason"] and found["margins"]["stable"]
+    assert found["verdict"]["word"] in ("stable with margin", "stable, fragile")
 
 
 def test_a_fast_law_with_states_has_no_bound_but_margins(paper):

@@ -526,7 +526,9 @@ def test_json_has_the_scenario_and_every_metric(result, tmp_path):
     out = tmp_path / "new" / "run.csv"
     options = ("--payload-scale", 2, "--delay", 0.001, "--window", 0.1, "--settle-within", 5)
     found = result("simulate", "R", *CONTROLLED, *options, "--out", out)
-    assert set(found) == {"scenario", "metrics", "out", "rows"}
+    assert set(found) == {"scenario", "metrics", "bears", "out", "rows"}
+    assert found["bears"]["reason"] == "" and found["bears"]["payload"][0] < 1.0
+    assert 0.005 < found["bears"]["delay"] < 0.009  # docs/analysis.md
     assert found["metrics"]["case_study"] is None  # the run is shorter
     assert found["metrics"].keys() == METRICS.keys()
     for name, kind in METRICS.items():
@@ -562,6 +564,7 @@ def test_what_is_printed_names_joints_components_and_figures(flexarm):
         "filtered_derivative",
         "HOLDING",
         "settled within 1 mm",
+        "the loop bears, at rest where it ended      payload x 0 to",
         "0.2 s in",
     ):
         assert word in text

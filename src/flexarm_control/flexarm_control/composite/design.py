@@ -26,7 +26,7 @@ PARAMETERS = (
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0).described(
         "Samples per second that the driver or simulator sends: what designs are checked at."
     ),
-    parameter("stability_margin", 0.0, "1/s", -1e3, 1e3).described(
+    parameter("stability_margin", 0.0, "1/s", -1e6, 1e3).described(
         "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this."
     ),
 )

@@ -81,8 +81,8 @@ def card(design):
     def limits(name):
         if not stable():
             return 1.0, 1.0
-        low = _limit(lambda f: stable(**{name: 1.0 / f}), 1.0, FARTHEST)
-        high = _limit(lambda f: stable(**{name: f}), 1.0, FARTHEST)
+        low = limit(lambda f: stable(**{name: 1.0 / f}), 1.0, FARTHEST)
+        high = limit(lambda f: stable(**{name: f}), 1.0, FARTHEST)
         return (0.0 if np.isinf(low) else 1.0 / low), high
 
     damping, stated = np.inf, list(loops())
@@ -91,8 +91,8 @@ def card(design):
         s = s[(np.abs(s) < design.omega_c) & (s.imag > 0.0)]
         damping = min(damping, float((-s.real / np.abs(s)).min(initial=np.inf)))
     period = sampling.period
-    latest = _limit(lambda late: stable(delay=late * period), sampling.delay / period, LATEST)
-    phase = _limit(lambda angle: stable(phase=angle), 0.0, np.pi)
+    latest = limit(lambda late: stable(delay=late * period), sampling.delay / period, LATEST)
+    phase = limit(lambda angle: stable(phase=angle), 0.0, np.pi)
     slowest = min(-pole.real for _, pole, _ in design.slowest)
     tips = [Tip(plants[1.0, 1.0], q) for q in design.configurations]
     n, m, more = nominal.n_joints, nominal.n_modes, plants[1.0, 1.0]
@@ -132,8 +132,11 @@ def _poles(loop, K):
     return eigvals(loop.F - loop.G @ (K @ loop.N), check_finite=False)
 
 
-def _limit(stable, low, high):
-    """Where `stable` ends between `low`, where it holds, and `high`; infinite if it holds there."""
+def limit(stable, low, high, bisections=BISECTIONS):
+    """Where `stable` ends between `low`, where it holds, and `high`; infinite if it holds there.
+
+    The `bisections` follow a coarse search outwards.
+    """
     if not stable(low):
         return low
     # Outwards first: beyond the first instability a loop may be stable again.
@@ -145,7 +148,7 @@ def _limit(stable, low, high):
         low = step
     else:
         return np.inf
-    for _ in range(BISECTIONS):
+    for _ in range(bisections):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if stable(middle) else (low, middle)
     return low

@@ -14,7 +14,7 @@ from flexarm_dynamics.models import model
 from ..loop import scenario as scenarios
 
 #: Stability margin that lets every design pass its check: unstable ones are analysed, too [1/s].
-UNCHECKED = -1e3
+UNCHECKED = -1e6
 #: Number of configurations along the motion.
 ALONG = 21
 
@@ -49,6 +49,11 @@ class Case:
     def q(self):
         """The motion's end, where the loop is linearised, shape (n,) [rad]."""
         return self.positions[-1]
+
+    @property
+    def places(self):
+        """Start, middle and end of the motion, where the loop is judged, shape (3, n) [rad]."""
+        return self.positions[[0, len(self.positions) // 2, -1]]
 
     @property
     def arm(self):

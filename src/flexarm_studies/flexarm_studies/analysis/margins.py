@@ -94,7 +94,7 @@ def study(case, runs=True, tried=TRIED, progress=None):
     found = {"reason": "", "stable": nominal > -full_order.ROUNDING, "decay_per_s": nominal}
     every = {kind.name: of_poles(case, kind) for kind in kinds(case)}
     found["margins"] = every
-    decays = [case.decay(plant=scaled(case.arm, **{name: v})) for name, v in PLANTS]
+    decays = [_decay(case, scaled(case.arm, **{name: v})) for name, v in PLANTS]
     found["plants"] = [
         {"what": name, "factor": v, "decay_per_s": decay}
         for (name, v), decay in zip(PLANTS, decays, strict=True)
@@ -107,6 +107,14 @@ def study(case, runs=True, tried=TRIED, progress=None):
                 progress.fraction((i + 1) / (len(names) + 1))
     found["noise"] = noise(case) if runs else {"reason": "not computed with --quick"}
     return found
+
+
+def _decay(case, arm):
+    """As `Case.decay` of another arm; None where that does not rest."""
+    try:
+        return case.decay(plant=arm)
+    except FlexarmError:
+        return None
 
 
 def of_poles(case, kind):

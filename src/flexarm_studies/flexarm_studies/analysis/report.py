@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The text of an analysis, for a terminal."""
 
+from flexarm_control.robust.verdict import Bears
+
+from ..loop.judged import words
 from ..loop.scenario import type_of
 
 
 def _digits(value):
     return "-" if value is None else f"{value:.4g}"
+
+
+def _short(value):
+    return "does not rest" if value is None else f"{value:.3g}"
 
 
 def _row(label, value):
@@ -21,6 +28,7 @@ def lines(found):
     )
     out = [f"{scenario['arm']}: {kinds}; {found['rate_Hz']:g} Hz; {scenario['trajectory']}"]
     for part, heading, text in (
+        ("verdict", "Verdict", _verdict),
         ("scales", "Time scales", _scales),
         ("gain_sweep", "Slow gains and the bending: poles of the whole loop", _sweep),
         ("bound", "How large mu may be", _bound),
@@ -47,6 +55,11 @@ def _poles(poles):
     # Undamped poles lie at zero, apart from rounding.
     upper = [(0.0 if abs(re) < 1e-10 * size else re, im) for re, im in poles if im >= 0.0]
     return ", ".join(f"{re:.4g}" + (f" +- {im:.4g}j" if im else "") for re, im in upper)
+
+
+def _verdict(v):
+    yield f"  {v['text']}"
+    yield _row("the loop bears", words(Bears(**v["bears"])))
 
 
 def _scales(s):
@@ -131,7 +144,9 @@ def _margins(m):
                 least = "at least " if margin["at_least"] else ""
                 text += f": {least}{margin['simulated']:.4g}{unit} with the observer"
         yield _row(f"unstable with {margin['text']}", text)
-    plants = ", ".join(f"{p['what']} {p['factor']:g}: {p['decay_per_s']:.3g}" for p in m["plants"])
+    plants = ", ".join(
+        f"{p['what']} {p['factor']:g}: {_short(p['decay_per_s'])}" for p in m["plants"]
+    )
     yield _row("decay on other arms [1/s]", plants)
     noise = m["noise"]
     yield _row(

@@ -13,6 +13,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
 from .. import tables
+from ..loop import judged
 from ..loop import scenario as scenarios
 from ..loop.metrics import tip_path
 from .options import add_settings, angles
@@ -128,17 +129,18 @@ def run_controller(options, recorder=None):
         )
     record, metrics, loop = scenarios.run_loop(scenario, recorder)
     plant = loop.simulator.plant_model
+    bears = judged.bears_of(loop, loop.controller.reference.position.copy(), scenario.delay)
     for warning in warnings(scenario, loop):
         print(f"flexarm simulate: {warning}", file=sys.stderr)
     if options.out:
         tables.write(*table(record, loop.model, plant), options.out)
     if options.json:
-        result = {"scenario": scenario.as_dict(), "metrics": metrics}
+        result = {"scenario": scenario.as_dict(), "metrics": metrics, "bears": bears.as_dict()}
         if options.out:
             result |= {"out": str(Path(options.out)), "rows": len(record.time)}
         print(json.dumps(result, allow_nan=False))
     else:
-        print("\n".join(report(scenario, loop, metrics)))
+        print("\n".join(report(scenario, loop, metrics, bears)))
     if options.bag:
         print(f"bag {options.bag}; look at it with: flexarm report {options.bag}", file=sys.stderr)
     if metrics["lost"]:
@@ -165,8 +167,8 @@ def warnings(scenario, loop):
 # What is printed -------------------------------------------------------------------------------
 
 
-def report(scenario, loop, metrics):
-    """Lines with the metrics, for people."""
+def report(scenario, loop, metrics, bears):
+    """Lines with the metrics, and what the loop `bears` at rest where the reference ends, for people."""
     arm_model, m, values = loop.model, metrics, scenario.controller
     if loop.designed is not None:
         values = loop.designed.parameters | values
@@ -185,6 +187,7 @@ def report(scenario, loop, metrics):
     ):
         lines.append("{:16}{:12.4g}{:12.4g}{:13.4g}{:12.4g}".format(name, *row))
     lines += ["", *(f"{text:44}{value}" for text, value in _of_the_tip(scenario, m))]
+    lines.append(f"{'the loop bears, at rest where it ended':44}{judged.words(bears)}")
     for i, each in enumerate(m.get("passes", ())):
         peak = max(each["peak_joint_error_rad"])
         lines.append(

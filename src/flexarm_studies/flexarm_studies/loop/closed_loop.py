@@ -97,6 +97,11 @@ class ClosedLoop:
         self.bag = self.designed = None
 
     @property
+    def source(self):
+        """Whether joint speeds, and rates of the deflections, are measured."""
+        return self._publish_velocity, self._publish_rates
+
+    @property
     def estimated(self):
         """The last sample that the observer passed on."""
         return self._estimate

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict on a loop in words: stable with margin, fragile and to what, or unstable and in what.
+
+Judged are the sampled loops of `whole`, with observer and delay, in one or several configurations at rest. Each of
+`PERTURBATIONS` is tried by itself, the rest as in the arm file. A loop that bears them all is stable with margin.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models.model import build
+
+from .card import FARTHEST, LATEST, limit
+from .uncertain import Uncertainty, richer
+from .whole import WholeLoop
+
+#: Phase by which the torques of all joints may lag [rad], and periods by which they may be later [-].
+PHASE, PERIODS = np.radians(30.0), 1.0
+WITH_MARGIN, FRAGILE, UNSTABLE, UNKNOWN = (
+    "stable with margin",
+    "stable, fragile",
+    "unstable",
+    "unknown",
+)
+#: Bisections of a limit for what is printed with three digits, and for a quick look.
+FINE, QUICK = 10, 6
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """What is tried: its words, and factors of the arm file or of the loop."""
+
+    words: str
+    payload: float = 1.0
+    stiffness: float = 1.0
+    gain: complex = 1.0
+    later: float = 0.0  # [s]
+    richer: bool = False  # one bending mode more in each direction
+
+
+def perturbations(period):
+    """The stated set, for a sampling `period` [s]; factors as of a design, see `Uncertainty`."""
+    usual = Uncertainty()
+    out = [Perturbation(f"a payload x {f:g}", payload=f) for f in usual.payload]
+    out += [Perturbation(f"a stiffness x {f:g}", stiffness=f) for f in usual.stiffness]
+    out += [Perturbation(f"torques x {f:g}", gain=f) for f in usual.gain]
+    ms = 1e3 * PERIODS * period
+    return [
+        *out,
+        Perturbation(f"a delay {ms:.3g} ms longer", later=PERIODS * period),
+        Perturbation(f"a phase lag of {np.degrees(PHASE):.0f} degrees", gain=np.exp(-1j * PHASE)),
+        Perturbation("a bending mode more than the arm file has", richer=True),
+    ]
+
+
+@dataclass(frozen=True)
+class Bears:
+    """How far a loop may be off until it is unstable, each by itself.
+
+    Attributes
+    ----------
+    payload : (float, float)
+        Least and greatest factor; 0 and None: none was found [-].
+    delay : float or None
+        Longest, from a measurement to its torque; None: none was found [s].
+    reason : str
+        Why it is not known; empty if it is.
+    """
+
+    payload: tuple = (None, None)
+    delay: float | None = None
+    reason: str = ""
+
+    def as_dict(self):
+        """Ready for JSON."""
+        return asdict(self) | {"payload": list(self.payload)}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict; see the module.
+
+    Attributes
+    ----------
+    word : str
+        `WITH_MARGIN`, `FRAGILE`, `UNSTABLE` or `UNKNOWN`.
+    text : str
+        A sentence: to what it is fragile, or what is unstable, or why it is unknown.
+    tried : tuple of (str, bool)
+        Words of each perturbation, and whether the loop bears it.
+    bears : Bears
+    """
+
+    word: str
+    text: str
+    tried: tuple = ()
+    bears: Bears = Bears()
+
+    def as_dict(self):
+        """Ready for JSON."""
+        tried = [{"perturbation": what, "stable": ok} for what, ok in self.tried]
+        return {"word": self.word, "text": self.text, "tried": tried, "bears": self.bears.as_dict()}
+
+
+class Judge:
+    """Loops of one control in several configurations.
+
+    Parameters
+    ----------
+    controllers : sequence of LinearController
+    delay : float
+        From a measurement until its torque acts [s].
+    """
+
+    def __init__(self, controllers, delay=0.0):
+        self.loops = [WholeLoop(c, delay) for c in controllers]
+        self.delay, self.period = delay, controllers[0].period
+        self.arm = controllers[0].model.arm
+        self._models = {}
+
+    def stable(self, payload=1.0, stiffness=1.0, gain=1.0, later=0.0, richer=False):
+        """Whether all loops are stable with such an arm, gain and delay, as in `Perturbation`."""
+        key = payload, stiffness, richer
+        try:
+            if key not in self._models:
+                self._models[key] = build(_arm(self.arm, *key))
+            return all(
+                loop.stable(
+                    plant=loop.plant(self._models[key], key), gain=gain, delay=self.delay + later
+                )
+                for loop in self.loops
+            )
+        except (FlexarmError, np.linalg.LinAlgError):  # it does not rest there
+            return False
+
+    def bears(self, bisections=FINE):
+        """`Bears` of the loops, in so many `bisections`."""
+        if not self.stable():
+            return Bears(reason="the loop is unstable as it is")
+        T = self.period
+        low = 0.0
+        if not self.stable(payload=0.0):
+            low = 1.0 / limit(lambda f: self.stable(payload=1.0 / f), 1.0, FARTHEST, bisections)
+        high = limit(lambda f: self.stable(payload=f), 1.0, FARTHEST, bisections)
+        first = self.delay / T
+        late = limit(
+            lambda k: self.stable(later=(k - first) * T), first, first + LATEST, bisections
+        )
+        finite = [None if np.isinf(v) else float(v) for v in (high, late * T)]
+        return Bears((float(low), finite[0]), finite[1])
+
+    def verdict(self):
+        """The `Verdict`."""
+        for loop in self.loops:
+            if not loop.stable():
+                return Verdict(UNSTABLE, f"{UNSTABLE}: {_growing(loop)}", (), self.bears())
+        tried = tuple(
+            (p.words, self.stable(p.payload, p.stiffness, p.gain, p.later, p.richer))
+            for p in perturbations(self.period)
+        )
+        weak = [words for words, ok in tried if not ok]
+        if not weak:
+            return Verdict(WITH_MARGIN, WITH_MARGIN, tried, self.bears())
+        return Verdict(FRAGILE, f"{FRAGILE}: to {', to '.join(weak)}", tried, self.bears())
+
+
+def unknown(reason):
+    """The `Verdict` on a loop that can't be judged."""
+    return Verdict(UNKNOWN, f"{UNKNOWN}: {reason}", (), Bears(reason=str(reason)))
+
+
+def _arm(arm, payload, stiffness, more):
+    return scaled(richer(arm) if more else arm, payload, stiffness)
+
+
+def _growing(loop):
+    s, name = loop.growing()
+    q = ", ".join(f"{v:.3g}" for v in loop.controller.q)
+    if abs(s.imag) < 1e-3 * abs(s.real):
+        how = "moves away"
+    elif abs(s.imag) > 0.9 * np.pi / loop.controller.period:
+        how = "alternates from sample to sample"
+    else:
+        how = f"oscillates at {abs(s.imag) / (2.0 * np.pi):.3g} Hz"
+    return f"{name} {how}, doubling in {np.log(2.0) / s.real:.3g} s, at rest in [{q}] rad"

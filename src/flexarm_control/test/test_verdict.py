@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled loop with its observer, and the verdict on it in words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexarm_control.composite import full_order
+from flexarm_control.composite.design import design
+from flexarm_control.observers.arm_observer import observe
+from flexarm_control.robust.loop import Sampling, sampled_loop
+from flexarm_control.robust.verdict import FRAGILE, UNSTABLE, WITH_MARGIN, Judge
+from flexarm_control.robust.whole import Source, WholeLoop, linear_controller
+from flexarm_dynamics.errors import DesignError
+
+T = 1e-3
+TRUE = {"velocity": True, "rate": True}
+NO_CHECK = {"stability_margin": -1e6, "feedforward": "none"}
+
+
+def controller(model, slow, fast, observer, q, period=T, **source):
+    name = observer.get("type", "filtered_derivative")
+    settings = {k: v for k, v in observer.items() if k != "type"}
+    law = design(model, slow, fast, {"type": "corrected"}, NO_CHECK | {"rate": 1.0 / period})
+    return linear_controller(law, observe(model, name, settings), q, period, Source(**source)), law
+
+
+@pytest.mark.parametrize("fast", [{"type": "lqr"}, {"type": "output_feedback"}])
+@pytest.mark.parametrize("delay", [0.0, 0.0007, 0.002])
+def test_with_true_rates_it_is_the_full_order_loop(arm_r, fast, delay):
+    q = np.array([0.4])
+    made, law = controller(
+        arm_r, {"type": "model_following"}, fast, {"type": "true_rates"}, q, **TRUE
+    )
+    expected = full_order.poles(law, q, T, delay)
+    found = WholeLoop(made, delay).poles()
+    for pole in expected[expected.real > -300.0]:
+        assert np.abs(found - pole).min() < 1e-3 * max(abs(pole), 1.0)
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity):
+    n, m, q = 2, 4, np.array([0.3, 0.5])
+    K = np.zeros((n, 3 * n + 2 * m))
+    gains = {"stiffness": [20.0, 5.0], "damping": [6.0, 1.5], "integral": [8.0, 2.0]}
+    for k, values in enumerate(gains.values()):
+        K[:, k * n : (k + 1) * n] = np.diag(values)
+    F = np.arange(16).reshape(n, 2 * m) * 1e-2
+    K[:, 3 * n :] = -F
+    observer = {"bandwidth": 300.0, "joint_velocity_bandwidth": 200.0}
+    law = design(
+        two_link, {"type": "joint_pid", **gains}, {"type": "fixed_gain", "gain": F.ravel().tolist()},
+        {"type": "reference"}, NO_CHECK,
+    )  # fmt: skip
+    made = linear_controller(
+        law, observe(two_link, "filtered_derivative", observer), q, T, Source(velocity)
+    )
+    loop = sampled_loop(
+        two_link, two_link, q, Sampling(T, 0.0015, np.inf if velocity else 200.0, 300.0)
+    )
+    z = np.linalg.eigvals(loop.F - loop.G @ (K @ loop.N))
+    found = np.linalg.eigvals(WholeLoop(made, 0.0015).matrix())
+    for pole in z[np.abs(z) > 0.5]:
+        assert np.abs(found - pole).min() < 1e-5
+
+
+def test_an_observer_that_keeps_a_model_per_tenth_of_a_radian_has_no_false_pole(arm_r):
+    slow, fast = {"type": "model_following"}, {"type": "lqr"}
+    for observer in ({"type": "kalman"}, {"type": "luenberger"}):
+        on, _ = controller(arm_r, slow, fast, observer, np.array([0.25]))
+        beside, _ = controller(arm_r, slow, fast, observer, np.array([0.22]))
+        assert_allclose(
+            WholeLoop(on).poles()[:4].real, WholeLoop(beside).poles()[:4].real, rtol=0.01
+        )
+
+
+def test_a_good_loop_is_stable_with_margin_and_bears_more_than_was_tried(arm_r):
+    made, _ = controller(
+        arm_r, {"type": "model_following"}, {"type": "lqr"}, {"type": "kalman"}, np.zeros(1)
+    )
+    verdict = Judge([made]).verdict()
+    assert verdict.word == verdict.text == WITH_MARGIN
+    assert all(ok for _, ok in verdict.tried) and len(verdict.tried) == 9
+    assert verdict.bears.payload[0] < 0.7 and verdict.bears.delay > 2 * T
+    late = WholeLoop(made).stable
+    assert late(delay=0.98 * verdict.bears.delay) and not late(delay=1.05 * verdict.bears.delay)
+
+
+def test_a_fragile_loop_names_to_what(arm_r):
+    made, _ = controller(
+        arm_r, {"type": "model_following"}, {"type": "lqr"}, {"type": "kalman"}, np.zeros(1)
+    )
+    longest = Judge([made]).bears().delay
+    verdict = Judge([made], longest - 0.5 * T).verdict()
+    assert verdict.word == FRAGILE
+    assert "to a delay 1 ms longer" in verdict.text and "to a phase lag" in verdict.text
+    assert "a stiffness x 0.9" not in verdict.text
+    assert verdict.bears.delay == pytest.approx(longest, rel=0.01)
+
+
+def test_an_unstable_loop_gets_the_word_and_what_moves(arm_r):
+    fast = {"type": "fixed_gain", "gain": [0.0, 0.0, 0.0, -60.0]}
+    made, _ = controller(
+        arm_r, {"type": "model_following"}, fast, {"type": "true_rates"}, np.zeros(1), **TRUE
+    )
+    verdict = Judge([made]).verdict()
+    assert verdict.word == UNSTABLE and verdict.text.startswith("unstable: ")
+    assert "doubling in" in verdict.text and "Hz" in verdict.text
+    assert verdict.bears.reason == "the loop is unstable as it is"
+
+
+def test_a_payload_under_which_the_arm_folds_is_not_borne(heavy_arm):
+    made, _ = controller(
+        heavy_arm, {"type": "model_following"}, {"type": "lqr"}, {"type": "kalman"}, np.zeros(1)
+    )
+    judge = Judge([made])
+    assert judge.stable() and not judge.stable(stiffness=0.01)
+
+
+def test_a_law_that_leaves_the_joints_free_has_no_loop(arm_r):
+    with pytest.raises(DesignError, match="leaves the joints free"):
+        controller(arm_r, {"type": "none"}, {"type": "lqr"}, {"type": "kalman"}, np.zeros(1))
+
+
+def test_phase_and_gain_act_on_the_torque(arm_r):
+    made, _ = controller(
+        arm_r,
+        {"type": "model_following"},
+        {"type": "none"},
+        {"type": "true_rates"},
+        np.zeros(1),
+        **TRUE,
+    )
+    loop = WholeLoop(made)
+    assert_allclose(loop.matrix(gain=1.0 + 0.0j), loop.matrix(), atol=1e-12)
+    doubled = WholeLoop(replace(made, C=2.0 * made.C, D=2.0 * made.D))
+    assert_allclose(np.sort(loop.poles(gain=2.0).real), np.sort(doubled.poles().real), rtol=1e-6)
+    assert not loop.stable(gain=np.exp(-1j * np.radians(179.0)))
