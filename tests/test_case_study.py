@@ -150,6 +150,14 @@ def test_p3_reproduces_the_published_design(made):
         np.testing.assert_allclose(run[key], tables.PRINT[key], rtol=3e-4)
 
 
+def test_a_run_in_one_process_has_a_bag_of_the_same_samples(tmp_path, monkeypatch):
+    monkeypatch.setattr(case_study, "DURATION", SHORT)
+    run = next(run for run in case_study.RUNS if run.model == demo.IN_ONE_PROCESS)
+    record, _ = demo._timed(run, tmp_path)
+    follows_the_loop_without_ros(tmp_path / run.name / "bag", run, SHORT)
+    assert record.time[-1] == pytest.approx(SHORT)
+
+
 @pytest.mark.parametrize("run", WITH_NODES, ids=lambda run: run.name)
 def test_bag_of_the_demo_equals_the_loop_without_ros(made, run):
     follows_the_loop_without_ros(made.out / run.name / "bag", run, case_study.DURATION)

@@ -85,8 +85,8 @@ def law_of(run, arm_model):
     return assembly.control(arm_model, scenario.parameters(run.file) | {"slow.gain": run.gain})
 
 
-def run_without_ros(run):
-    """The run in one process, with the objects that the nodes call.
+def run_without_ros(run, recorder=None):
+    """The run in one process, with the objects that the nodes call; the `recorder` is that of `scenario.run_loop`.
 
     Returns
     -------
@@ -96,7 +96,11 @@ def run_without_ros(run):
     if run.rates == "true":
         values["observer.type"] = "true_rates"
     loop = scenario.loop_of(Scenario(run.arm, values))
-    return loop.run(paper_trajectory(loop.model.joint_names), DURATION)
+    motion = paper_trajectory(loop.model.joint_names)
+    if recorder is None:
+        return loop.run(motion, DURATION)
+    with recorder(loop, run.arm, values["observer.type"]):
+        return loop.run(motion, DURATION)
 
 
 def paper_trajectory(joint_names, points=101):

@@ -44,7 +44,7 @@ def linear_table(summaries):
 def nonlinear_table(summaries, references):
     """Lines of the table of the nonlinear runs: nodes beside the continuous loop."""
     lines = [
-        "Nonlinear arm, 90 deg in 2 s: three nodes at 1 kHz (n) beside the continuous loop (c)",
+        "Nonlinear arm, 90 deg in 2 s: three nodes at 1 kHz (n; P3_h11: one process) beside the continuous loop (c)",
         f"{'':26}{'peak joint':>15}{'max error':>17}{'tip residual':>19}{'peak tip':>17}{'peak torque':>15}",
         f"{'':26}{'error [deg]':>15}{'t > 3 s [deg]':>17}{'rms 3-8 s [ft]':>19}{'[ft]':>17}{'[lbf ft]':>15}",
         f"{'':26}"
