@@ -180,7 +180,6 @@ class View:
             raise FlexarmError("is missing", field=error.name, hint=hint) from None
         self.stack.callback(page.close)
         self.link.say, self.link.on_values = page.say, page.take_values
-        self.link.find_gains(page.offer_gains)
         print(f"flexarm view: {arm_model.arm.name} at {page.url}, until Ctrl-C", flush=True)
         if not self.options.no_open:
             import webbrowser
@@ -206,6 +205,8 @@ class View:
         if self.home is None:
             self.home = snapshot.q
             page.aim(first_target(self.drawer.arm, snapshot.q))
+            # Not before: a controller that is still designing has other laws until then.
+            self.link.find_gains(page.offer_gains)
         picture = self.drawer.picture(
             snapshot.q, snapshot.delta, snapshot.slow, snapshot.fast, page.exaggeration
         )
