@@ -23,12 +23,12 @@ from ..loop.samples import ArmSample, SampleOrder
 from ..trajectory import ReferenceGenerator
 from .loop import measured_amplitudes
 
-#: Step of the differences [rad, m, N m, …]; fractions of it are no effect.
-STEP, NONE = 1e-6, 1e-12
+#: Steps of the differences [rad, m, N m, …]: the smaller one where friction bends within the larger; and what is zero.
+STEPS, NONE = (1e-6, 1e-8), 1e-12
 #: Where an answer jumps it is asked this far beside [rad]; a jump is a curvature over this, relative to the slope [-].
 BESIDE, JUMP = (0.0, 1e-3, -2e-3), 1e-3
-#: Samples in which an observer has to converge, and in which it then settles.
-CONVERGING, SETTLING = 20_000, 50
+#: Samples in which an observer has to converge, and to settle to a fraction; looked at each so many samples.
+CONVERGING, SETTLING, EACH, SETTLED = 20_000, 3000, 50, 1e-9
 #: A pole counts as growing beyond this, absolute [1/s] and by its size [-]: errors of the differences.
 ROUNDING = 1e-5
 
@@ -85,8 +85,8 @@ class _Asked:
         observer.observer.reset()
         law.reset()
         law.limit = np.full(n, np.inf)
-        self._converge()
         self.parts = [observer, observer.observer, law.slow, law.fast]
+        self._converge()
         self.kept = [(part, _arrays(part), dict(vars(part))) for part in self.parts]
         self.order, self.begun = copy.copy(observer._order), self.count
 
@@ -98,7 +98,13 @@ class _Asked:
                 break
         else:
             raise DesignError("does not converge at rest", field="the observer")
-        for _ in range(SETTLING):
+        before = None
+        for k in range(SETTLING):
+            if k % EACH == 0:
+                now = [values for part in self.parts for values in _arrays(part).values()]
+                if before is not None and all(map(_same, now, before)):
+                    return
+                before = now
             self.ask(self.at_rest)
 
     def ask(self, y):
@@ -154,6 +160,11 @@ class _Asked:
                 i -= values.size
 
 
+def _same(values, others):
+    scale = np.abs(values).max(initial=1e-6)
+    return bool((np.abs(values - others) <= SETTLED * scale).all())
+
+
 def _arrays(part):
     """Copies of the arrays of numbers that an object has itself."""
     return {
@@ -192,17 +203,17 @@ def linear_controller(law, observer, q, period, source=None):
         raise DesignError("leaves the joints free: there is no loop", field="the slow law")
     q, source = np.asarray(q, float), source or Source()
     for beside in BESIDE:
-        found = _differenced(
-            law, observer, q + beside * np.cos(1.0 + np.arange(q.size)), period, source
-        )
-        if found is not None:
-            return found
+        place = q + beside * np.cos(1.0 + np.arange(q.size))
+        asked = _Asked(law, observer, place, period, source)
+        for step in STEPS:
+            found = _differenced(asked, step)
+            if found is not None:
+                return found
     raise DesignError("jumps at rest: there is no linear loop", field="observer or law")
 
 
-def _differenced(law, observer, q, period, source):
+def _differenced(asked, step):
     """As `linear_controller`; None where an answer jumps at q: some observers keep a model per tenth of a radian."""
-    asked = _Asked(law, observer, q, period, source)
     size, inputs = asked.states().size, asked.at_rest.size
 
     def answered(state, y):
@@ -210,21 +221,20 @@ def _differenced(law, observer, q, period, source):
         for sign, out in ((1.0, ahead), (0.0, here), (-1.0, back)):
             asked.put_back()
             if state is not None:
-                asked.move(state, sign * STEP)
+                asked.move(state, sign * step)
             move = np.zeros(inputs)
             if y is not None:
-                move[y] = sign * STEP
+                move[y] = sign * step
             converged, u = asked.ask(asked.at_rest + move)
             if not converged:
                 raise DesignError("loses the arm at rest", field="the observer")
             out += [asked.states(), u]
         for a, c, b in zip(ahead, here, back, strict=True):
             scale = np.abs(c).max(initial=1.0)
-            if (
-                np.abs(a - 2.0 * c + b) > JUMP * np.abs(a - b).max(initial=0.0) + 1e-9 * scale
-            ).any():
+            most = JUMP * (np.abs(a - b).max(initial=0.0) + step * scale)
+            if (np.abs(a - 2.0 * c + b) > most).any():
                 raise _JumpError
-        return [(a - b) / (2.0 * STEP) for a, b in zip(ahead, back, strict=True)]
+        return [(a - b) / (2.0 * step) for a, b in zip(ahead, back, strict=True)]
 
     try:
         columns = [answered(i, None) for i in range(size)]
@@ -248,7 +258,7 @@ def _differenced(law, observer, q, period, source):
         kept = kept[felt & moved]
     return LinearController(
         A[np.ix_(kept, kept)], B[kept], C[:, kept], D, asked.reference.position.copy(),
-        law.model, asked.source, period, law.slow.separate,
+        asked.model, asked.source, 1e-9 * asked.period_ns, asked.law.slow.separate,
     )  # fmt: skip
 
 
