@@ -53,6 +53,8 @@ def path():
         ("config/arms/R.yaml", (), "auto", True),
         ("two_link", (), "auto", True),
         ("R", (), "auto", False),
+        ("", (), "auto", False),
+        ("", (), "robust", True),
         ("my_arm.yaml", ("slow.type",), "auto", False),
         ("my_arm.yaml", ("fast.type",), "auto", False),
         ("my_arm.yaml", ("slow.stiffness", "observer.type", "feedforward"), "auto", True),

@@ -90,7 +90,7 @@ def is_wanted(name, given, kind=AUTO):
     Parameters
     ----------
     name : str
-        Of the arm, as it was given: a shipped name or a path; empty for an arm that is no file's.
+        Of the arm, as it was given: a shipped name or a path; empty for an arm that is no file's, which gets none.
     given : collection of str
         Names of the parameters that are given by hand.
     kind : str
@@ -98,7 +98,7 @@ def is_wanted(name, given, kind=AUTO):
     """
     if kind != AUTO:
         return kind == ROBUST
-    return name not in PAPER_ARMS and not any(law in given for law in LAWS)
+    return name not in ("", *PAPER_ARMS) and not any(law in given for law in LAWS)
 
 
 def task(arm, values):
