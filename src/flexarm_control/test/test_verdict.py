@@ -66,14 +66,24 @@ def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity
         assert np.abs(found - pole).min() < 1e-5
 
 
-def test_an_observer_that_keeps_a_model_per_tenth_of_a_radian_has_no_false_pole(arm_r):
-    slow, fast = {"type": "model_following"}, {"type": "lqr"}
-    for observer in ({"type": "kalman"}, {"type": "luenberger"}):
-        on, _ = controller(arm_r, slow, fast, observer, np.array([0.25]))
-        beside, _ = controller(arm_r, slow, fast, observer, np.array([0.22]))
-        assert_allclose(
-            WholeLoop(on).poles()[:4].real, WholeLoop(beside).poles()[:4].real, rtol=0.01
-        )
+def test_an_observer_that_jumps_at_a_tenth_of_a_radian_is_asked_beside_it(arm_r):
+    law = design(arm_r, {"type": "model_following"}, {"type": "lqr"}, None, NO_CHECK)
+    q = np.array([0.25])
+
+    def made(jump):
+        observer = observe(arm_r, "filtered_derivative", {})
+        plain = observer.observer.update
+
+        def update(sample, dt):
+            plain(sample, dt)
+            observer.observer.rate += jump * np.round(10.0 * sample.position[0])
+
+        observer.observer.update = update
+        return linear_controller(law, observer, q, T)
+
+    smooth, jumps = made(0.0), made(1e-4)
+    assert smooth.q == q and 0.0 < abs(jumps.q[0] - q[0]) < 0.01
+    assert_allclose(WholeLoop(jumps).poles()[:4], WholeLoop(smooth).poles()[:4], rtol=0.01)
 
 
 def test_a_good_loop_is_stable_with_margin_and_bears_more_than_was_tried(arm_r):
