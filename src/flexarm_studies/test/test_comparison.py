@@ -237,13 +237,14 @@ def test_combinations_make_sense():
     assert len(star) == 1 + 5 + 4 + 2 + 2
 
 
-SHORT = replace(R, motion="quintic:to=0.02,duration=0.1", window=0.1, budget=2)
+#: Takes 9 N m of the 13.6 that the joint has.
+SHORT = replace(R, motion="quintic:to=0.01,duration=0.1", window=0.1, budget=2)
 
 
 def test_a_baseline_runs_in_the_same_loop():
     candidate = controllers.CONTROLLERS[controllers.PID]
     row = trial.run(SHORT, candidate.setup(SHORT, [f.first for f in candidate.free(SHORT)]))
-    assert 0.0 < row["peak_joint_error_rad"] < 0.02
+    assert 0.0 < row["peak_joint_error_rad"] < 0.01
     assert 0.0 < row["peak_torque_Nm"][0] <= 13.56
     length = 4.0 * 0.3048
     settling = SHORT.window if row["settling_s"] is None else row["settling_s"]
@@ -261,6 +262,7 @@ def test_a_baseline_has_the_shipped_controllers_peak_torque_and_no_more(monkeypa
     assert free["peak_torque_Nm"][0] > 3.0
     monkeypatch.setattr(controllers, "allowed", lambda case: (1.5,))
     held = trial.run(SHORT, controllers.prepared(SHORT, controllers.PID, stiff))
+    # The motion needs six times as much: the baseline lags behind, and is not refused.
     assert held["peak_torque_Nm"] == pytest.approx([1.5], rel=1e-12)
 
 
@@ -283,7 +285,7 @@ def test_a_shaped_motion_is_judged_by_the_motion_that_was_asked_for():
     shaped = setup.motion(cases.model_of("R"))
     assert 1e-9 * shaped.times_ns[-1] > 0.3
     row = trial.run(SHORT, setup)
-    assert row["peak_joint_error_rad"] > 0.3 * 0.02
+    assert row["peak_joint_error_rad"] > 0.3 * 0.01
 
 
 def test_what_is_refused_is_a_result():

@@ -38,9 +38,17 @@ SHIPPED, PREVIEW, TUNED = (f"composite ({kind})" for kind in ("shipped", "previe
 OWN = (SHIPPED, PREVIEW, TUNED)
 PID = "joint PID"
 
-#: The supervisor's limits are off: the comparison has its own limit for a lost arm, the same for all controllers.
+#: The supervisor's limits are off: the comparison has its own limit for a lost arm, the same for all controllers. A
+#: motion that needs more torque than a baseline may use is not refused either: the baseline lags behind, and is judged.
 UNWATCHED = dict.fromkeys(
-    ("tracking_error_limit", "velocity_margin", "position_margin", "saturation_time"), 0.0
+    (
+        "tracking_error_limit",
+        "velocity_margin",
+        "position_margin",
+        "saturation_time",
+        "trajectory_torque_margin",
+    ),
+    0.0,
 )
 
 #: A composite control that does nothing, for controllers that replace it by a law of their own.
