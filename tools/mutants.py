@@ -300,6 +300,7 @@ LAWS = [
         ),
         ("loop", "a late torque acts at once", "add(end, whole)", "add(end, 0)"),
         ("decay", "the gradient's sign", "found = -np.outer(", "found = np.outer("),
+        ("search", "the worst loops are not chosen", "if value > most and", "if value < most and"),
         (
             "decay",
             "the smooth maximum is none",

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
+from flexarm_control.low_pass import LowPass
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Slowest, Wanted, eigenvalues, gradient
@@ -30,7 +31,7 @@ from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
-QUICK = Settings(rate=500.0, delay=0.002, effort=0.2)
+QUICK = Settings(rate=500.0, delay=0.002, effort=0.5)
 FAST = 1e9  # a corner at which a filtered derivative is a difference
 
 
@@ -57,6 +58,41 @@ def test_without_filters_integral_and_delay_the_loop_is_that_of_full_state_feedb
         s, last = Phi @ s + Gamma @ u, y
         X = (loop.F - loop.G @ K @ loop.N) @ X
         assert_allclose(X[:12], s, rtol=1e-9, atol=1e-9 * np.abs(s).max())
+
+
+def test_the_low_pass_of_the_loop_is_that_of_the_laws(two_link):
+    # Sample by sample, with the torque under way for one period, against the filter that the laws run.
+    q, h, corner = np.array([0.0, 0.7]), 1e-3, 80.0
+    loop = sampled_loop(two_link, two_link, q, Sampling(h, h, FAST, FAST, corner))
+    n, m = 2, 4
+    draw = np.random.default_rng(1)
+    K = np.zeros((n, 3 * n + 2 * m))
+    K[:, :n], K[:, 3 * n : 3 * n + m] = draw.standard_normal((n, n)), draw.standard_normal((n, m))
+    Phi, Gamma = sampled(*linear_plant(two_link, q, coulomb=False), h)
+    s, filters, late = draw.standard_normal(12), LowPass(n, corner), np.zeros(n)
+    filters(np.zeros(n))
+    X = np.zeros(len(loop.F))
+    X[:12] = s
+    for _ in range(6):
+        filters.advance(h)
+        u = filters(-K @ np.concatenate([s[:2], np.zeros(4), s[2:6], np.zeros(4)]))
+        s, late = Phi @ s + Gamma @ late, u.copy()
+        X = (loop.F - loop.G @ K @ loop.N) @ X
+        assert_allclose(X[:12], s, rtol=1e-9, atol=1e-9 * np.abs(s).max())
+
+
+def test_the_low_pass_begins_with_what_it_gets_and_ends_there():
+    filters = LowPass(1, 50.0)
+    assert filters(np.array([3.0])) == 3.0
+    steps = []
+    for _ in range(400):
+        filters.advance(1e-3)
+        steps.append(filters(np.array([1.0]))[0])
+    decay = np.exp(-50.0 * 1e-3 * np.arange(1, 401))
+    assert_allclose(steps, 1.0 + 2.0 * decay * (1.0 + np.arange(1, 401) * (1.0 - np.exp(-0.05))))
+    filters.reset()
+    assert filters(np.array([-2.0])) == -2.0
+    assert LowPass(1, 0.0)(np.array([7.0])) == 7.0
 
 
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 1.4e-3, 2e-3])

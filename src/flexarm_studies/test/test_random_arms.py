@@ -9,6 +9,8 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose
 
+from flexarm_control.composite.assembly import control
+from flexarm_control.robust.design import Settings, design
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
@@ -23,6 +25,20 @@ COUNT = 2 * len(generator.LAYOUTS)
 @pytest.fixture(scope="module")
 def drawn():
     return list(generator.arms(COUNT, seed=5))
+
+
+# --------------------------------------------------------------------------- designs
+
+
+def test_an_arm_with_light_hubs_has_gains_by_a_low_pass():
+    # Without it, modes beyond the loop's reach leave the joints next to no stiffness.
+    case = generator.arm(5)
+    places = tuple(tuple(q.tolist()) for q in baselines.task_of(case).places[1:2])
+    found = design(case.read(), Settings(500.0, 0.002, effort=0.3, configurations=places))
+    assert np.isfinite(found.sampling.torque_corner) and found.decay > 0.05
+    law = control(model.build(found.arm), found.parameters())
+    for part in (law.slow, law.fast):
+        assert part.parameters["bandwidth"] == pytest.approx(found.sampling.torque_corner, rel=1e-5)
 
 
 # --------------------------------------------------------------------------- the generator

@@ -10,7 +10,7 @@ Each pole :math:`s = \ln(z)/h` of each loop has the value
 so that up to omega_c, where torque reaches, v is minus the decay over the lowest bending frequency omega_1 with the
 joints locked; of modes that are much stiffer less is asked, since a motion hardly excites them. Still stiffer modes are
 only asked to keep a fraction of their own damping zeta, and of loops that are less likely a fraction of all this is
-asked. The largest v of all poles is what a design makes small. With the right and left
+asked. A pole that grows counts by omega_1, whatever it is. The largest v of all poles is what a design makes small. With the right and left
 eigenvectors x, y of F - G K N,
 
 .. math:: \frac{\partial s}{\partial K_{ab}} = -\frac{(y^HG)_a\,(Nx)_b}{h\,z\,y^Hx} .
@@ -19,11 +19,11 @@ A pole that hardly moves with any gain is left to itself: its mode is one that t
 see.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgWarning, eigvals, lu_factor, lu_solve
+from scipy.linalg import eigvals
+from scipy.linalg.lapack import zgetrf, zgetrs
 
 #: A pole counts as one that no gain moves below this change of v by one unit of all scaled gains.
 UNMOVED = 0.01
@@ -48,8 +48,8 @@ class Wanted:
         size = np.maximum(np.abs(s), 1e-12)
         soft = self.omega_1 * np.minimum(1.0, np.sqrt(SOFT * self.omega_1 / size))
         beyond = np.minimum(self.omega_1, self.zeta * size)
-        # A pole that grows counts in full.
-        return np.where(s.real < 0.0, fraction, 1.0) * np.where(size <= self.omega_c, soft, beyond)
+        asked = fraction * np.where(size <= self.omega_c, soft, beyond)
+        return np.where(s.real < 0.0, asked, self.omega_1)
 
 
 def eigenvalues(loop, K):
@@ -61,24 +61,19 @@ def eigenvalues(loop, K):
 
 def gradient(loop, closed, z):
     """Derivative of the real part of a pole s by the gains, shape of K; by inverse iteration."""
-    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
-        # An eigenvalue that is met to the last digit, or is no simple one, counts without a gradient.
-        warnings.simplefilter("ignore", LinAlgWarning)
-        return _gradient(loop, closed, z)
-
-
-def _gradient(loop, closed, z):
     size = len(closed)
-    factors = lu_factor(closed - (z * (1.0 + 1e-10) + 1e-14) * np.eye(size), check_finite=False)
+    factors, pivots, _ = zgetrf(closed - (z * (1.0 + 1e-10) + 1e-14) * np.eye(size))
     start = np.cos(1.0 + np.arange(size)).astype(complex)
     right, left = start, start
-    for _ in range(2):
-        right = lu_solve(factors, right, check_finite=False)
-        right /= np.linalg.norm(right)
-        left = lu_solve(factors, left, trans=2, check_finite=False)
-        left /= np.linalg.norm(left)
-    across = loop.period * z * (left.conj() @ right)
-    found = -np.outer(left.conj() @ loop.G, loop.N @ right) / across
+    # Where it is singular to the last bit, no slope is found: zero.
+    with np.errstate(all="ignore"):
+        for _ in range(2):
+            right = zgetrs(factors, pivots, right)[0]
+            right /= np.linalg.norm(right)
+            left = zgetrs(factors, pivots, left, trans=2)[0]
+            left /= np.linalg.norm(left)
+        across = loop.period * z * (left.conj() @ right)
+        found = -np.outer(left.conj() @ loop.G, loop.N @ right) / across
     return np.nan_to_num(found.real)
 
 

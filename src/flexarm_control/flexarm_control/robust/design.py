@@ -12,7 +12,7 @@ The literature knows this as static output feedback by minimisation of the spect
 Overton 2006, HIFOO; Ackermann 1980 for the multi-model idea).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,10 +20,11 @@ from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import build
 
 from ..fading import lowest
+from ..low_pass import POLES
 from .decay import Slowest, Wanted
 from .loop import Sampling
 from .noise import Noise
-from .search import DECAYS, STARTS, Search, optimal, start
+from .search import STARTS, Search, race, start
 from .uncertain import (
     Uncertainty,
     configurations,
@@ -35,6 +36,10 @@ from .uncertain import (
 
 #: Corner of the filtered derivatives over omega_c.
 FILTER = 2.0
+#: Corners of the torque's low pass that are tried, over omega_1; infinite: none.
+LOW_PASS = (np.inf, 20.0, 8.0)
+#: A low pass costs margins of gain and phase, and is taken where it makes the decay larger by more than this factor.
+SLUGGISH = 1.25
 #: The controller's own check has neither filters nor delay, which the design has.
 UNCHECKED = -1000.0
 #: Beside a period a torque is under way for so long between processes [s].
@@ -137,6 +142,8 @@ class Design:
         """Flat parameters of the three nodes."""
         n = len(self.arm.joints)
         K = self.K
+        finite = np.isfinite(self.sampling.torque_corner)
+        corner = numbers([self.sampling.torque_corner])[0] if finite else 0.0
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -145,12 +152,14 @@ class Design:
             "slow.stiffness": numbers(np.diag(K[:, :n])),
             "slow.damping": numbers(np.diag(K[:, n : 2 * n])),
             "slow.integral": numbers(np.diag(K[:, 2 * n : 3 * n])),
+            "slow.bandwidth": corner,
             "fast.type": "none",
         }
         if K.shape[1] > 3 * n:
             out["fast.type"] = "fixed_gain"
             out["fast.gain"] = numbers(-K[:, 3 * n :])
             out["fast.configuration"] = numbers(self.configurations[0])
+            out["fast.bandwidth"] = corner
         return out | {"manifold.type": "reference"} | observer_parameters(self.sampling)
 
 
@@ -239,24 +248,24 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     at = places(nominal, settings)
     omega_1 = lowest(nominal)
     sampling, omega_c = sampling_for(nominal, at, settings)
-    late = sampling.delay + 0.5 * sampling.period
-    loops = uncertain_loops(nominal, at, sampling, uncertainty)
     wanted = Wanted(omega_1, omega_c, own_damping(arm, uncertainty))
     scale = units(nominal, at, omega_1)
-    slowest = Slowest(loops, wanted, scale)
     speed = max(settings.speed, 0.05)
-    noise = Noise(slowest, nominal, sampling, speed * NOISIEST, omega_1)
-    starts = [
-        slowest.scaled(start(nominal, at, scale, a, late + 1.0 / sampling.joint_corner))
-        for a in STARTS
-    ]
-    starts += [
-        slowest.scaled(optimal(nominal, at[len(at) // 2], omega_1, decay)) for decay in DECAYS
-    ]
-    if gains is not None:
-        starts.append(slowest.scaled(gains))
-    search = Search(slowest, noise, speed * FASTEST, settings.effort, settings.seed)
-    x = search.best(starts, progress)
+    searches = []
+    for factor in LOW_PASS:
+        samples = replace(sampling, torque_corner=factor * omega_1)
+        slowest = Slowest(uncertain_loops(nominal, at, samples, uncertainty), wanted, scale)
+        noise = Noise(slowest, nominal, samples, speed * NOISIEST, omega_1)
+        late = sampling.delay + 0.5 * sampling.period
+        late += 1.0 / sampling.joint_corner + POLES / samples.torque_corner
+        starts = [start(nominal, at, scale, a, late) for a in STARTS]
+        starts += [] if gains is None else [gains]
+        search = Search(slowest, noise, speed * FASTEST, 1.0 if np.isinf(factor) else SLUGGISH)
+        searches.append((search, [slowest.scaled(K) for K in starts]))
+    chosen, x = race(searches, settings.effort, progress)
+    search = searches[chosen][0]
+    slowest, noise = search.slowest, search.noise
+    sampling = replace(sampling, torque_corner=LOW_PASS[chosen] * omega_1)
     rows, left = [], []
     for one in slowest.values(x):
         v, _, _, s, unmoved = slowest.worst([one])
@@ -275,7 +284,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         at,
         tuple(rows),
         tuple(sorted(set(left))),
-        round(search.evaluations),
+        round(sum(search.evaluations for search, _ in searches)),
         tuple(noise.shares(K).tolist()),
     )
 

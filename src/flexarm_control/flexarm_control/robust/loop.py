@@ -9,8 +9,9 @@ beyond the file's leak into them. Rates are filtered derivatives with the corner
 .. math::
     r_k = d_k + (r_{k-1} - d_k)\,e^{-\omega_c h}, \qquad d_k = (y_k - y_{k-1})/h,
 
-the integral is that of the slow law, :math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. With
-the state X of all of this, and the control :math:`u = -K\,m`,
+the integral is that of the slow law, :math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. The
+feedback's torque passes two filters of first order with the corner of `slow.bandwidth` and `fast.bandwidth`
+(`flexarm_control.low_pass`). With the state X of all of this, and the control :math:`u = -K\,m`,
 
 .. math:: X_{k+1} = F X_k + G u_k, \qquad m = N X = (q, r_q, -w, \hat\delta, r_\delta) .
 """
@@ -22,6 +23,8 @@ import numpy as np
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.linear import linear_plant, sampled
 
+from ..low_pass import POLES, LowPass
+
 
 @dataclass(frozen=True)
 class Sampling:
@@ -31,6 +34,7 @@ class Sampling:
     delay: float  # from the measurement to the torque [s]
     joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
     modal_corner: float  # of that of modal amplitudes [rad/s]
+    torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
 
 
 @dataclass(frozen=True)
@@ -83,8 +87,11 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     late = sampling.delay - whole * h
     split = late > 1e-12
     under_way = whole + split
-    # X = (s, y of the last sample, r of the last sample, -w of the last sample, torques under way, newest last)
-    at_y, at_r, at_w, at_u = size, size + p, size + 2 * p, size + 2 * p + n
+    poles = 0 if np.isinf(sampling.torque_corner) else POLES
+    # X = (s, y of the last sample, r of the last sample, -w of the last sample, the low pass, torques under way,
+    # newest last)
+    at_y, at_r, at_w, at_v = size, size + p, size + 2 * p, size + 2 * p + n
+    at_u = at_v + n * poles
     total = at_u + n * under_way
     rate = np.zeros((p, total))  # r_k
     slope = (1.0 - keep) / h
@@ -103,13 +110,20 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     F[at_r : at_r + p] = rate
     F[at_w : at_w + n] = integral
     later, end = sampled(A, B, h - late)
+    # What the low pass gives now, of the state and of u.
+    out, through = np.zeros((n, total)), np.eye(n)
+    if poles:
+        passed = slice(at_v, at_u)
+        low_pass = LowPass(n, sampling.torque_corner).state_space(h)
+        F[passed, passed], G[passed], out[:, passed], through = low_pass
 
     def add(matrix, age):
         if age:
             at = total - n * age
             F[:size, at : at + n] += matrix
         else:
-            G[:size] += matrix
+            F[:size] += matrix @ out
+            G[:size] += matrix @ through
 
     add(end, whole)
     if split:
@@ -119,7 +133,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
         if age > 1:
             F[at : at + n, at + n : at + 2 * n] = np.eye(n)
         else:
-            G[at : at + n] = np.eye(n)
+            F[at : at + n], G[at : at + n] = out, through
     N = np.zeros((3 * n + 2 * m, total))
     N[:n, :size] = C[:n]
     N[n : 2 * n] = rate[:n]

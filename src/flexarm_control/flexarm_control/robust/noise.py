@@ -2,11 +2,16 @@
 """How much of the sensors' noise the gains pass on to the torque."""
 
 import numpy as np
+from scipy.signal import lfilter
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 
+from ..low_pass import POLES
+
 #: Joint and strain noise assumed where the file states none [rad], [-].
 ENCODER_NOISE, STRAIN_NOISE = 1.5e-5, 1e-6
+#: So many samples of a response to noise are looked at.
+SAMPLES = 4096
 
 
 class Noise:
@@ -34,9 +39,12 @@ class Noise:
             strain = np.array([g.uncertainty or STRAIN_NOISE for g in arm.gauges])
             modal = np.linalg.norm(map_.inverse * strain, axis=1)
         sigma = np.zeros(3 * n + 2 * m)
-        sigma[:n], sigma[3 * n : 3 * n + m] = joint, modal
-        sigma[n : 2 * n] = joint * _of_rate(sampling.joint_corner, sampling.period)
-        sigma[3 * n + m :] = modal * _of_rate(sampling.modal_corner, sampling.period)
+        position, joint_rate, modal_rate = (
+            _passed(sampling, corner)
+            for corner in (None, sampling.joint_corner, sampling.modal_corner)
+        )
+        sigma[:n], sigma[3 * n : 3 * n + m] = joint * position, modal * position
+        sigma[n : 2 * n], sigma[3 * n + m :] = joint * joint_rate, modal * modal_rate
         limit, inertia = arm.torque_limits, np.diag(model.terms(np.zeros(n), np.zeros(n)).M)[:n]
         limit = np.where(np.isfinite(limit), limit, inertia * omega_1**2)
         self._share = sigma / limit[:, None]
@@ -57,7 +65,17 @@ class Noise:
         return float(over @ over), (slope * self._slowest.scale)[self._slowest.free]
 
 
-def _of_rate(corner, period):
-    """Noise of a filtered derivative over that of the signal [1/s]."""
-    keep = np.exp(-corner * period)
-    return (1.0 - keep) / period * np.sqrt(2.0 / (1.0 + keep))
+def _passed(sampling, corner):
+    """White noise of a signal behind the torque's low pass, over that of the signal.
+
+    `corner` [rad/s]: of a filtered derivative [1/s]; None: of the signal itself [-].
+    """
+    pulse = np.zeros(SAMPLES)
+    pulse[0] = 1.0
+    if corner is not None:
+        keep = np.exp(-corner * sampling.period)
+        pulse = lfilter(np.array([1.0, -1.0]) * (1.0 - keep) / sampling.period, [1.0, -keep], pulse)
+    keep = np.exp(-sampling.torque_corner * sampling.period)
+    for _ in range(POLES):
+        pulse = lfilter([1.0 - keep], [1.0, -keep], pulse)
+    return np.linalg.norm(pulse)

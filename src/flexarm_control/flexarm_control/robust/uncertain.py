@@ -37,8 +37,8 @@ class Uncertainty:
     payload: tuple = (0.7, 1.3)
     stiffness: tuple = (0.9, 1.1)
     damping: tuple = (0.3, 3.0)
-    gain: tuple = (0.75, 1.33)
-    delay: float = 0.5
+    gain: tuple = (0.6, 1.7)
+    delay: float = 1.0
 
 
 def configurations(arm, seed=0):

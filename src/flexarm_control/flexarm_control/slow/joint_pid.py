@@ -5,6 +5,8 @@ r"""Stiffness, damping and integral of each joint about the rigid arm's torque o
     \bar u = B^{-1}(x_{ref})\,[\ddot q_{ref} - a(x_{ref})] + K_q e + K_{\dot q}\dot e + w, \qquad
     \dot w = K_w e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
 
+what is fed back passing a low pass (`flexarm_control.low_pass`),
+
 with diagonal gains in torque per angle: the slow law that `flexarm design` makes gains for, together with a constant
 feedback of the deflections (`fast.type: fixed_gain`) on the manifold of the reference. Gains of (13) multiply the
 inertia of the arm file; these do not, so that what is designed for an uncertain arm does not change with what the
@@ -18,6 +20,7 @@ import numpy as np
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
+from ..low_pass import BANDWIDTH, LowPass
 from .base import SlowLaw
 
 
@@ -45,6 +48,7 @@ class JointPid(SlowLaw):
         parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
+        BANDWIDTH,
     )
 
     def __init__(self, model, parameters):
@@ -58,8 +62,10 @@ class JointPid(SlowLaw):
         n = model.n_joints
         self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
         self._known = b"", np.zeros(n)
+        self._low_pass = LowPass(n, self.parameters["bandwidth"])
 
     def reset(self):
+        self._low_pass.reset()
         for state in (self.integral, self._error, self._beyond):
             state[:] = 0.0
 
@@ -67,8 +73,10 @@ class JointPid(SlowLaw):
         if isinstance(other, JointPid):
             np.clip(other.integral, -self._most, self._most, out=self.integral)
             self.integral *= self.gain > 0.0
+            self._low_pass.resume(other._low_pass)
 
     def advance(self, dt):
+        self._low_pass.advance(dt)
         # Where the torque is at its limit, an error that pushes farther has nothing to gain.
         grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
         self.integral += dt * self.gain * grows
@@ -82,7 +90,7 @@ class JointPid(SlowLaw):
         u = self.stiffness * self._error
         u += self.damping * (motion.velocity - qd)
         u += self.integral
-        return u
+        return self._low_pass(u)
 
     def saw(self, torque):
         self._beyond[:] = np.sign(torque) * (np.abs(torque) > self._limit)

@@ -22,10 +22,12 @@ COMMENTS = {
     "slow.stiffness": "[N m/rad]",
     "slow.damping": "[N m s/rad]",
     "slow.integral": "[N m/(rad s)]",
+    "slow.bandwidth": "[rad/s] low pass of what is fed back; 0.0: none",
     "manifold.type": "deflections of the reference's motion",
     "fast.type": "fast control: constant feedback of the deflections; none: slow control alone",
     "fast.gain": "for each joint: modal amplitudes, then their rates",
     "fast.configuration": "[rad] where the loop is checked",
+    "fast.bandwidth": "[rad/s]",
     "observer.type": "rates as filtered derivatives: no model that could be wrong",
     "observer.bandwidth": "[rad/s]",
     "observer.joint_velocity_bandwidth": "[rad/s]",
@@ -58,7 +60,7 @@ def add_arguments(parser):
         ("payload", "0.7:1.3"),
         ("stiffness", "0.9:1.1"),
         ("damping", "0.3:3"),
-        ("gain", "0.75:1.33"),
+        ("gain", "0.6:1.7"),
     ):
         add(
             f"--{name}",
