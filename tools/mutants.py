@@ -449,6 +449,41 @@ LAWS = [
         ),
     ),
     *of(
+        "flexarm_studies",
+        "uncertain",
+        "flexarm_studies/test/test_uncertain.py",
+        (
+            "baselines",
+            "strain feedback: sign of the moment that a gauge shows",
+            '(1.0 if gauge.direction == "twist" else -1.0)',
+            '(-1.0 if gauge.direction == "twist" else 1.0)',
+        ),
+        (
+            "baselines",
+            "strain feedback: of the whole moment, not of what the motion leaves",
+            "(s[n : n + m] - still)",
+            "s[n : n + m]",
+        ),
+        (
+            "plants",
+            "friction: none is added",
+            "viscous=own.viscous + fraction * limit, coulomb=own.coulomb + fraction * limit",
+            "viscous=own.viscous, coulomb=own.coulomb",
+        ),
+        (
+            "report",
+            "a lost run counts as its errors until then",
+            "word = next((w for w in (REFUSED, LOST) if w in row), None)",
+            "word = None",
+        ),
+        (
+            "report",
+            "the worst plant is the best one",
+            'found[-1] if over == "worst"',
+            'found[0] if over == "worst"',
+        ),
+    ),
+    *of(
         "flexarm_control",
         "feedforward",
         TESTS

@@ -108,7 +108,7 @@ COMMANDS = {
     "robustness": Command(
         "flexarm_studies.commands.robustness",
         "robustness",
-        "how many lost samples, and how much random delay, a loop bears",
+        "which other arms, how many lost samples, and how much random delay, a loop bears",
     ),
     "analyze": Command(
         "flexarm_studies.analysis.command",
@@ -128,7 +128,7 @@ COMMANDS = {
     "compare": Command(
         "flexarm_studies.comparison.command",
         "compare",
-        "composite control beside joint PID, input shaping, LQR and rigid adaptive control, all tuned alike",
+        "controllers and tuned baselines on plants that are not their models, and on their models: who wins what",
     ),
     "arms": Command(
         "flexarm_studies.random_arms.command",

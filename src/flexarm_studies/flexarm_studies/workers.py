@@ -1,13 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worker processes for many runs."""
+"""Where many runs are computed: in this process, in worker processes, or on a Dask cluster."""
 
 import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+
+from flexarm_dynamics.errors import FlexarmError
 
 #: Set to 1 for workers: with several threads each they would slow each other down.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+#: Value of ``--scheduler`` for processes on this machine.
+PROCESSES = "processes"
+
+
+def add_arguments(add, what=""):
+    """Add ``--workers`` and ``--scheduler`` by a parser's `add_argument`; `what` is added to the help of both."""
+    add("--workers", type=int, metavar="N", help=f"processes{what} (one per core)")
+    add(
+        "--scheduler",
+        metavar=f"ADDRESS|{PROCESSES}",
+        help=f"a Dask cluster{what}, tcp://host:8786, or {PROCESSES} of this machine ({PROCESSES})",
+    )
+
+
+def results(function, calls, workers=None, scheduler=None):
+    """Yield (i, ``function(*calls[i])``), as they come.
+
+    Parameters
+    ----------
+    function : callable
+        Of a module, so that other processes find it.
+    calls : sequence of tuple
+    workers : int, optional
+        Number of processes; one per core if not given. 1: everything in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler to use instead; its workers need flexarm. `PROCESSES`: none.
+
+    Raises
+    ------
+    FlexarmError
+        For fewer than one worker, and where Dask is not installed or its scheduler can't be reached.
+    """
+    if workers is not None and workers < 1:
+        raise FlexarmError("is too small", field="--workers", value=workers, limit="1 or more")
+    if not calls:
+        return
+    count = min(workers or os.cpu_count() or 1, len(calls))
+    remote = scheduler not in (None, PROCESSES)
+    if not remote and count == 1:
+        yield from ((i, function(*call)) for i, call in enumerate(calls))
+        return
+    with dask(scheduler) if remote else processes(count) as executor:
+        yield from through(executor, function, calls)
+
+
+def through(executor, function, calls):
+    """As `results`, by any `concurrent.futures` executor."""
+    waiting = {executor.submit(function, *call): i for i, call in enumerate(calls)}
+    try:
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 @contextmanager
@@ -26,3 +82,24 @@ def processes(count):
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def dask(address):
+    """An executor on the Dask cluster whose scheduler is at an `address`."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise FlexarmError(
+            "needs Dask, which is not installed",
+            field="--scheduler",
+            hint="pip install distributed (and flexarm on its workers)",
+        ) from None
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise FlexarmError(
+            f"is no Dask scheduler that can be reached: {error}", field="--scheduler", value=address
+        ) from None
+    with client, client.get_executor(pure=False) as executor:
+        yield executor

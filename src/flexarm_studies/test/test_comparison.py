@@ -17,6 +17,7 @@ from flexarm_studies.comparison import cases, combinations, command, controllers
 from flexarm_studies.comparison.baselines import FullStateLqr, JointPid, lqr_gain
 from flexarm_studies.comparison.tuning import Free, tune
 from flexarm_studies.loop import scenario
+from flexarm_studies.uncertain import plants
 
 pytestmark = pytest.mark.slow
 
@@ -221,8 +222,8 @@ def test_arms_without_damping_or_noise_get_some_and_others_stay():
     assert cases.arm_of("two_link").links == arm_file.load("two_link").links
     quiet, noisy = cases.arm_of("R"), cases.arm_of("R", noisy=True)
     assert {g.noise for g in quiet.gauges} == {0.0}
-    assert {g.noise for g in noisy.gauges} == {cases.STRAIN_NOISE}
-    assert noisy.joints[0].encoder_counts == cases.COUNTS
+    assert {g.noise for g in noisy.gauges} == {plants.STRAIN_NOISE}
+    assert noisy.joints[0].encoder_counts == plants.COUNTS
 
 
 def test_combinations_make_sense():
@@ -368,11 +369,13 @@ def test_a_file_without_markers_is_refused(tmp_path):
 
 
 def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
-    def interrupted(jobs, seed, workers):
-        yield 1, stored()["subjects"][0]["contenders"][controllers.PID]
+    def interrupted(keep, function, calls, *where):
+        found = stored()["subjects"][0]["contenders"][controllers.PID]
+        keep.append({"sample": "R: joint PID", "found": found})
+        yield 1, None
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "_results", interrupted)
+    monkeypatch.setattr(command, "gather", interrupted)
     out = tmp_path / "rows.json"
     words = ["--arms", "R", "--controllers", "composite (shipped),joint PID", "--no-combinations"]
     with pytest.raises(KeyboardInterrupt):

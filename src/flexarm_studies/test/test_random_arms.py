@@ -15,8 +15,9 @@ from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
-from flexarm_studies.random_arms import baselines, generator, report, study, trial
-from flexarm_studies.random_arms.controllers import CONTROLLERS
+from flexarm_studies.random_arms import generator, report, study
+from flexarm_studies.uncertain import baselines, plants, trial
+from flexarm_studies.uncertain.controllers import CONTROLLERS
 
 #: One of each layout, with and without gravity.
 COUNT = 2 * len(generator.LAYOUTS)
@@ -132,7 +133,7 @@ def record_of(make_record, case, plant, rest):
 
 def test_a_run_is_judged_by_where_the_plant_itself_would_rest(make_record):
     case = arm_like_r()
-    plant = model.build(trial.plant_of(case.read(), trial.VARIANTS["payload x1.3"]))
+    plant = model.build(plants.plant_of(case.read(), plants.VARIANTS["payload x1.3"]))
     record, end = record_of(make_record, case, plant, 0.0)
     found = trial.judged(case, plant, record, end)
     # 0.1 rad e^(-t/half a period) moves the tip by 0.1 % of the reach after ln(100) half periods.
@@ -147,12 +148,12 @@ def test_a_run_is_judged_by_where_the_plant_itself_would_rest(make_record):
 
 def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
     arm = arm_like_r().read()
-    plant = trial.plant_of(arm, trial.VARIANTS["payload x0.7"])
+    plant = plants.plant_of(arm, plants.VARIANTS["payload x0.7"])
     assert plant.finite_slope and plant.foreshortening
     assert len(plant.modes) == len(arm.modes) + 1
     assert_allclose(plant.payload.mass, 0.7 * arm.payload.mass)
     assert not any(g.bits for g in plant.gauges) and not any(j.encoder_counts for j in plant.joints)
-    noisy = trial.plant_of(arm, trial.VARIANTS["noisy"])
+    noisy = plants.plant_of(arm, plants.VARIANTS["noisy"])
     assert noisy.gauges == arm.gauges and noisy.joints == arm.joints
 
 
@@ -160,9 +161,9 @@ def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
 def test_a_baseline_that_is_tuned_for_the_arm_settles_on_it_and_the_same_every_time():
     case = arm_like_r()
     setup = CONTROLLERS["lqr"](case)
-    found = trial.run(case, setup, trial.VARIANTS["exact"])
+    found = trial.run(case, setup, plants.VARIANTS["exact"])
     assert "lost" not in found and found["settled"] and found["settling_periods"] < 3.0
-    again = trial.run(case, CONTROLLERS["lqr"](case), trial.VARIANTS["exact"])
+    again = trial.run(case, CONTROLLERS["lqr"](case), plants.VARIANTS["exact"])
     assert again == found
 
 
@@ -171,13 +172,13 @@ def test_a_designed_controller_runs():
     case = arm_like_r()
     setup = CONTROLLERS["designed_preview"](case)
     assert setup.controller["feedforward"] == "preview" and setup.law is None
-    found = trial.run(case, setup, trial.VARIANTS["exact"])
+    found = trial.run(case, setup, plants.VARIANTS["exact"])
     assert "lost" not in found and "refused" not in found and found["peak_joint_error_deg"] < 5.0
 
 
 def test_a_design_that_is_refused_is_a_result():
     case = generator.arm(1, seed=5)  # a yaw joint reaches no vertical bending
-    found = trial.run(case, CONTROLLERS["default"](case), trial.VARIANTS["exact"])
+    found = trial.run(case, CONTROLLERS["default"](case), plants.VARIANTS["exact"])
     assert list(found) == ["refused"] and "can't reach" in found["refused"]
 
 
@@ -189,7 +190,7 @@ def test_a_design_that_is_refused_is_a_result():
 def test_a_pid_is_stable_on_what_it_is_tuned_for(number):
     task = baselines.Task(generator.arm(number, seed=5))
     gains, _ = baselines.pid(task, "zvd")
-    K = baselines.pid_feedback(gains, len(task.plants[0].X))
+    K = baselines.pid_feedback(task, gains, task.plants[0])
     assert all(baselines.poles(p, K, gains["i"]).real.max() < 0.0 for p in task.plants)
     # With thirty times the gains it is not: the judge can fail.
     assert any(baselines.poles(p, 30.0 * K, gains["i"]).real.max() > 0.0 for p in task.plants)
@@ -199,7 +200,7 @@ def test_a_sampled_loop_is_that_of_its_samples(drawn):
     task = baselines.Task(drawn[2])
     plant, n = task.plants[0], task.model.n_joints
     gains = baselines.pid_gains(task, [task.omega, 1.0, 0.1, 2.0, 0.5])
-    K = baselines.pid_feedback(gains, len(plant.X))
+    K = baselines.pid_feedback(task, gains, plant)
     rng = np.random.default_rng(0)
     for late in (0, 1):
         x, last, held = rng.normal(size=len(plant.Phi)), rng.normal(size=n), np.zeros(n)
@@ -217,7 +218,7 @@ def test_the_settling_time_of_the_linear_arm_is_about_that_of_the_run():
     case = arm_like_r()
     task = baselines.Task(case)
     _, periods = baselines.pid(task, "zvd")
-    found = trial.run(case, CONTROLLERS["pid_zvd"](case), trial.VARIANTS["payload x1.3"])
+    found = trial.run(case, CONTROLLERS["pid_zvd"](case), plants.VARIANTS["payload x1.3"])
     assert periods < 4.0 and found["settled"]
     assert abs(found["settling_periods"] - periods) < 1.5
 

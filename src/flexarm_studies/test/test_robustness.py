@@ -10,6 +10,7 @@ from numpy.testing import assert_array_equal
 from flexarm_control.loop.samples import ArmSample
 from flexarm_dynamics.arm.units import FOOT
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_studies.commands import robustness as module
 from flexarm_studies.commands.robustness import breaks, levels_of, table
 from flexarm_studies.loop.network import TORQUE_TIMEOUT, Network, NetworkedLoop
 from flexarm_studies.loop.scenario import Scenario, loop_of, parameters, run, trajectory_of
@@ -132,11 +133,12 @@ def test_a_torque_is_held_until_it_is_too_old_then_the_safe_action_is_taken():
 def robustness(result):
     """Rows of ``flexarm robustness R`` for a short motion, one run at each level."""
     motion = ("--trajectory", "quintic:to=0.5,duration=0.7", "--window", 0.8)
-    return lambda *words: result("robustness", "R", "--seeds", 1, *motion, *words)
+    few = ("--seeds", 1, "--workers", 1)
+    return lambda *words: result("robustness", "R", *few, *motion, *words)
 
 
 def test_the_default_bears_a_fifth_of_the_samples_lost_and_delays_up_to_10_ms(robustness):
-    rows = robustness("--loss", 0.2, "--delay", 10)
+    rows = robustness("--loss", 0.2, "--delay", 10, "--plants", "none")["sweeps"]
     levels = [(r["disturbance"], r["level"]) for r in rows]
     assert levels == [("samples lost", 20.0), ("delay uniform from 0 to", 10.0)]
     for row in rows:
@@ -145,9 +147,27 @@ def test_the_default_bears_a_fifth_of_the_samples_lost_and_delays_up_to_10_ms(ro
 
 
 def test_so_does_the_papers_control_which_breaks_when_nearly_all_are_lost(robustness):
-    rows = robustness("--controller", "paper_composite", "--loss", "0.2:0.75:0.95", "--delay", "10")
+    words = ("--loss", "0.2:0.75:0.95", "--delay", "10", "--plants", "none")
+    rows = robustness("--controller", "paper_composite", *words)["sweeps"]
     assert [r["stable"] for r in rows] == [1, 0, 1]
     assert rows[1]["why"]
+
+
+def test_arms_that_are_not_the_model_are_reported_and_an_interrupted_command_goes_on(
+    robustness, tmp_path, monkeypatch
+):
+    kept = tmp_path / "kept.jsonl"
+    words = ("--loss", 0, "--delay", 0, "--plants", "nominal,payload x1.3", "--out", kept)
+    found = robustness(*words)
+    plants = {row["variant"]: row for row in found["plants"]}
+    assert list(plants) == ["nominal", "payload x1.3"] and len(found["sweeps"]) == 2
+    exact, heavy = (row["peak_joint_error_deg"] for row in plants.values())
+    assert 0.0 < exact < heavy
+    kept.write_text("".join(kept.read_text().splitlines(keepends=True)[:-1]))
+    ran, at = [], module.at
+    monkeypatch.setattr(module, "at", lambda *args: (ran.append(args), at(*args))[1])
+    monkeypatch.setattr(module, "on_plant", None)  # not called again
+    assert robustness(*words) == found and len(ran) == 1
 
 
 def row(level, stable, what="samples lost"):

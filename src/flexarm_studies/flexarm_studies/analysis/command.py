@@ -11,6 +11,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
+from .. import workers
 from ..commands.options import add_settings, at_least
 from ..loop import scenario as scenarios
 from ..loop.judged import verdict_of
@@ -54,10 +55,7 @@ def add_arguments(parser):
     add("--quick", action="store_true", help="no nonlinear runs, a shorter search for the bound")
     add("--monte-carlo", type=int, metavar="N", help="N runs of arms that differ from the model")
     add("--seed", type=int, default=0, help="seed of configurations and samples (0)")
-    add("--workers", type=int, metavar="N", help="processes of the Monte Carlo (one per core)")
-    add(
-        "--scheduler", metavar="ADDRESS", help="a Dask cluster for the Monte Carlo: tcp://host:8786"
-    )
+    workers.add_arguments(add, " for the Monte Carlo")
     add(
         "--out",
         metavar="DIR",

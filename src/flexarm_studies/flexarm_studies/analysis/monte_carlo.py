@@ -7,12 +7,8 @@ JSON-lines file as they come; its first line is the specification.
 """
 
 import hashlib
-import json
 import math
-import os
-from concurrent.futures import as_completed
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +18,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 from ..commands.options import at_least
 from ..loop import scenario as scenarios
-from ..workers import processes
+from ..store import Store, gather
 
 FILE = "monte_carlo.jsonl"
 #: Uniform ranges: factors of payload, stiffness and damping [-], and the delay [s].
@@ -113,7 +109,7 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
     workers : int, optional
         Number of processes; one per core if not given. 1: everything in this process.
     scheduler : str, optional
-        Address of a Dask scheduler to use instead; its workers need flexarm.
+        As for `workers.results`.
     progress : Progress, optional
 
     Returns
@@ -127,139 +123,17 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
         For a file of another specification, and where Dask is not installed or its scheduler can't be reached.
     """
     at_least("--monte-carlo", count, 1)
-    at_least("--workers", workers, 1)
-    keep = None if directory is None else Store(Path(directory) / FILE, spec)
-    results = {} if keep is None else {n: r for n, r in keep.results.items() if n < count}
-    missing = [n for n in range(count) if n not in results]
-    try:
-        for result in _results(spec, missing, workers, scheduler):
-            results[result["sample"]] = result
-            if keep is not None:
-                keep.append(result)
-            if progress is not None:
-                progress.fraction(len(results) / count)
-    finally:
-        if keep is not None:
-            keep.close()
-    return [results[n] for n in range(count)]
+    keep = Store(None if directory is None else Path(directory) / FILE, spec)
+    missing = [(spec, n) for n in range(count) if n not in keep.results]
+    done = count - len(missing)
+    for i, _ in enumerate(gather(keep, _rows, missing, workers, scheduler), 1):
+        if progress is not None:
+            progress.fraction((done + i) / count)
+    return [keep.results[n] for n in range(count)]
 
 
-def _results(spec, missing, workers, scheduler):
-    """Yield results as they come."""
-    if not missing:
-        return
-    workers = min(workers or os.cpu_count() or 1, len(missing))
-    if scheduler is None and workers == 1:
-        yield from (sample(spec, n) for n in missing)
-        return
-    with processes(workers) if scheduler is None else _dask(scheduler) as executor:
-        yield from through(executor, spec, missing)
-
-
-def through(executor, spec, missing):
-    """Yield results of samples, as they come, from any `concurrent.futures` executor."""
-    waiting = [executor.submit(sample, spec, n) for n in missing]
-    try:
-        for future in as_completed(waiting):
-            yield future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
-
-
-@contextmanager
-def _dask(address):
-    try:
-        from distributed import Client
-    except ImportError:
-        raise FlexarmError(
-            "needs Dask, which is not installed",
-            field="--scheduler",
-            hint="pip install distributed (and flexarm on its workers)",
-        ) from None
-    try:
-        client = Client(address, timeout=10)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise FlexarmError(
-            f"is no Dask scheduler that can be reached: {error}", field="--scheduler", value=address
-        ) from None
-    with client, client.get_executor(pure=False) as executor:
-        yield executor
-
-
-class Store:
-    """Results in a JSON-lines file.
-
-    Parameters
-    ----------
-    path : Path
-        Created if missing. A last line that an interruption cut off is dropped.
-    spec : Specification
-
-    Attributes
-    ----------
-    results : dict
-        Those already in the file, by sample number.
-
-    Raises
-    ------
-    FlexarmError
-        For a file of another specification, and for any other file.
-    """
-
-    def __init__(self, path, spec):
-        self.path = Path(path)
-        header = {"specification": json.loads(json.dumps(asdict(spec)))}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        whole = self._whole() if self.path.exists() else []
-        self.results = {}
-        if whole:
-            self._check(whole[0], header)
-            self.results = {row["sample"]: row for row in whole[1:]}
-        self._file = self.path.open("a", encoding="utf-8")
-        if not whole:
-            self.append(header)
-
-    def _whole(self):
-        """Rows of the complete lines; the file is cut after them."""
-        data = self.path.read_bytes()
-        end = data.rfind(b"\n") + 1
-        try:
-            rows = [json.loads(line) for line in data[:end].splitlines()]
-            if any(not isinstance(r, dict) for r in rows) or any(
-                "sample" not in r for r in rows[1:]
-            ):
-                raise ValueError("not rows of samples")
-        except ValueError as error:
-            raise FlexarmError(
-                f"not a file of Monte Carlo results: {error}", field=str(self.path)
-            ) from None
-        if not rows and data and not data.startswith(b'{"specification"'):
-            raise FlexarmError("not a file of Monte Carlo results", field=str(self.path))
-        os.truncate(self.path, end)
-        return rows
-
-    def _check(self, there, wanted):
-        if there == wanted:
-            return
-        old, new = there.get("specification"), wanted["specification"]
-        if not isinstance(old, dict):
-            raise FlexarmError("not a file of Monte Carlo results", field=str(self.path))
-        other = sorted(k for k in {*old, *new} if old.get(k) != new.get(k))
-        raise FlexarmError(
-            f"has results of another specification ({', '.join(other)} differ)",
-            field=str(self.path),
-            hint="use another --out, or remove the file",
-        )
-
-    def append(self, row):
-        """Write a `row` to the file at once."""
-        self._file.write(json.dumps(row, allow_nan=False) + "\n")
-        self._file.flush()
-
-    def close(self):
-        """Close the file."""
-        self._file.close()
+def _rows(spec, number):
+    return [sample(spec, number)]
 
 
 def summary(results):

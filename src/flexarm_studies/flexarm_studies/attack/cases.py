@@ -9,8 +9,8 @@ from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
-from ..comparison.cases import COUNTS, STRAIN_NOISE
 from ..loop import scenario as scenarios
+from ..uncertain.plants import COUNTS, STRAIN_NOISE
 
 #: Arm to its controller file (empty: the nodes' defaults), motion and rate [Hz].
 ARMS = {

@@ -132,3 +132,12 @@ def new_path(path, option):
         hint = "name another one or remove it"
         raise FlexarmError("exists already", field=option, value=str(path), hint=hint)
     return path
+
+
+def chosen(option, text, known):
+    """The names in an option's text, each of which must be `known`."""
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise FlexarmError("is unknown", field=option, value=name, limit=", ".join(known))
+    return names

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""``flexarm robustness``: how many lost samples and how much random delay a loop tolerates.
+r"""``flexarm robustness``: how many lost samples and how much random delay a loop tolerates, and which other arms.
 
-A motion is simulated with samples lost independently with a probability, and separately with every sample delayed by
-a time uniform from 0 to a maximum (`network`). There are several seeds at each level; observer, controller, limits
-and the driver's timeout are included. A run is stable if the loop kept the arm and, compared with the same run
-without loss and delay,
+A motion is simulated on arms that are not the controller's model (`uncertain.plants`): nominal and worst errors.
+With the arm as it is in its file, it is simulated with samples lost independently with a probability, and separately
+with every sample delayed by a time uniform from 0 to a maximum (`network`). There are several seeds at each level;
+observer, controller, limits and the driver's timeout are included. A run is stable if the loop kept the arm and,
+compared with the same run without loss and delay,
 
 - the largest joint error is at most `TRACKING` times as large, plus `ALLOWED`;
 - the largest bending, :math:`\sqrt{\delta^T K\delta}` with the links' stiffness K, is at most `BENDING` times as large;
@@ -14,18 +15,27 @@ without loss and delay,
 Errors are relative to the reference at that time, not to the older one that the answer to a late sample used.
 """
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
+from flexarm_control.robust import default
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
-from .. import markdown
+from .. import markdown, workers
+from ..comparison.controllers import Setup
 from ..loop import scenario as scenarios
 from ..loop.metrics import tracking_metrics
 from ..progress import Progress
-from .options import add_arm_arguments, in_range, numbers, show
+from ..store import Store, gather
+from ..uncertain import report, runs
+from ..uncertain.plants import VARIANTS, names_for
+from ..uncertain.trial import ArmTask
+from .options import add_arm_arguments, chosen, in_range, numbers, show
 
 #: Bounds of a stable run; see the module. `ALLOWED` in rad, `SETTLED` as a fraction of the reach.
 TRACKING, ALLOWED, BENDING, SETTLED = 2.0, 0.05, 1.5, 0.005
@@ -45,14 +55,14 @@ COLUMNS = (
 def add_arguments(parser):
     """Arguments of ``robustness``."""
     parser.description = (
-        "Simulates a motion with samples lost at random, and separately with random "
-        "delays, at rising levels, and reports where the loop becomes unstable."
+        "Simulates a motion on arms that differ from the arm file, and separately with samples lost at random and with "
+        "random delays, at rising levels, and reports nominal and worst errors, and where the loop becomes unstable."
     )
     parser.epilog = (
         "example: flexarm robustness R --controller paper_composite --loss 0:0.1:0.9 --delay 0:4:40"
     )
     add = parser.add_argument
-    add_arm_arguments(parser, "rows as JSON")
+    add_arm_arguments(parser, "rows as JSON: plants, sweeps")
     add(
         "--controller",
         action="append",
@@ -66,7 +76,22 @@ def add_arguments(parser):
     add("--seeds", type=int, default=3, help="runs at each level (3)")
     add("--noise", action="store_true", help="gauges have the arm file's noise")
     add("--window", type=float, default=3.0, help="time after the motion [s] (3)")
-    add("--figure", metavar="FILE.png", help="draw it")
+    names = ",".join(VARIANTS)
+    add("--plants", default=names, help=f"uncertain set, separated by commas; or none ({names})")
+    workers.add_arguments(add)
+    add(
+        "--out",
+        metavar="FILE.jsonl",
+        help="keep every result; those in it are not computed again, so an interrupted command goes on",
+    )
+    add("--figure", metavar="FILE.png", help="draw the sweeps")
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What the results of a file have in common."""
+
+    robustness: dict
 
 
 def robustness(options):
@@ -76,24 +101,69 @@ def robustness(options):
         "loss": levels_of("--loss", options.loss, 1.0),
         "jitter": [1e-3 * ms for ms in levels_of("--delay", options.delay, 1000.0)],
     }
-    progress, rows = Progress(), []
-    for name in options.controller or ["default"]:
-        scenario = scenarios.Scenario(
+    names = () if options.plants == "none" else chosen("--plants", options.plants, VARIANTS)
+    variants = names_for(arm_file.load(options.arm), names)
+    scenario_of, calls = _scenarios(options), {}
+    for name, scenario in scenario_of.items():
+        calls |= {f"{name}/{v}": (on_plant, name, scenario, v) for v in variants}
+        for what, values in levels.items():
+            calls |= {
+                f"{name}/{what} {x}": (at, name, scenario, what, x, options.seeds) for x in values
+            }
+    settings = {name: scenario.as_dict() for name, scenario in scenario_of.items()}
+    found = _computed(options, calls, Specification({"seeds": options.seeds, "runs": settings}))
+    plants = [row for row in found if "variant" in row]
+    sweeps = [row for row in found if "variant" not in row]
+    lines = [*report.table(plants), "", *report.verdicts(plants), ""] if plants else []
+    lines += [*table(sweeps), "", *breaks(sweeps)]
+    show(options, {"plants": plants, "sweeps": sweeps}, lines, indent=1)
+    if options.figure:
+        draw(sweeps, options.figure, f"{options.arm}, {options.trajectory}, {options.rate:g} Hz")
+
+
+def _scenarios(options):
+    """The undisturbed `Scenario` of each controller, by its file's name without folder and suffix."""
+    found = {}
+    for file in options.controller or ["default"]:
+        name = Path(file).stem
+        if name in found:
+            raise FlexarmError("is there twice", field="--controller", value=name)
+        found[name] = scenarios.Scenario(
             options.arm,
-            {} if name == "default" else scenarios.parameters(name),
+            {} if file == "default" else scenarios.parameters(file),
             trajectory=options.trajectory,
             rate=options.rate,
             noise=options.noise,
             window=options.window,
         )
-        for what, values in levels.items():
-            progress.step(f"{Path(name).stem}, {SWEPT[what][0]}")
-            found = sweep(scenario, what, values, options.seeds, progress.fraction)
-            rows += [{"controller": Path(name).stem, **row} for row in found]
+    return found
+
+
+def _computed(options, calls, specification):
+    """Rows of `calls`, a function with its arguments each, by their keys."""
+    keep, progress = Store(options.out, specification), Progress()
+    left = [(key, *call) for key, call in calls.items() if key not in keep.results]
+    done = len(calls) - len(left)
+    for i, _ in gather(keep, _kept, left, options.workers, options.scheduler):
+        done += 1
+        progress.step(left[i][0], done, len(calls))
     progress.done()
-    show(options, rows, [*table(rows), "", *breaks(rows)], indent=1)
-    if options.figure:
-        draw(rows, options.figure, f"{options.arm}, {options.trajectory}, {options.rate:g} Hz")
+    return [keep.results[key]["row"] for key in calls]
+
+
+def _kept(key, function, *arguments):
+    return [{"sample": key, "row": function(*arguments)}]
+
+
+def on_plant(name, scenario, variant):
+    """Row of `runs.rows` of the controller `name` and motion of a `scenario`, on one of the uncertain plants."""
+    given = dict(scenario.controller) | {"rate": scenario.rate}
+    # Runs take an arm that was read, which gets a design only if that is asked for.
+    if default.is_wanted(scenario.arm, given, given.get("design.type", default.AUTO)):
+        given["design.type"] = default.ROBUST
+    task = ArmTask(scenario.arm, arm_file.load(scenario.arm), scenario.trajectory)
+    (row,) = runs.rows(task, scenario.arm, name, lambda case: Setup(given), [variant])
+    return {k: v for k, v in row.items() if k not in ("sample", "seconds")}
 
 
 def levels_of(option, text, most):
@@ -167,26 +237,28 @@ class Judge:
         return float(error), float(np.sqrt(energy.max(initial=0.0))), rest
 
 
-def sweep(scenario, what, levels, seeds=3, progress=lambda fraction: None):
-    """Run a `scenario` at every one of the `levels` of one disturbance, `what`: ``loss`` [-] or ``jitter`` [s].
+def at(name, scenario, what, level, seeds):
+    """Run a controller's `scenario` at one level of a disturbance, `what`: ``loss`` [-] or ``jitter`` [s].
 
-    Returns a row per level with the worst numbers of its `seeds` runs, keys `COLUMNS` without the controller; None if a
-    run has no number.
+    Returns a row with the controller's `name` and the worst numbers of its `seeds` runs, keys `COLUMNS`; None if a run
+    has no number.
     """
-    judge, (words, factor, unit), rows = Judge(scenario), SWEPT[what], []
-    for i, level in enumerate(levels):
-        runs = [judge.run(**{what: level, "seed": scenario.seed + k}) for k in range(seeds)]
-        error, ratio, rest = (_worst([r[j] for r in runs]) for j in range(3))
-        reasons = [r[3] for r in runs if r[3]]
-        head = (words, round(factor * level, 9), unit, seeds - len(reasons), seeds)
-        worst = (
-            None if error is None else float(np.degrees(error)),
-            ratio,
-            None if rest is None else 1e3 * rest,
-        )
-        rows.append(dict(zip(COLUMNS[1:], (*head, *worst, (reasons or [""])[0]), strict=True)))
-        progress((i + 1) / len(levels))
-    return rows
+    judge, (words, factor, unit) = _judge(json.dumps(scenario.as_dict())), SWEPT[what]
+    found = [judge.run(**{what: level, "seed": scenario.seed + k}) for k in range(seeds)]
+    error, ratio, rest = (_worst([r[j] for r in found]) for j in range(3))
+    reasons = [r[3] for r in found if r[3]]
+    head = (name, words, round(factor * level, 9), unit, seeds - len(reasons), seeds)
+    worst = (
+        None if error is None else float(np.degrees(error)),
+        ratio,
+        None if rest is None else 1e3 * rest,
+    )
+    return dict(zip(COLUMNS, (*head, *worst, (reasons or [""])[0]), strict=True))
+
+
+@lru_cache(maxsize=4)
+def _judge(scenario):
+    return Judge(scenarios.Scenario(**json.loads(scenario)))
 
 
 def _worst(values):

@@ -10,14 +10,16 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
 from ..loop import scenario as scenarios
+from ..uncertain.plants import NOMINAL, VARIANTS, with_noise
+from ..uncertain.trial import ArmTask
 
 #: Damping ratio of every mode of arms whose file states no damping [-].
 DAMPING = 0.005
-#: Sensors of arms whose file states no noise: rms strain of a gauge, encoder counts per turn.
-STRAIN_NOISE, COUNTS = 5e-7, 2**16
 #: Sixty degrees of every joint in two seconds; `long_reach` starts where its torque limits allow it.
 SIXTY = "quintic:to=1.0472,duration=2"
 LONG_WAY = "quintic:from=0;1.2;0.8;-0.8,to=1.0472;0.1528;1.8472;0.2472,duration=2"
+#: The plants of an arm whose runs take ten seconds each.
+FEW = (NOMINAL, "payload x0.7", "payload x1.3", "stiffness x0.9", "damping x0.3", "noisy")
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class Case:
         Which combinations of the composite control's parts are tried: see `combinations.of`.
     window : float
         How long the rest after the motion is judged [s].
+    plants : tuple
+        Those of `plants.VARIANTS` on which controllers are judged.
     """
 
     arm: str
@@ -49,6 +53,7 @@ class Case:
     budget: int
     depth: str
     window: float = 2.0
+    plants: tuple = tuple(VARIANTS)
 
     @property
     def duration(self):
@@ -64,7 +69,7 @@ CASES = (
     Case("R", "composite", "paper:duration=2", 500.0, 32, "full"),
     Case("one_link", "composite", "paper:duration=2", 500.0, 32, "none"),
     Case("two_link", "two_link", SIXTY, 1000.0, 16, "star"),
-    Case("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star"),
+    Case("long_reach", "long_reach", LONG_WAY, 500.0, 12, "star", plants=FEW),
 )
 
 
@@ -83,11 +88,7 @@ def arm_of(name, noisy=False):
     """The arm, with a little damping where its file has none; with `noisy` also with noise where it states none."""
     arm = arm_file.load(name)
     arm = replace(arm, links=tuple(map(_damped, arm.links)))
-    if not noisy:
-        return arm
-    gauges = tuple(replace(g, noise=g.noise or STRAIN_NOISE) for g in arm.gauges)
-    joints = tuple(replace(j, encoder_counts=j.encoder_counts or COUNTS) for j in arm.joints)
-    return replace(arm, gauges=gauges, joints=joints)
+    return with_noise(arm) if noisy else arm
 
 
 def _damped(link):
@@ -102,6 +103,11 @@ def _damped(link):
 def model_of(name):
     """The arm's model: for which controllers are designed."""
     return model.build(arm_of(name))
+
+
+def task_of(case):
+    """The case as what runs on uncertain plants need; controllers are designed with the noise that is met there."""
+    return ArmTask(case.arm, arm_of(case.arm, noisy=True), case.motion)
 
 
 def ends_of(case):

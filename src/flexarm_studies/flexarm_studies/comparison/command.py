@@ -1,27 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm compare``: tunes all controllers alike, runs them, and writes the table."""
+"""``flexarm compare``: tunes all controllers alike, runs them, and writes the tables.
+
+One table is of the plant that is the controllers' model, with everything tuned by simulation on it. The other one is
+of the uncertain set, with baselines tuned for that: `uncertain`.
+"""
 
 import argparse
 import json
-import os
 import sys
-from concurrent.futures import as_completed
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 
-from ..commands.options import at_least
+from .. import workers
+from ..commands.options import at_least, chosen
 from ..progress import Progress
-from ..workers import processes
+from ..store import Store, gather
+from ..uncertain import controllers as uncertain
+from ..uncertain import plants, runs
 from . import cases, combinations, report
-from .controllers import CONTROLLERS, PREVIEW, prepared
+from .controllers import CONTROLLERS, PREVIEW, Setup, prepared
 from .trial import REFUSED, run
 from .tuning import tune
 
 #: For `--quick`: the one arm, the number of simulations, and the window after the motion [s].
 QUICK, QUICK_BUDGET, QUICK_WINDOW = "R", 2, 0.2
+QUICK_PLANTS = (plants.NOMINAL, "payload x1.3")
+#: Of the controllers that run on the uncertain set: the shipped file.
+SHIPPED = "shipped"
+#: The controllers that run on the uncertain set.
+ON_PLANTS = (SHIPPED, "designed", "designed_preview", *uncertain.BASELINES)
+
+
+@dataclass(frozen=True)
+class OnPlants:
+    """Of a job: a controller on uncertain plants."""
+
+    controller: str
+    variants: tuple
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What the results of a file have in common."""
+
+    comparison_seed: int
+    cases: list
 
 
 def add_arguments(parser):
@@ -33,10 +59,25 @@ def add_arguments(parser):
     add = parser.add_argument
     arms = ",".join(s.arm for s in cases.CASES)
     add("--arms", default=arms, help=f"arms, separated by commas ({arms})")
-    add("--controllers", "--contenders", help="controllers, separated by commas; or none (all)")
+    add(
+        "--controllers",
+        "--contenders",
+        help=f"controllers, separated by commas; or none (all); on the uncertain set: {','.join(ON_PLANTS)}",
+    )
+    names = ",".join(plants.VARIANTS)
+    add(
+        "--plants",
+        default=names,
+        help=f"uncertain set, separated by commas, of which long_reach has a part; or none ({names})",
+    )
     add("--budget", type=int, metavar="N", help="simulations per controller (depends on the arm)")
     add("--seed", type=int, default=0, help="seed of tuning and noise (0)")
-    add("--workers", type=int, metavar="N", help="processes (one per core)")
+    workers.add_arguments(add)
+    add(
+        "--out",
+        metavar="FILE.jsonl",
+        help="keep every result; those in it are not computed again, so an interrupted command goes on",
+    )
     add(
         "--quick",
         action="store_true",
@@ -93,12 +134,14 @@ def merged(runs):
     by_arm = {}
     for run_ in runs:
         for case in run_["subjects"]:
-            whole = by_arm.setdefault(case["arm"], case | {"contenders": {}, "combinations": []})
+            empty = {"contenders": {}, "combinations": [], "plants": []}
+            whole = by_arm.setdefault(case["arm"], case | empty)
             for name in ("motion", "rate_Hz", "window_s", "budget"):
                 if whole[name] != case[name] or runs[0]["seed"] != run_["seed"]:
                     raise FlexarmError(f"the runs differ in {name} or seed", field=case["arm"])
             whole["contenders"] |= case["contenders"]
             whole["combinations"] += case["combinations"]
+            whole["plants"] += case.get("plants", [])
     order = [s.arm for s in cases.CASES]
     return {
         "seed": runs[0]["seed"],
@@ -106,24 +149,29 @@ def merged(runs):
     }
 
 
-def chosen(options):
-    """The requested cases, and names of controllers."""
-    for name, least in (("budget", 1), ("workers", 1), ("seed", 0)):
+def wanted_of(options):
+    """The requested cases, names of controllers tuned on the model, names of those on uncertain plants, and plants."""
+    for name, least in (("budget", 1), ("seed", 0)):
         at_least(f"--{name}", getattr(options, name), least)
-    names = list(CONTROLLERS)
+    names = [*CONTROLLERS, *ON_PLANTS]
     if options.controllers == "none":
         names = []
     elif options.controllers:
         names = _joined([name.strip() for name in options.controllers.split(",")])
+    variants = ()
+    if options.plants != "none":
+        variants = tuple(chosen("--plants", options.plants, plants.VARIANTS))
     wanted = cases.find([QUICK] if options.quick else options.arms.split(","))
     if options.quick:
         wanted = [replace(s, window=QUICK_WINDOW, depth="star") for s in wanted]
+        variants = tuple(v for v in variants if v in QUICK_PLANTS)
     budget = options.budget or (QUICK_BUDGET if options.quick else None)
     if budget:
         wanted = [replace(s, budget=budget) for s in wanted]
     if options.no_combinations:
         wanted = [replace(s, depth="none") for s in wanted]
-    return wanted, names
+    tuned = [name for name in names if name in CONTROLLERS]
+    return wanted, tuned, [name for name in names if name in ON_PLANTS], variants
 
 
 def _joined(words):
@@ -132,18 +180,25 @@ def _joined(words):
     while rest:
         for count in (2, 1):
             name = ", ".join(rest[:count])
-            if name in CONTROLLERS:
+            if name in CONTROLLERS or name in ON_PLANTS:
                 names.append(name)
                 del rest[:count]
                 break
         else:
-            known = "; ".join(CONTROLLERS)
+            known = "; ".join((*CONTROLLERS, *ON_PLANTS))
             raise FlexarmError("is unknown", field="--controllers", value=rest[0], limit=known)
     return names
 
 
-def jobs_of(wanted, names):
-    """All jobs, the longest first: (case, controller's name or combination)."""
+def jobs_of(wanted, names, on_plants=(), variants=()):
+    """All jobs, the longest first: (case, controller's name, combination or `OnPlants`)."""
+    of_set = [
+        (s, OnPlants(name, plants.names_for(cases.arm_of(s.arm), judged)))
+        for s in reversed(wanted)
+        for judged in [tuple(v for v in variants if v in s.plants)]
+        for name in on_plants
+        if judged
+    ]
     tuned = [
         (s, name)
         for s in reversed(wanted)
@@ -151,7 +206,7 @@ def jobs_of(wanted, names):
         if name != PREVIEW or combinations.shipped(s)[-1] != "preview"
     ]
     parts = [(s, c) for s in reversed(wanted) for c in combinations.of(s)]
-    return tuned + parts
+    return of_set + tuned + parts
 
 
 def evaluate(case, name, seed):
@@ -186,52 +241,66 @@ def evaluate(case, name, seed):
     }
 
 
+def on_plants(case, what, seed=0):
+    """Rows of a controller on uncertain plants, as `runs.rows`; it is tuned once for all of them."""
+    shipped = partial(Setup, case.values() | {"rate": case.rate})
+    make = uncertain.CONTROLLERS.get(what.controller, lambda task: shipped())
+    found = runs.rows(cases.task_of(case), case.arm, what.controller, make, what.variants, seed)
+    return [
+        {k: v for k, v in row.items() if k not in ("sample", "arm", "seconds")} for row in found
+    ]
+
+
+def label(job):
+    """Of a job, in a file of results and for people."""
+    case, what = job
+    if isinstance(what, OnPlants):
+        return f"{case.arm}: {what.controller} on {len(what.variants)} plants"
+    return f"{case.arm}: {what if isinstance(what, str) else ' + '.join(what)}"
+
+
 def _do(job, seed):
     case, what = job
-    if isinstance(what, str):
-        return evaluate(case, what, seed)
-    return {"row": run(case, combinations.setup(case, what))}
+    if isinstance(what, OnPlants):
+        found = on_plants(case, what, seed)
+    elif isinstance(what, str):
+        found = evaluate(case, what, seed)
+    else:
+        found = {"row": run(case, combinations.setup(case, what))}
+    return [{"sample": label(job), "found": found}]
 
 
 def study(options, progress, each=lambda found: None):
     """Tune and run all controllers; `each` is called with the results so far after every job.
 
     Returns what docs/comparison.json holds: ``seed``, and a list of cases, each with ``arm``, ``motion``, ``rate_Hz``,
-    ``window_s``, ``budget``, the controllers by name, and the list ``combinations``.
+    ``window_s``, ``budget``, the controllers by name, the list ``combinations``, and the rows ``plants``.
     """
-    wanted, names = chosen(options)
-    jobs = jobs_of(wanted, names)
-    results = {}
-    workers = min(options.workers or os.cpu_count() or 1, len(jobs))
+    wanted, names, on, variants = wanted_of(options)
+    jobs = jobs_of(wanted, names, on, variants)
+    kinds = [asdict(case) | {"variants": list(variants)} for case in wanted]
+    keep = Store(options.out, Specification(options.seed, kinds))
 
     def gathered():
-        return {"seed": options.seed, "subjects": [_of_arm(s, jobs, results) for s in wanted]}
+        return {"seed": options.seed, "subjects": [_of_arm(s, jobs, keep.results) for s in wanted]}
 
-    for i, found in _results(jobs, options.seed, workers):
-        results[i] = found
-        case, what = jobs[i]
-        label = what if isinstance(what, str) else " + ".join(what)
-        progress.step(f"{case.arm}: {label}", len(results), len(jobs))
+    calls = [(job, options.seed) for job in jobs if label(job) not in keep.results]
+    done = len(jobs) - len(calls)
+    for i, _ in gather(keep, _do, calls, options.workers, options.scheduler):
+        done += 1
+        progress.step(label(calls[i][0]), done, len(jobs))
         each(gathered())
     progress.done()
     return gathered()
 
 
-def _results(jobs, seed, workers):
-    """(number, result) of every job as they come."""
-    if workers == 1:
-        for i, job in enumerate(jobs):
-            yield i, _do(job, seed)
-        return
-    with processes(workers) as executor:
-        waiting = {executor.submit(_do, job, seed): i for i, job in enumerate(jobs)}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-
-
 def _of_arm(case, jobs, results):
     """Rows of the finished jobs of a case, in the jobs' order."""
-    mine = [(w, results[i]) for i, (s, w) in enumerate(jobs) if s == case and i in results]
+    mine = [
+        (what, results[label((s, what))]["found"])
+        for s, what in jobs
+        if s == case and label((s, what)) in results
+    ]
     return {
         "arm": case.arm,
         "motion": case.motion,
@@ -242,8 +311,9 @@ def _of_arm(case, jobs, results):
         "combinations": [
             dict(zip(combinations.PARTS, what, strict=True)) | found
             for what, found in mine
-            if not isinstance(what, str)
+            if isinstance(what, tuple)
         ],
+        "plants": [row for what, found in mine if isinstance(what, OnPlants) for row in found],
     }
 
 

@@ -2,6 +2,7 @@
 """Tables of a comparison, for the terminal and for docs/comparison.md."""
 
 from .. import markdown
+from ..uncertain import report as uncertain
 from .controllers import OWN, PID, SHIPPED
 
 BEGIN, END = "<!-- comparison: begin -->", "<!-- comparison: end -->"
@@ -49,6 +50,14 @@ def _case(case):
         f"## {case['arm']}\n\n`{case['motion']}`, {case['rate_Hz']:g} Hz,"
         f" {case['budget']} simulations per tuning; residual: 0 to {window:g} s after the motion."
     )
+    if case.get("plants"):
+        rows = case["plants"]
+        others = len({row["variant"] for row in rows} - {uncertain.NOMINAL})
+        yield f"### {case['arm']}, uncertain plants\n\nMedian and worst of {others} plants; {uncertain.legend(rows)}."
+        yield "\n".join(uncertain.table(rows))
+        yield uncertain.bullets(uncertain.verdicts(rows))
+    if case["contenders"] or case["combinations"]:
+        yield f"### {case['arm']}, on the controllers' model"
     if case["contenders"]:
         yield _table(
             ("controller", *HEAD, "with noise: residual [mm]", "settled [s]", "cost"),

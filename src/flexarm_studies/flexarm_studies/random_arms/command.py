@@ -3,12 +3,12 @@
 
 from pathlib import Path
 
-from flexarm_dynamics.errors import FlexarmError
-
+from .. import workers
+from ..commands.options import chosen
 from ..progress import Progress
+from ..uncertain.controllers import CONTROLLERS
+from ..uncertain.plants import VARIANTS
 from . import generator, report, study
-from .controllers import CONTROLLERS
-from .trial import VARIANTS
 
 
 def add_arguments(parser):
@@ -25,7 +25,7 @@ def add_arguments(parser):
     add = parser.add_argument
     add("--count", type=int, default=100, help="arms (100)")
     add("--seed", type=int, default=0, help="of the arms and of the noise (0)")
-    add("--workers", type=int, metavar="N", help="processes (one per core)")
+    workers.add_arguments(add)
     names = ",".join(CONTROLLERS)
     add("--controllers", default=names, help=f"controllers, separated by commas ({names})")
     names = ",".join(VARIANTS)
@@ -49,13 +49,20 @@ def arms(options):
     if options.files:
         _write_files(options)
         return
-    controllers = _chosen("--controllers", options.controllers, CONTROLLERS)
-    variants = _chosen("--variants", options.variants, VARIANTS)
+    controllers = chosen("--controllers", options.controllers, CONTROLLERS)
+    variants = chosen("--variants", options.variants, VARIANTS)
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)
     progress = Progress()
     rows = study.run(
-        options.seed, options.count, controllers, variants, options.out, options.workers, progress
+        options.seed,
+        options.count,
+        controllers,
+        variants,
+        options.out,
+        options.workers,
+        progress,
+        options.scheduler,
     )
     progress.done()
     if options.write:
@@ -70,11 +77,3 @@ def _write_files(options):
         path = folder / f"{arm.name}.yaml"
         path.write_text(f"# --trajectory {arm.motion}\n{arm.text}", encoding="utf-8")
         print(path)
-
-
-def _chosen(option, text, known):
-    names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            raise FlexarmError("is unknown", field=option, value=name, limit=", ".join(known))
-    return names

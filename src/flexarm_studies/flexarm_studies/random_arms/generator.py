@@ -13,6 +13,7 @@ torque limits are 1.5 to 2 times what the rigid arm needs for it, weight and fri
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -86,7 +87,12 @@ class RandomArm:
 
     def read(self):
         """The `Arm`, read as from a file."""
-        return arm_file.parse(self.text, self.name)
+        return _read(self.text, self.name)
+
+
+@lru_cache(maxsize=4)
+def _read(text, name):
+    return arm_file.parse(text, name)
 
 
 def arms(count, seed=0, start=0):

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from .. import markdown
-from .controllers import BASELINES
+from ..uncertain.controllers import BASELINES
 
 BEGIN, END = "<!-- random arms: begin -->", "<!-- random arms: end -->"
 COLUMNS = (

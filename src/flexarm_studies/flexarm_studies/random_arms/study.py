@@ -6,19 +6,13 @@ number of workers. The file's first line holds the seed. Results of changed code
 line is older than the code.
 """
 
-import os
-import time
-from concurrent.futures import as_completed
 from dataclasses import dataclass
-from pathlib import Path
 
-from flexarm_dynamics.errors import FlexarmError
-
-from ..analysis.monte_carlo import Store
 from ..commands.options import at_least
-from ..workers import processes
-from . import generator, trial
-from .controllers import CONTROLLERS
+from ..store import Store, gather
+from ..uncertain.controllers import CONTROLLERS
+from ..uncertain.runs import key, rows
+from . import generator
 
 
 @dataclass(frozen=True)
@@ -28,49 +22,20 @@ class Specification:
     random_arms_seed: int = 0
 
 
-def key(number, controller, variant):
-    """Of a run, in the file."""
-    return f"{number}/{controller}/{variant}"
-
-
 def job(seed, number, controller, variants):
-    """Set a controller up for one arm and run these variants; also called in other processes.
+    """Rows of one arm and controller in these variants; also called in other processes.
 
     Returns
     -------
     list of dict
-        Rows, each with ``sample`` (its `key`), ``number``, ``arm``, ``controller``, ``variant``, ``seconds`` of
-        computing, and what `trial.run` returns.
+        Those of `uncertain.runs.rows`, with the arm's ``number``.
     """
     case = generator.arm(number, seed)
-    begin, refused, setup = time.monotonic(), None, None
-    try:
-        setup = CONTROLLERS[controller](case)
-    except FlexarmError as error:
-        refused = str(error)
-    rows = []
-    for variant in variants:
-        if refused is None:
-            found = trial.run(case, setup, trial.VARIANTS[variant], seed=number)
-        else:
-            found = {"refused": refused}
-        now = time.monotonic()
-        rows.append(
-            {
-                "sample": key(number, controller, variant),
-                "number": number,
-                "arm": case.name,
-                "controller": controller,
-                "variant": variant,
-                "seconds": round(now - begin, 3),
-                **found,
-            }
-        )
-        begin = now
-    return rows
+    found = rows(case, number, controller, CONTROLLERS[controller], variants, seed=number)
+    return [row | {"number": number} for row in found]
 
 
-def run(seed, count, controllers, variants, path=None, workers=None, progress=None):
+def run(seed, count, controllers, variants, path=None, workers=None, progress=None, scheduler=None):
     """Run arms 0 to count - 1 under all `controllers` in all `variants`.
 
     Parameters
@@ -79,8 +44,8 @@ def run(seed, count, controllers, variants, path=None, workers=None, progress=No
     controllers, variants : sequence of str
     path : str or Path, optional
         File of rows, JSON lines; runs that are in it are not run again.
-    workers : int, optional
-        Number of processes; one per core if not given. 1: everything in this process.
+    workers, scheduler
+        As for `workers.results`.
     progress : Progress, optional
 
     Returns
@@ -88,36 +53,15 @@ def run(seed, count, controllers, variants, path=None, workers=None, progress=No
     list of dict
         Rows by arm, controller and variant.
     """
-    for name, value, least in (("seed", seed, 0), ("count", count, 1), ("workers", workers, 1)):
+    for name, value, least in (("seed", seed, 0), ("count", count, 1)):
         at_least(f"--{name}", value, least)
-    keep = None if path is None else Store(Path(path), Specification(seed))
-    found = {} if keep is None else dict(keep.results)
-    jobs = []
+    keep, jobs = Store(path, Specification(seed)), []
     for number in range(count):
         for controller in controllers:
-            left = [v for v in variants if key(number, controller, v) not in found]
+            left = [v for v in variants if key(number, controller, v) not in keep.results]
             if left:
                 jobs.append((seed, number, controller, left))
-    try:
-        for i, rows in enumerate(_results(jobs, workers), 1):
-            for row in rows:
-                found[row["sample"]] = row
-                if keep is not None:
-                    keep.append(row)
-            if progress is not None:
-                progress.step(f"{rows[0]['arm']}: {rows[0]['controller']}", i, len(jobs))
-    finally:
-        if keep is not None:
-            keep.close()
-    return [found[key(n, c, v)] for n in range(count) for c in controllers for v in variants]
-
-
-def _results(jobs, workers):
-    """Rows of each job as they come."""
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
-    if workers <= 1:
-        yield from (job(*each) for each in jobs)
-        return
-    with processes(workers) as executor:
-        for future in as_completed([executor.submit(job, *each) for each in jobs]):
-            yield future.result()
+    for done, (i, _) in enumerate(gather(keep, job, jobs, workers, scheduler), 1):
+        if progress is not None:
+            progress.step(f"arm {jobs[i][1]}: {jobs[i][2]}", done, len(jobs))
+    return [keep.results[key(n, c, v)] for n in range(count) for c in controllers for v in variants]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Baselines for a random arm, tuned on the same information that a design has: arm file, uncertain set, rate, delay.
+r"""Baselines for an arm and its motion, tuned on what a design has: arm file, uncertain set, rate, delay.
 
 The uncertain set is the arm at start, middle and end of its motion with `PAYLOADS` times its payload and one mode more,
 linearised, sampled at `RATE`, its torque at once and one sample late; of it the part that torque reaches.
@@ -9,6 +9,13 @@ linearised, sampled at `RATE`, its torque at once and one sample late; of it the
   shaped (ZVD or EI) for the modes that ring under it at the motion's end. Gains must be stable on the whole set, and
   have the shortest settling time of the linear arm on the shaped motion, worst of all payloads: by its poles alone a
   PID would be so soft that it leaves the modes' own damping as it is.
+- Joint PID with strain feedback: the same PID without a shaper, and of each joint that bends a link with a gauge, the
+  moment :math:`\mu` that this link's innermost gauge shows, and its rate, about the moment :math:`\mu_r` of the
+  reference's motion. Both gains are tuned with the PID's, by the same measure (Luo, Direct strain feedback control of
+  flexible robot arms, IEEE Trans. Automatic Control 38, 1993; there the rate alone):
+
+.. math:: u = u_{PID} + \kappa\,(\mu - \mu_r) + \lambda\,\dot\mu / \omega_1 .
+
 - Full-state LQR: `comparison.baselines.FullStateLqr`, with the Kalman filter that gives it the state, tuned together by
   the poles :math:`p` of all these loops at once. With the first locked frequency :math:`\omega_1` it minimises
 
@@ -39,6 +46,7 @@ from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 from ..comparison.baselines import Baseline, FullStateLqr, JointPid
 from ..comparison.controllers import DAMPED, IDLE, MAX_INTEGRAL, SHAPED, UNWATCHED, Setup
 from ..comparison.tuning import Free, tune
+from .plants import most_modes
 from .trial import TOLERANCE
 
 #: Factors of the payload in the uncertain set [-].
@@ -93,7 +101,7 @@ def linear(arm_model, q, rate=RATE):
 
 
 class Task:
-    """A random arm with what its baselines are tuned for.
+    """An arm with what its baselines are tuned for.
 
     Attributes
     ----------
@@ -127,9 +135,7 @@ class Task:
     def models(self):
         """The arm with each payload and one mode more in every direction."""
         arm = self.model.arm
-        more = arm.with_modes(
-            1 + max(f.modes for link in arm.links for f in link.flexible.values())
-        )
+        more = arm.with_modes(1 + most_modes(arm))
         return [model.build(scaled(more, payload)) for payload in PAYLOADS]
 
     @cached_property
@@ -250,42 +256,63 @@ def pid_gains(task, values):
 
 
 def pid(task, kind):
-    """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind`, and its settling time [periods].
+    """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind` or None, and its settling time [periods].
 
     Refused where no gains are stable on the whole uncertain set.
     """
+    return tuned_pid(task, _pid_free(task), pid_gains, kind)
+
+
+def tuned_pid(task, free, gains_of, kind=None):
+    """As `pid`, of the `free` numbers, from which `gains_of` makes the gains of a `task`."""
 
     def unstable(values):
-        gains = pid_gains(task, values)
-        K = pid_feedback(gains, task.plants[0].X.shape[0])
-        worst = max(poles(plant, K, gains["i"]).real.max() for plant in task.plants) / task.omega
-        return max(worst, -MARGIN)
+        gains = gains_of(task, values)
+        found = []
+        for plant in task.plants:
+            K = pid_feedback(task, gains, plant)
+            found.append(poles(plant, K, gains["i"]).real.max())
+        return max(max(found) / task.omega, -MARGIN)
 
     def cost(values):
         worst = unstable(values)
         if worst > -MARGIN:
             return NEVER * (2.0 + worst)
-        gains = pid_gains(task, values)
+        gains = gains_of(task, values)
         return settling(task, gains, train_of(task, gains, kind))
 
-    values, periods, _ = tune(cost, _pid_free(task), PID_BUDGET, screen=unstable)
+    values, periods, _ = tune(cost, free, PID_BUDGET, screen=unstable)
     if periods >= 1.5 * NEVER:
         problem = "no gains of the joints' PID are stable on the whole uncertain set"
         raise DesignError(problem, field=task.case.name)
-    return pid_gains(task, values), periods
+    return gains_of(task, values), periods
 
 
-def pid_feedback(gains, size):
-    """Feedback of a PID, without the integral, of a state (q, delta, qd, delta_d) of `size` numbers."""
-    n = gains["p"].size
+def pid_feedback(task, gains, plant):
+    """Feedback of a PID, without the integral, of the state (q, delta, qd, delta_d) of a `plant` of the `task`.
+
+    The moment of strain feedback is what the observer makes of the gauges: `Task.seen`, of a plant with more modes.
+    """
+    size, n = len(plant.X), gains["p"].size
     K = np.zeros((n, size))
     K[:, :n], K[:, size // 2 : size // 2 + n] = np.diag(gains["p"]), np.diag(gains["d"])
+    if "moment" in gains:
+        rows = moment_rows(task.model)
+        if size != 2 * (n + task.model.n_modes):
+            rows = rows @ task.seen[n:, n:]
+        K[:, n : size // 2] -= gains["moment"] * rows
+        K[:, size // 2 + n :] -= gains["moment_rate"] * rows
     return K
 
 
 def train_of(task, gains, kind):
-    """The `Shaper` of the modes that ring under PID `gains` at the motion's end; None where none rings."""
-    K = pid_feedback(gains, task.nominal[-1].X.shape[0])
+    """The `Shaper` of a `kind` for modes that ring under PID `gains` at the end of a `task`; None where none rings.
+
+    None also without a `kind`.
+    """
+    if kind is None:
+        return None
+    K = pid_feedback(task, gains, task.nominal[-1])
     omega, zeta = frequencies_and_damping(poles(task.nominal[-1], K, gains["i"]))
     rings = (zeta < DAMPED) & (omega < 0.5 * np.pi * RATE)
     if not rings.any():
@@ -316,7 +343,7 @@ def settling(task, gains, train):
     for plant, tip, load in task.loaded:
         Gamma, X = plant.Gamma, plant.X
         N, n = Gamma.shape
-        loop = pid_loop(plant, pid_feedback(gains, len(X)), gains["i"])
+        loop = pid_loop(plant, pid_feedback(task, gains, plant), gains["i"])
         # What comes in: the reference, late as the feedback; its integral; the load that the weight does not carry.
         inputs = np.zeros((len(times), N + 2 * n))
         inputs[:, :N] = -Gamma @ load
@@ -350,14 +377,84 @@ def _response(loop, inputs, start, outputs):
 
 
 def shaped_pid(case, kind):
-    """`Setup` of the joints' PID with a shaper of a `kind`."""
+    """`Setup` of the joints' PID with a shaper of a `kind`, or None."""
     task = task_of(case)
     gains, _ = pid(task, kind)
     train = train_of(task, gains, kind)
     profile = task.profile if train is None else train.apply(task.profile)
     motion = specs.sampled(profile, task.model)
-    given = IDLE | WATCH | {"observer.type": "filtered_derivative", "rate": RATE}
-    return Setup(given, lambda arm: Pid(arm, gains), lambda arm: motion)
+    return Setup(_given(), lambda arm: Pid(arm, gains), lambda arm: motion)
+
+
+def _given():
+    return IDLE | WATCH | {"observer.type": "filtered_derivative", "rate": RATE}
+
+
+# PID with strain feedback ------------------------------------------------------------------------
+
+
+#: Which component of a joint's axis a gauge's direction bends about, and the sign of the moment.
+ABOUT = {"y": (2, 1.0), "z": (1, -1.0), "twist": (0, 1.0)}
+
+
+def moment_rows(arm_model):
+    """Rows (n, m) of a model, `arm_model`: moment on each joint that its link's innermost gauge shows [N m].
+
+    With a section's stiffness EI the moment is EI y'', a gauge's strain -c y''; twist is GJ theta'. Zeros where the
+    joint's own link has no gauge that shows it. The joint turns with its link, so that their axes agree.
+    """
+    arm, rows = arm_model.arm, np.zeros((arm_model.n_joints, arm_model.n_modes))
+    for row, joint, link in zip(rows, arm.joints, arm.links, strict=True):
+        seen = [g for g in arm.gauges if g.link == link.name]
+        seen = [g for g in seen if abs(joint.axis[ABOUT[g.direction][0]]) > 0.5]
+        if seen:
+            gauge = min(seen, key=lambda g: g.position)
+            part, sign = ABOUT[gauge.direction]
+            sign = sign * joint.axis[part] * (1.0 if gauge.direction == "twist" else -1.0)
+            strain = gauge_rows(arm_model, [gauge])[0]
+            row[:] = sign * link.stiffness[gauge.direction] / gauge.surface_distance * strain
+    return rows
+
+
+class StrainPid(Pid):
+    """`Pid` with feedback of the bending moment: gains ``moment`` [-] and ``moment_rate`` [s]; see the module."""
+
+    def __init__(self, arm_model, gains):
+        super().__init__(arm_model, gains)
+        self._rows = moment_rows(arm_model)
+
+    def _torque(self, s, reference, dt):
+        n, m, k = self.model.n_joints, self.model.n_modes, self.gains
+        u = super()._torque(s, reference, dt)
+        still = reference_deflection(self.model, reference)
+        u += k["moment"] * (self._rows @ (s[n : n + m] - still))
+        return u + k["moment_rate"] * (self._rows @ s[2 * n + m :])
+
+
+def reference_deflection(arm_model, reference):
+    """Deflections (m,) under weight and inertia forces of the `reference`, without vibration: (9)."""
+    terms = arm_model.terms(reference.position, reference.velocity)
+    forces = terms.M[arm_model.n_joints :, : arm_model.n_joints] @ reference.acceleration
+    return np.linalg.solve(terms.K2, -forces - terms.f2)
+
+
+def _strain_free(task):
+    return [*_pid_free(task), Free("kappa", -0.8, 4.0, 0.0), Free("lambda", -2.0, 2.0, 0.0)]
+
+
+def strain_gains(task, values):
+    """Gains of `StrainPid` from tuned values: those of `pid_gains`, then kappa and lambda."""
+    *own, moment, rate = values
+    return pid_gains(task, own) | {"moment": moment, "moment_rate": rate / task.omega}
+
+
+def strain_pid(case):
+    """`Setup` of the joints' PID with strain feedback."""
+    task = task_of(case)
+    if not moment_rows(task.model).any():
+        raise DesignError("has no gauge that shows the moment on a joint", field=case.name)
+    gains, _ = tuned_pid(task, _strain_free(task), strain_gains)
+    return Setup(_given(), lambda arm: StrainPid(arm, gains))
 
 
 # LQR with a Kalman filter ------------------------------------------------------------------------
@@ -491,7 +588,7 @@ _LAST = {}
 
 
 def task_of(case):
-    """The `Task` of a random arm; the last one is kept, with its tuned gains."""
+    """The `Task` of an arm; the last one is kept, with its tuned gains."""
     if case.name not in _LAST:
         _LAST.clear()
         _LAST[case.name] = Task(case)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""One run of a random arm on a plant that is not the controller's model, and the numbers by which it is judged.
+r"""One run of an arm on a plant that is not the controller's model, and the numbers by which it is judged.
 
-The plant is the accurate level: links that keep their length, finite slope, one mode more in every direction of every
-link. A `Variant` scales its payload, stiffness and damping, or adds noise, counts and delay.
+The plants are those of `plants.VARIANTS`.
 
 Where the tip should end up: where the plant's tip rests, bent by the plant's own weight, with every joint exactly at
 the end of the reference. A heavier payload sags more, which joint torques can't and need not change: that is no
@@ -15,19 +14,18 @@ loop of a drive does. Those would cost a hundred substeps per sample, and the ta
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property
 
 import numpy as np
 
-from flexarm_control.trajectory import specs
-from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_sim.integrators import substeps
 
 from ..loop import scenario as scenarios
 from ..loop.metrics import joint_error, residual_vibration, tip_path
+from .plants import plant_of
 
 #: Distance of the tip from its place of rest, as a fraction of the reach, within which it is settled [-].
 TOLERANCE = 1e-3
@@ -37,10 +35,8 @@ WINDOW, REST = 6.0, 1.0
 MIN_WINDOW = 2.0
 #: Joints are at rest within this of the reference [deg].
 JOINT_REST = 0.02
-#: Samples per second, where the controller's parameter ``rate`` states no other; with noise, delay and counts [Hz].
-RATE, SLOW_RATE = 1000.0, 500.0
-#: Torque acts this long after the measurement in the noisy variant [s].
-DELAY = 0.002
+#: Samples per second, where neither the controller's parameter ``rate`` nor the variant states another [Hz].
+RATE = 1000.0
 #: The arm counts as lost at this joint error [rad]. Shaped baselines are late by their shaper: it is generous.
 MAX_ERROR = 2.0
 #: Substeps per sample up to which the explicit method is taken, and step of the implicit one [s].
@@ -48,45 +44,35 @@ EXPLICIT, STEP = 4, 2.5e-4
 
 
 @dataclass(frozen=True)
-class Variant:
-    """How the plant differs from the model, beyond the accurate level.
+class ArmTask:
+    """An arm and its motion, as far as a run needs them; a `RandomArm` has the same.
 
     Attributes
     ----------
-    payload, stiffness, damping : float
-        Factors [-].
-    noisy : bool
-        Noise and counts of the arm file's sensors, no measured velocity, `SLOW_RATE` and `DELAY`.
+    name : str
+    arm : Arm
+        As the controller knows it.
+    motion : str
+        As `Scenario.trajectory`.
     """
 
-    payload: float = 1.0
-    stiffness: float = 1.0
-    damping: float = 1.0
-    noisy: bool = False
+    name: str
+    arm: Arm
+    motion: str
 
+    def read(self):
+        """The arm."""
+        return self.arm
 
-VARIANTS = {
-    "exact": Variant(),
-    "payload x0.7": Variant(payload=0.7),
-    "payload x1.3": Variant(payload=1.3),
-    "stiffness x0.9": Variant(stiffness=0.9),
-    "stiffness x1.1": Variant(stiffness=1.1),
-    "damping x0.3": Variant(damping=0.3),
-    "damping x3": Variant(damping=3.0),
-    "noisy": Variant(noisy=True),
-}
-
-
-def plant_of(arm, variant):
-    """The simulated arm of a variant: accurate level, one mode more, sensors ideal unless the variant is noisy."""
-    modes = 1 + max(f.modes for link in arm.links for f in link.flexible.values())
-    plant = scaled(arm, variant.payload, variant.stiffness, variant.damping).with_modes(modes)
-    plant = replace(plant, foreshortening=True, finite_slope=True)
-    if variant.noisy:
-        return plant
-    joints = tuple(replace(joint, encoder_counts=0) for joint in plant.joints)
-    gauges = tuple(replace(gauge, bits=0) for gauge in plant.gauges)
-    return replace(plant, joints=joints, gauges=gauges)
+    @cached_property
+    def period(self):
+        """Of the lowest mode with joints locked, the longer one of both ends of the motion [s]; 0.0: it is rigid."""
+        known = model.build(self.arm)
+        if not known.n_modes:
+            return 0.0
+        motion = scenarios.trajectory_of(self.motion, known, np.zeros(known.n_joints))
+        ends = np.array(motion.positions)[[0, -1]]
+        return 2.0 * np.pi / min(known.frequencies(q, locked=True)[0] for q in ends)
 
 
 def window_of(case):
@@ -95,11 +81,11 @@ def window_of(case):
 
 
 def run(case, setup, variant, seed=0):
-    """Run a controller on a random arm.
+    """Run a controller on an arm.
 
     Parameters
     ----------
-    case : RandomArm
+    case : RandomArm or ArmTask
     setup : Setup
     variant : Variant
     seed : int
@@ -114,7 +100,7 @@ def run(case, setup, variant, seed=0):
         loop = loop_of(case, setup, variant, seed)
         if setup.law is not None:
             loop.controller.law = setup.law(loop.model)
-        wanted = specs.from_spec(case.motion, loop.model)
+        wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
         motion = wanted if setup.motion is None else setup.motion(loop.model)
         loop.simulator.reset(wanted.positions[0])
         end = 1e-9 * int(wanted.times_ns[-1])
@@ -128,11 +114,11 @@ def run(case, setup, variant, seed=0):
 
 def loop_of(case, setup, variant, seed=0):
     """The `ClosedLoop` of a run, before its first sample."""
-    known = _read(case)
+    known = case.read()
     given = dict(setup.controller)
-    if variant.noisy:
+    if variant.sensors:
         given["publish_joint_velocity"] = False
-    rate = SLOW_RATE if variant.noisy else given.get("rate", RATE)
+    rate = variant.rate or given.get("rate", RATE)
     plant = plant_of(known, variant)
     explicit = substeps(model.build(plant), 1.0 / rate) <= EXPLICIT
     given["integrator"] = "dop853" if explicit else "implicit"
@@ -140,25 +126,16 @@ def loop_of(case, setup, variant, seed=0):
         known,
         given,
         plant_arm=plant,
-        noise=variant.noisy,
+        noise=variant.sensors,
         seed=seed,
         rate=rate,
-        delay=DELAY if variant.noisy else 0.0,
+        delay=variant.delay,
     )
     loop = scenarios.loop_of(scenario)
     loop.MAX_ERROR = MAX_ERROR
     if not explicit:
         loop.simulator.plant.substeps = round(1.0 / rate / STEP)
     return loop
-
-
-@lru_cache(maxsize=4)
-def _read_text(text):
-    return arm_file.parse(text)
-
-
-def _read(case):
-    return _read_text(case.text)
 
 
 def _as_wanted(record, wanted, loop):
@@ -220,7 +197,7 @@ def judged(case, plant, record, end):
         settling = float(time[outside[-1] + 1]) if outside.size else 0.0
         found |= {
             "settling_s": settling,
-            "settling_periods": settling / case.period,
+            "settling_periods": settling / case.period if case.period else None,
             "settled": True,
         }
     rest = float(error[after[moving]][last].max())

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controllers that are tried on the uncertain set, by name; each makes its `Setup` from a `RandomArm` or `ArmTask`.
+
+``shipped`` is the controller file that flexarm has for a shipped arm. ``default`` and ``preview`` are what
+docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm. ``designed`` and
+``designed_preview`` are what ``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay, at start, middle
+and end of the motion, as the baselines are tuned. The baselines are tuned for each arm.
+"""
+
+from functools import partial
+
+from flexarm_control.robust.default import default
+from flexarm_control.robust.design import Settings
+from flexarm_control.robust.uncertain import Uncertainty
+
+from ..comparison.controllers import Setup
+from ..loop import scenario as scenarios
+from .baselines import RATE, full_state_lqr, shaped_pid, strain_pid, task_of
+from .plants import DELAY
+
+
+def _tutorial(feedforward, case):
+    settings = ("slow.type=model_following", f"feedforward={feedforward}")
+    return Setup(scenarios.parameters("composite", settings))
+
+
+def _designed(feedforward, case):
+    """From the cache of designs where it is there."""
+    start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
+    settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
+    found = default(case.read(), settings, Uncertainty())
+    return Setup(found.parameters | {"feedforward": feedforward, "rate": RATE})
+
+
+CONTROLLERS = {
+    "default": partial(_tutorial, "model"),
+    "preview": partial(_tutorial, "preview"),
+    "designed": partial(_designed, "model"),
+    "designed_preview": partial(_designed, "preview"),
+    "pid": partial(shaped_pid, kind=None),
+    "pid_zv": partial(shaped_pid, kind="zv"),
+    "pid_zvd": partial(shaped_pid, kind="zvd"),
+    "pid_ei": partial(shaped_pid, kind="ei"),
+    "pid_strain": strain_pid,
+    "lqr": full_state_lqr,
+}
+#: With what the others are compared.
+BASELINES = ("pid", "pid_zv", "pid_zvd", "pid_ei", "pid_strain", "lqr")
+#: What the names mean, for tables.
+WORDS = {
+    "shipped": "the controller file that is shipped for the arm",
+    "default": "the nodes' composite control with `model_following`",
+    "preview": "the same with `feedforward: preview`",
+    "designed": "`flexarm design`",
+    "designed_preview": "the same with `feedforward: preview`",
+    "pid": "joint PID",
+    "pid_zv": "joint PID, ZV shaper",
+    "pid_zvd": "joint PID, ZVD shaper",
+    "pid_ei": "joint PID, EI shaper",
+    "pid_strain": "joint PID with strain feedback",
+    "lqr": "full-state LQR with a Kalman filter (LQG)",
+}

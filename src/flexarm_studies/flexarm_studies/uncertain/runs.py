@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of a controller on uncertain plants: set up once for an arm, and a row for each plant."""
+
+import time
+
+from flexarm_dynamics.errors import FlexarmError
+
+from . import trial
+from .plants import VARIANTS
+
+
+def key(arm, controller, variant):
+    """Of a run, in a file of rows."""
+    return f"{arm}/{controller}/{variant}"
+
+
+def rows(case, label, controller, make, variants, seed=0):
+    """Set a controller up for an arm and run these variants.
+
+    Parameters
+    ----------
+    case : RandomArm or ArmTask
+    label : str or int
+        Of the arm in keys.
+    controller : str
+    make : callable
+        From the case: its `Setup`. A FlexarmError that it raises refuses all variants.
+    variants : sequence of str
+    seed : int
+        Of the noise.
+
+    Returns
+    -------
+    list of dict
+        Rows, each with ``sample`` (its `key`), ``arm``, ``controller``, ``variant``, ``seconds`` of computing, and
+        what `trial.run` returns.
+    """
+    begin, refused, setup = time.monotonic(), None, None
+    try:
+        setup = make(case)
+    except FlexarmError as error:
+        refused = str(error)
+    found = []
+    for variant in variants:
+        if refused is None:
+            result = trial.run(case, setup, VARIANTS[variant], seed=seed)
+        else:
+            result = {"refused": refused}
+        now = time.monotonic()
+        found.append(
+            {
+                "sample": key(label, controller, variant),
+                "arm": case.name,
+                "controller": controller,
+                "variant": variant,
+                "seconds": round(now - begin, 3),
+                **result,
+            }
+        )
+        begin = now
+    return found
