@@ -465,6 +465,12 @@ LAWS = [
             "s[n : n + m]",
         ),
         (
+            "baselines",
+            "LQG: as much noise in the torque as there may be",
+            "value + max(np.log10(noisy / NOISIEST), 0.0)",
+            "value",
+        ),
+        (
             "plants",
             "friction: none is added",
             "viscous=own.viscous + fraction * limit, coulomb=own.coulomb + fraction * limit",

@@ -140,6 +140,36 @@ def test_an_arm_whose_gauges_show_no_moment_is_refused_strain_feedback(arm):
         baselines.strain_pid(ArmTask("bare", bare, "paper:duration=2"))
 
 
+# --------------------------------------------------------------------------- LQG
+
+
+def test_the_noise_in_the_torque_of_an_lqg_is_that_of_its_samples():
+    task = baselines.Task(cases.task_of(R))
+    values = [f.first for f in baselines._lqr_free(task)]
+    K, given = baselines.lqr_gain(task, values), baselines.kalman_parameters(task, values)
+    share = baselines.lqg_noise(task, K, given)
+    # The same loop, sample by sample.
+    own, L = task.nominal[2], baselines.kalman_gain(task, 2, given)
+    loop = baselines._lqg_loop(task, task.plants[5], own, L, K, 0)
+    N, M = len(task.plants[5].Phi), len(own.Phi)
+    rng, s, torque = np.random.default_rng(0), np.zeros(len(loop)), []
+    root = np.linalg.cholesky(baselines.reading_covariance(task))
+    for _ in range(40000):
+        s = loop @ s
+        s[N : N + M] += L @ root @ rng.normal(size=len(root))
+        torque.append(s[-1])
+    assert_allclose(share, np.std(torque) / task.model.arm.torque_limits[0], rtol=0.05)
+
+
+def test_a_tuned_lqg_is_stable_on_its_set_and_no_noisier_than_a_design():
+    task = baselines.Task(cases.task_of(R))
+    K, given, slowest = baselines.lqr(task)
+    assert slowest < 0.0
+    assert baselines.lqg_noise(task, K, given) < 1.5 * baselines.NOISIEST
+    setup = baselines.full_state_lqr(cases.task_of(R))
+    assert setup.controller["publish_joint_velocity"] is False
+
+
 # --------------------------------------------------------------------------- runs and who wins
 
 

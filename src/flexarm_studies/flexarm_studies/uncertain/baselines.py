@@ -22,19 +22,23 @@ linearised, sampled at `RATE`, its torque at once and one sample late; of it the
 .. math:: \max_{cases,\,p} d(p) + c\,\overline{\max(d(p),\,-1)}, \qquad
     d(p) = \frac{\mathrm{Re}\,p}{\omega_1}\max\Bigl(1, \frac{|p|}{b\,\omega_1}\Bigr).
 
-Poles beyond b = `BAND` count less: no gain moves the decay of the highest modes, but the others' it may. The second
-term is a tie-break (c = `TIE`): of two gains with the same slowest pole, the one that damps the others better.
+plus the logarithm of how many times too large the sensors' noise in the torque is: it may be as large as in a design
+(`NOISIEST`). Without this bound the gains are so high that an encoder's count takes a tenth of the torque, and counts
+alone make the loop oscillate. Poles beyond b = `BAND` count less: no gain moves the decay of the highest modes, but the
+others' it may. The second term is a tie-break (c = `TIE`): of two gains with the same slowest pole, the one that damps
+the others better.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag, null_space, solve_discrete_are
+from scipy.linalg import block_diag, null_space, solve_discrete_are, solve_discrete_lyapunov
 from scipy.signal import lfilter
 
 from flexarm_control.motions import shapers
 from flexarm_control.observers.kalman import measurement_covariance
+from flexarm_control.robust.design import NOISIEST
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
@@ -523,8 +527,7 @@ def kalman_gain(task, place, parameters):
     density[n + m :, n + m :] = H @ np.diag(force) @ H.T
     Q = sampled_noise(part.A, part.X.T @ density @ part.X, 1.0 / RATE)
     C = part.X[: n + m]
-    noise = {"position_noise": 0.0, "strain_noise": 0.0}
-    R = measurement_covariance(task.model, noise, task.strain_map, ())
+    R = reading_covariance(task)
     P = _riccati(part.Phi.T, C.T, Q, R)
     return np.linalg.solve(R + C @ P @ C.T, C @ P).T
 
@@ -558,13 +561,40 @@ def _lqg_loop(task, plant, own, L, K, late):
     return loop
 
 
+def reading_covariance(task):
+    """Covariance of the readings of a `task`, (n + m, n + m), from the noise that the arm file states."""
+    noise = {"position_noise": 0.0, "strain_noise": 0.0}
+    return measurement_covariance(task.model, noise, task.strain_map, ())
+
+
+def lqg_noise(task, K, parameters):
+    """Rms torque of the sensors' noise under LQR `K` and the filter of `parameters`, over the torque limit [-].
+
+    The largest of all joints, of the loop at the end of a `task`; infinite where that is unstable.
+    """
+    place = len(task.places) - 1
+    own, L = task.nominal[place], kalman_gain(task, place, parameters)
+    plant = task.plants[PAYLOADS.index(1.0) * len(task.places) + place]
+    loop = _lqg_loop(task, plant, own, L, K, 0)
+    if np.abs(np.linalg.eigvals(loop)).max() >= 1.0:
+        return np.inf
+    N, M = len(plant.Phi), len(own.Phi)
+    G = np.zeros((len(loop), L.shape[1]))
+    G[N : N + M] = L
+    P = solve_discrete_lyapunov(loop, G @ reading_covariance(task) @ G.T)
+    rms = np.sqrt(np.maximum(np.diag(P)[N + M :], 0.0))
+    return float((rms / task.model.arm.torque_limits).max())
+
+
 def lqr(task):
     """Tuned gain of the LQR, parameters of its Kalman filter, and the slowest pole; refused as in `pid`."""
 
     def judged(values):
         try:
             K, filtered = lqr_gain(task, values), kalman_parameters(task, values)
-            return K, filtered, *task.worst(lqg_poles(task, K, filtered))
+            value, slowest = task.worst(lqg_poles(task, K, filtered))
+            noisy = lqg_noise(task, K, filtered) if slowest < 0.0 else NOISIEST
+            return K, filtered, value + max(np.log10(noisy / NOISIEST), 0.0), slowest
         except DesignError:
             return None, None, 1e3, 1e3
 
@@ -581,6 +611,7 @@ def full_state_lqr(case):
     K, filtered, _ = lqr(task_of(case))
     observer = {f"observer.{name}": value for name, value in filtered.items()}
     given = IDLE | WATCH | observer | {"observer.type": "kalman", "rate": RATE}
+    given["publish_joint_velocity"] = False  # the filter that is tuned has positions alone
     return Setup(given, lambda arm: Lqr(arm, K))
 
 
