@@ -14,7 +14,7 @@ from flexarm_control.fading import Fading
 from flexarm_control.feedforward.model import regulator
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.linear import linear_plant
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
 MS = 1_000_000
@@ -35,10 +35,36 @@ def test_a_mode_that_no_torque_reaches_is_left_out_of_the_regulator():
     arm = replace(arm, links=(link,), gravity=(0.0, 0.0, 0.0), gauges=(), observed_modes=())
     both, q = build(arm), np.zeros(1)
     A, B = linear_plant(both, q, coulomb=False)
-    closed = np.linalg.eigvals(A - B @ regulator(both, q))
+    closed = np.linalg.eigvals(A - B @ regulator(both, q, 1e-3))
     decay = 0.3 * both.frequencies(locked=True)[0]
     alone = closed[closed.real > -decay]
     assert len(alone) == 2 and np.abs(np.abs(alone[0]) / both.frequencies(q) - 1.0).min() < 1e-3
+
+
+def test_the_regulator_holds_where_samples_are_too_far_apart_for_that_of_continuous_time():
+    model, q = build(arm_file.load("R")), np.zeros(1)
+    plant = linear_plant(model, q, coulomb=False)
+    gains = {}
+    for period in (1e-3, 3e-2):
+        Phi, Gamma = sampled(*plant, period)
+        gains[period] = regulator(model, q, period)
+        assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains[period])).max() < 1.0
+    Phi, Gamma = sampled(*plant, 3e-2)
+    assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains[1e-3])).max() > 1.0
+
+
+def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):
+    names = arm_r.joint_names
+    motion = design(arm_r, SLOW, FAST, CORRECTED, {"feedforward": "model"}).feedforward
+    reference = ReferenceGenerator(names, period=0.5)
+    reference.start(np.zeros(1), 0)
+    data = trajectory.validate(names, names, 0, [(400 * MS, [1.0], [0.0], [0.0], [])])
+    assert reference.offer(data).accepted
+    reference.sample(0)
+    motion.update(reference, 0.0)
+    # The manifold's own amplitude is -3 mm there: of the snap with which the motion begins.
+    assert_allclose(motion.amplitude, 0.0, atol=1e-12)
+    assert_allclose(motion.torque, 0.0, atol=1e-9)
 
 
 def test_jumps_add_up_and_fade_whatever_the_samples():

@@ -9,6 +9,7 @@ import pytest
 from flexarm_control.observers.plausibility.agreement import Agreement
 from flexarm_control.observers.plausibility.channels import Channels
 from flexarm_control.observers.plausibility.low_pass import LowPass
+from flexarm_control.observers.plausibility.standstill import Standstill
 from flexarm_control.observers.plausibility.strain_law import StrainLaw
 from flexarm_control.observers.plausibility.zero_drift import CORRECTED, SLOW
 from flexarm_dynamics.arm import arm_file
@@ -250,3 +251,37 @@ def test_a_velocity_that_its_source_has_filtered_is_not_wrong():
         late += (1.0 - np.exp(-PERIOD / 0.004)) * (true - late)
         value[c.position], value[c.velocity] = (1.0 - np.cos(3.0 * t)) / 6.0, late
         assert agreement.update(value.copy(), PERIOD, 0.0) is None
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_joint_that_bent_links_hold_need_not_answer_the_torque(held):
+    # Friction, and the links' bending, hold it against a tenth of the torque limit.
+    arm = known_arm()
+    model = models.build(arm)
+    channels = Channels(model, StrainMap(model))
+    checks, terms = Standstill(channels), model.terms(np.zeros(1), np.zeros(1))
+    across = np.linalg.solve(terms.M[1:, 1:], terms.M[1:, :1])[:, 0] @ terms.K2
+    torque = np.array([0.2 * arm.torque_limits[0]])
+    delta = -torque[0] * across / (across @ across)
+    found = []
+    for k in range(60):
+        reading = np.concatenate([[0.1], 1e-6 * np.sin([k, 2 * k]), [np.nan]])
+        joints = checks.update(reading, torque, np.zeros(2), 1e-3, delta if held else 0.0 * delta)[
+            0
+        ]
+        found += joints.tolist()
+    assert bool(found) != held
+
+
+@pytest.mark.parametrize(("period", "found"), [(1e-3, True), (12e-3, False)])
+def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(period, found):
+    model = models.build(known_arm())
+    channels = Channels(model, StrainMap(model))
+    fastest = channels.model.frequencies(np.zeros(1))[-1]
+    assert (fastest * period > 1.0) != found
+    agreement, named = Agreement(channels), False
+    for k in range(100):
+        value = np.full(channels.size, np.nan)
+        value[channels.position], value[channels.velocity] = 1.3 * k * period, 1.0
+        named |= agreement.update(value, period, 0.0) is not None
+    assert named == found

@@ -31,7 +31,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import null_space, solve_continuous_are
+from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import linear_plant, sampled
@@ -39,6 +39,7 @@ from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import build
 
 from ..arrays import clip
+from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..fast.pole_placement import PolePlacement, reaches
 from ..trajectory.path import Path
@@ -59,8 +60,12 @@ THERE = 1e-9
 SAME_START = 1e-6
 
 
-def regulator(model, q):
-    """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module."""
+def regulator(model, q, period):
+    """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module.
+
+    Where the torque is held for a `period` [s] that is too long for the gain of continuous time, as with modes near
+    the sampling frequency, it is the optimal gain of sampled time.
+    """
     n, omega = model.n_joints, lowest(model, q)
     A, B = linear_plant(model, q, coulomb=False)
     Q = np.zeros(A.shape)
@@ -68,15 +73,22 @@ def regulator(model, q):
     Q[:n, :n] = np.diag((inertia * omega**2) ** 2)
     V = reached(A, B)
     A, B, Q = V.T @ A @ V, V.T @ B, V.T @ Q @ V
+    Phi, Gamma = sampled(A, B, period)
     try:
         P = solve_continuous_are(A + DECAY * omega * np.eye(len(A)), B, Q, np.eye(n))
+        K = B.T @ P
+        if np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() >= 1.0:
+            faster = np.exp(DECAY * omega * period)
+            Phi, Gamma = faster * Phi, faster * Gamma
+            P = solve_discrete_are(Phi, Gamma, period * Q, period * np.eye(n))
+            K = np.linalg.solve(period * np.eye(n) + Gamma.T @ P @ Gamma, Gamma.T @ P @ Phi)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(
             f"no regulator of {model.arm.name} at joint configuration {np.round(q, 4).tolist()} ({error})",
             field="feedforward model",
             hint="set feedforward: none",
         ) from None
-    return B.T @ P @ V.T
+    return K @ V.T
 
 
 def reached(A, B):
@@ -149,7 +161,7 @@ def gains_along(model, path, period):
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
     count = int(np.ceil(way[-1] / APART)) + 1
     at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], count)))
-    gains = np.array([regulator(model, q[k]) for k in at])
+    gains = np.array([regulator(model, q[k], period) for k in at])
     for i in range(len(at) - 1):
         middle, K = 0.5 * (q[at[i]] + q[at[i + 1]]), 0.5 * (gains[i] + gains[i + 1])
         Phi, Gamma = sampled(*linear_plant(model, middle, coulomb=False), period)
@@ -257,7 +269,9 @@ class ModelFeedforward(Feedforward):
         self._run = _Run(2 * (n + m), n, fading_rate(model, settings.configuration))
         self._name_parts()
         #: The gain, if it does not depend on the joints; else None.
-        self.K = regulator(model, settings.configuration) if self._same_everywhere() else None
+        self.K = None
+        if self._same_everywhere():
+            self.K = regulator(model, settings.configuration, settings.period)
         self._prepared, self._first = None, True
         self._ahead = None  # the result of `look_ahead`
         self._held = None  # position, and the result of `wanted` there, while the reference rests
@@ -402,6 +416,10 @@ class ModelFeedforward(Feedforward):
             K = prepared.gains.at(elapsed)
         if self._first or before is None:
             fading.clear()
+            if not (source.rests or reference.velocity.any() or reference.acceleration.any()):
+                # A motion's first instant: the arm still rests, and the manifold has jumped.
+                rest = np.concatenate(self._on_manifold(at_rest(reference.position)))
+                fading.jump(rest - np.concatenate([source.state, source.torque]))
         else:
             fading.advance(dt)
             if not source.goes_on(before):

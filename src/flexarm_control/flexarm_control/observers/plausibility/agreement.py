@@ -5,12 +5,13 @@ Over a window that began at sample 0, with the trapezoidal rule,
 
 .. math::
     D = \sum_k \tfrac12(v_k + v_{k-1})\,h_k, \qquad
-    |x - x_0 - D| \le 0.1\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
+    |x - x_0 - D| \le s\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
     + \tfrac12\sum_k|v_k - v_{k-1}|\,h_k + 6\sigma_v\sqrt{t\,h}
 
 with :math:`\sigma`, c and J as in `jumps`, and :math:`\tau` by which a filtered rate may be late. The sum is what the
 rule can miss. Windows of `WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are
-evidence: a sign is wrong, a scale by more than 10 %, one of the two stands still, or the value drifts.
+evidence: a sign is wrong, a scale by more than s, one of the two stands still, or the value drifts.
+s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings.
 """
 
 import numpy as np
@@ -21,6 +22,8 @@ WINDOWS = (20, 200)
 PERSISTENT = 4
 #: Ratio by which a rate may be wrong [-].
 SCALE = 0.1
+#: The same, and the factor of what the trapezoidal rule can miss, where modes are fast for the sampling [-].
+FAST_SCALE, FAST_MISSED = 0.5, 2.0
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005
 #: Standard deviations that noise may reach.
@@ -51,6 +54,9 @@ class Agreement:
         self._count = np.concatenate([c.count, np.zeros(c.m)])
         self._noise = DEVIATIONS * np.sqrt(2.0) * c.noise[values] + self._count
         self._rate_noise = DEVIATIONS * c.noise[rates]
+        model = c.model
+        still = np.zeros(c.n)
+        self._fastest = float(model.frequencies(still)[-1]) if model.n_modes else 0.0  # [rad/s]
         size = values.size
         self.changed, self.driven, self._missed = np.zeros((3, len(WINDOWS), size))
         self._start, self._first = np.zeros((2, len(WINDOWS), size))
@@ -90,8 +96,9 @@ class Agreement:
         np.subtract(at, self._start, out=self.changed)
         self._last, self._rate = at, rate
         bound = np.maximum(np.abs(self.changed), np.abs(self.driven))
-        bound *= SCALE
-        bound += self._missed
+        fast = self._fastest * dt > 1.0
+        bound *= FAST_SCALE if fast else SCALE
+        bound += FAST_MISSED * self._missed if fast else self._missed
         bound += LATE * np.abs(rate - self._first)
         bound += self._noise
         if jitter > 0.0:

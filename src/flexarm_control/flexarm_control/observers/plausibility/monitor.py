@@ -279,7 +279,9 @@ class Monitor:
     def _compare(self, sample, stamp):
         c, dt, jumps = self.channels, self._dt, self.jumps
         noise = jumps.rms[c.strain]
-        joints, gauges, speeds, frame = self._standstill.update(self._raw, sample.torque, noise, dt)
+        joints, gauges, speeds, frame = self._standstill.update(
+            self._raw, sample.torque, noise, dt, sample.amplitude
+        )
         pairs = self._agreement.update(self._value, dt, jumps.jitter)
         compared, wiring = False, None
         if self._law is not None and self._has_strain:

@@ -12,7 +12,8 @@ is a simulated arm that is exactly at rest; therefore stillness alone is no evid
    \mathrm{erf}(s/2\sqrt2\sigma)` of the most probable count, s its step, when it lasts N samples with :math:`p^N <
    10^{-14}`. The noise has been seen when the readings' rms in `jumps` is at least half of it.
 3. of a joint, when the torque should have moved it. With :math:`\bar u` the part of the torque beyond friction, the
-   arm's weight and the uncertainty of both, and the acceleration :math:`M_{11}^{-1}\bar u` of the rigid arm since
+   arm's weight, what the bent links do to a joint that stands, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`, and the
+   uncertainty of all three, and the acceleration :math:`M_{11}^{-1}\bar u` of the rigid arm since
    it has been still: when the integral is more than `TRAVEL` of its encoder's steps, or of its noise.
 """
 
@@ -73,9 +74,9 @@ class Standstill:
         self._next = 0
         self._smallest = np.full(size, np.inf)
         self._speed, self._moved = np.zeros((2, c.n))
-        self._inertia = self._weight = None
+        self._inertia = self._weight = self._pushed = self._bent = None
 
-    def update(self, readings, torque, noise, dt):
+    def update(self, readings, torque, noise, dt, amplitude=None):
         """Take a new sample.
 
         Parameters
@@ -88,6 +89,8 @@ class Standstill:
             Rms of the gauges' readings so far.
         dt : float
             Since the last sample [s].
+        amplitude : ndarray, shape (m,), optional
+            Modal amplitudes.
 
         Returns
         -------
@@ -118,7 +121,7 @@ class Standstill:
         self.still[~same] = 0
         np.fmin(self._smallest, change, out=self._smallest, where=~same)
         self._remember(change, same)
-        return self._judge(readings, torque, noise, dt)
+        return self._judge(readings, torque, noise, dt, amplitude)
 
     def _remember(self, change, same):
         """Keep the changes before a reading became still; those of a still one are kept as they are."""
@@ -129,9 +132,11 @@ class Standstill:
             np.copyto(row, change, where=~same)
         self._next = (self._next + 1) % BEFORE
 
-    def _judge(self, readings, torque, noise, dt):
+    def _judge(self, readings, torque, noise, dt, amplitude):
         still, n, end = self.still, self.channels.n, self.channels.n + self.channels.g
-        joints = self._unmoved(readings[:n], torque, dt) if still[:n].any() else NONE
+        joints = NONE
+        if still[:n].any():
+            joints = self._unmoved(readings[:n], torque, dt, amplitude)
         quiet = still >= ABRUPT
         if not quiet.any():
             return joints, NONE, NONE, False
@@ -144,7 +149,7 @@ class Standstill:
         velocities = np.flatnonzero(abrupt[end:] & (readings[end:] != 0.0))
         return joints, gauges, velocities, frame
 
-    def _unmoved(self, position, torque, dt):
+    def _unmoved(self, position, torque, dt, amplitude):
         """Joints that the torque should have moved since they have been still."""
         still = self.still[: self.channels.n]
         if not np.isfinite(torque).all():
@@ -154,10 +159,14 @@ class Standstill:
             size = position.size
             self._inertia = np.linalg.inv(terms.M[:size, :size])
             self._weight = terms.f1.copy() if self._gravity else np.zeros(size)
-        net = torque - self._weight
-        net = np.sign(net) * np.maximum(
-            np.abs(net) - self._friction - WEIGHT * np.abs(self._weight), 0.0
-        )
+            across = np.linalg.solve(terms.M[size:, size:], terms.M[size:, :size]).T
+            self._pushed, self._bent = across @ terms.f2 * self._gravity, across @ terms.K2
+        bent = 0.0 * self._weight
+        if amplitude is not None and np.isfinite(amplitude).all():
+            bent = self._pushed + self._bent @ amplitude
+        net = torque - self._weight + bent
+        unsure = self._friction + WEIGHT * (np.abs(self._weight) + np.abs(bent))
+        net = np.sign(net) * np.maximum(np.abs(net) - unsure, 0.0)
         if not torque.any():
             net[:] = 0.0  # nothing acts, or brakes do
         began = still <= 1
