@@ -261,6 +261,34 @@ LAWS = [
     ),
     *of(
         "flexarm_control",
+        "payload",
+        "flexarm_control/test/test_payload_estimator.py",
+        (
+            "estimator",
+            "strains and torques that contradict each other are used",
+            "if self.low > self.high:",
+            "if False:",
+        ),
+        (
+            "estimator",
+            "weight and inertia of the strains: sign",
+            "strains.add(Y[n:], -need[n:], W, spring, errors, dt)",
+            "strains.add(Y[n:], need[n:], W, spring, errors, dt)",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "composite",
+        "flexarm_studies/test/test_payload_estimate.py -k step",
+        (
+            "law",
+            "another payload's torque: missing in the sample in which the integral takes it",
+            "                self.torque += taken\n",
+            "",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "robust",
         TESTS + "test_verdict.py",
         (
@@ -421,7 +449,7 @@ LAWS = [
         (
             "law",
             "a law that is replaced: not faded",
-            "fading.jump(old - self.torque)",
+            "fading.jump(old)",
             "fading.clear()",
         ),
         (

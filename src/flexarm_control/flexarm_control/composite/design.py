@@ -29,6 +29,10 @@ PARAMETERS = (
     parameter("stability_margin", 0.0, "1/s", -1e6, 1e3).described(
         "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this."
     ),
+    parameter("payload_scale", 1.0, "-", 0.0, 100.0).described(
+        "Payload that feed-forward, manifold and slow law are made for, in parts of the arm file's; payload_estimate"
+        " sets it. The fast law stays that of the arm file."
+    ),
 )
 
 
@@ -58,16 +62,20 @@ def design(model, slow, fast, manifold=None, settings=None):
         Nothing is made then.
     """
 
-    def law(group, given, *known):
+    def law(group, model, given, *known):
         name, values = typed(given, PREFIX[group][:-1])
         return design_law(group, name, model, values, *known)
 
-    slow_law, fast_law = law(SLOW, slow), law(FAST, fast)
-    surface = law(MANIFOLD, {"type": "quasi_steady"} if manifold is None else manifold, slow_law)
+    chosen = None if settings is None else check_all(PARAMETERS, settings)
+    fast_law = law(FAST, model, fast)
+    if chosen is not None and chosen["payload_scale"] != 1.0:
+        model = model.with_payload(chosen["payload_scale"])
+    slow_law = law(SLOW, model, slow)
+    given = {"type": "quasi_steady"} if manifold is None else manifold
+    surface = law(MANIFOLD, model, given, slow_law)
     control = CompositeControl(model, slow_law, fast_law, surface)
-    if settings is None:
+    if chosen is None:
         return control
-    chosen = check_all(PARAMETERS, settings)
     wanted = chosen["feedforward"]
     kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
     if slow_law.drifts:  # joints that nothing holds have no pole left of zero

@@ -30,14 +30,16 @@ class AwayError(DesignError):
 
 
 class _Pickler(pickle.Pickler):
-    """Writes every model of the arm as a name."""
+    """Writes every model of the arm, with whatever payload, as a name."""
 
     def __init__(self, file, arm):
         super().__init__(file, protocol=-1)
         self._arm = arm
 
     def persistent_id(self, obj):
-        return _MODEL if isinstance(obj, ArmModel) and obj.arm == self._arm else None
+        if isinstance(obj, ArmModel) and obj.origin[0] == self._arm:
+            return _MODEL, obj.payload_scale
+        return None
 
     def reducer_override(self, obj):
         if isinstance(obj, ArmModel):
@@ -48,10 +50,13 @@ class _Pickler(pickle.Pickler):
 class _Unpickler(pickle.Unpickler):
     def __init__(self, file, model):
         super().__init__(file)
-        self._model = model
+        self._models = {1.0: model}
 
     def persistent_load(self, name):
-        return self._model
+        _, scale = name
+        if scale not in self._models:
+            self._models[scale] = self._models[1.0].with_payload(scale)
+        return self._models[scale]
 
 
 def dumps(thing, arm):
@@ -65,7 +70,7 @@ def dumps(thing, arm):
 
 
 def loads(data, model):
-    """What `dumps` wrote, with `model` in the place of the models that it left out."""
+    """What `dumps` wrote, with `model`, or it with another payload, in the place of the models that it left out."""
     return _Unpickler(io.BytesIO(data), model).load()
 
 

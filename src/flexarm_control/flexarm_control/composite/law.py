@@ -7,7 +7,8 @@ paper takes their quasi-steady state (9); `manifold` has it and better ones. On 
 Two things would jump, and fade instead (module `fading`):
 
 - A control that takes another one's place adds to its slow torque what the old one would have given more at that
-  sample.
+  sample. One for another payload that does so at rest takes it into the slow law's integral, as far as that goes; the
+  rest fades within two of the arm's lowest locked periods, so that the arm is not set ringing.
 - Without a feed-forward, slow torque and manifold jump where the reference goes over to another polynomial, with its
   jerk and snap: what the polynomial before, continued, gives more is added. A feed-forward has that in its own motion.
 """
@@ -16,9 +17,13 @@ import numpy as np
 
 from ..arrays import clip
 from ..component import at_rest
-from ..fading import Fading, fading_rate
+from ..fading import Fading, fading_rate, lowest
 from ..feedforward.model import At
 from ..manifold.quasi_steady import QuasiSteady
+
+#: Rate at which the torque of another payload fades, over the lowest locked frequency: a hundredth is left after two
+#: periods.
+PAYLOAD_FADING = 8.4 / (4.0 * np.pi)
 
 
 class CompositeControl:
@@ -54,6 +59,7 @@ class CompositeControl:
         self._limit = np.full(n, np.inf)
         # Of the torque, from the control `_before` that this one replaces until its first step.
         self._exchanged, self._before = Fading(n, rate), None
+        self._other_payload = False  # than the control had that this one replaces
         # Of (slow torque, delta_bar, its rate), since path, piece and stamp of the last step.
         self._pieces, self._source = Fading(n + 2 * model.n_modes, rate), None
         # Of what motion, and the slow law's torque on it.
@@ -95,6 +101,9 @@ class CompositeControl:
         self.limit, self.fast_fraction = other.limit, other.fast_fraction
         self._pieces.take(other._pieces)
         self._source = other._source
+        self._other_payload = other.model.payload_scale != self.model.payload_scale
+        if self._other_payload:
+            self._exchanged.rate = PAYLOAD_FADING * lowest(self.model)
         # One that has not had a sample has nothing to go on from.
         self._before = other if other._last is not None else other._before
 
@@ -157,7 +166,13 @@ class CompositeControl:
         if before is not None and sample[-1] > 0.0:
             old = before.step(*sample).copy()
             clip(old, -self._limit, self._limit)  # as it was sent
-            fading.jump(old - self.torque)
+            old -= self.torque
+            if self._other_payload and not sample[4].velocity.any():
+                taken = self.slow.absorb(old)
+                self.slow_torque += taken
+                self.torque += taken
+                old -= taken
+            fading.jump(old)
         return fading.left.any()
 
     def _advance(self, reference, dt):

@@ -36,7 +36,7 @@ from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
-from flexarm_dynamics.models.model import build
+from flexarm_dynamics.models.model import copy
 
 from ..arrays import clip
 from ..component import at_rest
@@ -324,7 +324,7 @@ class ModelFeedforward(Feedforward):
 
     def prepare(self, trajectory, start):
         # A model of its own: the loop goes on with this one meanwhile.
-        model, path = build(self.model.arm), path_of(trajectory, start)
+        model, path = copy(self.model), path_of(trajectory, start)
         gains = None if self.K is not None else gains_along(model, path, self.settings.period)
         return Preparation(start, gains, self._plan(model, path, start))
 
@@ -341,9 +341,18 @@ class ModelFeedforward(Feedforward):
 
     def resume(self, other):
         if isinstance(other, ModelFeedforward):
-            self._run.take(other._run)
             self._first, self._prepared = other._first, other._prepared
             self._ahead = None
+            before = other._run.source
+            if self._other_payload(other) and before is not None and before.rests:
+                self._first = (
+                    True  # bent by its own weight at once: the torque that changes fades in `law`
+                )
+            else:
+                self._run.take(other._run)
+
+    def _other_payload(self, other):
+        return self.model.payload_scale != other.model.payload_scale
 
     def _preparation(self, reference):
         """What was designed for the active trajectory, and the time since its start; None, 0 without."""

@@ -3,9 +3,11 @@
 
 import numpy as np
 
-from flexarm_dynamics.errors import FlexarmError, MessageError, TrajectoryError
+from flexarm_dynamics.errors import DesignError, FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
+from ..payload import estimator
+from ..payload.estimator import PayloadEstimator
 from ..trajectory import ReferenceGenerator, Verdict, refuse_torque, validate
 from ..trajectory.reference import GENTLE
 from . import applied, authority, supervisor
@@ -40,6 +42,7 @@ PARAMETERS = (
         " friction, payload of the arm file; what needs more is refused. 0.0: not judged."
     ),
     *supervisor.PARAMETERS,
+    *estimator.PARAMETERS,
 )
 
 START_TOLERANCE = parameter("start_tolerance", 0.01, "rad", 0.0, 10.0, read_only=True).described(
@@ -82,6 +85,8 @@ class ArmController:
         How long after a state's stamp its torque acts, from what the driver reports.
     controller_id : int
         Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
+    payload : PayloadEstimator or None
+        What `weigh` learns of the payload; None: `payload_estimate` is off.
     """
 
     def __init__(self, model, law, settings, start_tolerance=0.01):
@@ -111,11 +116,72 @@ class ArmController:
         self._applied = Applied(model, settings, self.torque_limit)
         self.torque_delay = TorqueDelay(n)
         self._take_limits(settings)
+        self.payload = self._estimator(settings)
+
+    def _estimator(self, settings):
+        mode = settings["payload_estimate"]
+        if mode == estimator.OFF:
+            return None
+        if self.law.slow.learns:
+            raise DesignError(
+                "and a slow law that learns would both correct the payload",
+                field="payload_estimate",
+                value=mode,
+                hint="write off, or choose another slow.type",
+            )
+        return PayloadEstimator(self.model, mode, settings["payload_limit"])
 
     def replace_law(self, law):
         """Go on with another control, from the states of the present one; call between two samples."""
         law.resume(self.law)
         self.law = law
+
+    # Payload -------------------------------------------------------------------------------------
+
+    def weigh(self):
+        """Learn the payload from the last sample; call once the torque is sent."""
+        if self.payload is not None and self.enabled:
+            self.payload.update(self.reference.resting is not None)
+
+    @property
+    def payload_scale(self):
+        """Payload that the control is made for, in parts of the arm file's [-]."""
+        return self.law.model.payload_scale
+
+    @property
+    def payload_wanted(self):
+        """Payload that the control should be made for now; None: as it is, or the arm does not rest."""
+        found = self.payload
+        if found is None or found.reason or self.law.slow.learns:
+            return None
+        if not (self.enabled and self._rests):
+            return None
+        if found.low <= self.payload_scale <= found.high:
+            return None
+        return round(found.value, 3)
+
+    @property
+    def _rests(self):
+        at_rest = self.state in (State.READY, State.HOLDING) and self.reference.resting is not None
+        return at_rest and not self._doubt
+
+    def carry(self, law):
+        """Go on with a control made for another payload; False where the arm does not rest: then nothing changes."""
+        if not self._rests:
+            return False
+        self.replace_law(law)
+        return True
+
+    def _note(self, sample, dt):
+        """Keep what the estimate of the payload needs of a sample, before its torque is computed."""
+        if self._doubt:
+            self.payload.discard(f"a sensor is in doubt: {self._doubt}")
+            self.payload.restart()
+            return
+        known = np.isfinite(sample.torque).all()
+        self.payload.note(
+            sample.position, sample.amplitude, sample.torque if known else self.torque, dt
+        )
 
     def configure(self, settings):
         """Take new limits whole; call between two samples.
@@ -302,6 +368,8 @@ class ArmController:
     def _control(self, sample, dt):
         """The torque for a sample that can be trusted; whether it may be applied."""
         law, reference, supervisor = self.law, self.reference, self.supervisor
+        if self.payload is not None:
+            self._note(sample, dt)
         reference.sample(sample.stamp_ns)
         q, qd = sample.position, sample.velocity
         np.subtract(reference.position, q, out=self.position_error)
@@ -392,6 +460,8 @@ class ArmController:
 
     def distrust(self, reason):
         """No torque, for the state can't be trusted: a fault where there was torque, else until a valid one comes."""
+        if self.payload is not None:
+            self.payload.discard(reason)
         self.supervisor.doubt(reason)
         self._off()
 

@@ -62,7 +62,8 @@ class ControllerNode(ArmNode):
         self.core.warm_up()
         self._report = Report(self, self.core, self.design)
         self._inbox = TrajectoryInbox(self, self.core, designer)
-        self._workers = designer, Designs(self, self.core, designer), self._inbox
+        self._designs = Designs(self, self.core, designer)
+        self._workers = designer, self._designs, self._inbox
         self._reader = StateReader(arm)
         self._sample = ArmSample(len(arm.joints), len(arm.modes))
         self._torque = TorqueWriter(arm)
@@ -134,6 +135,9 @@ class ControllerNode(ArmNode):
         self._report.answered(took)
         if enabled:
             core.answered_by.look_ahead()
+            core.weigh()
+            if (payload := core.payload_wanted) is not None:
+                self._designs.carry(payload)
 
     def _watch(self):
         """On the steady clock: notice that the states have stopped."""

@@ -34,6 +34,7 @@ class Designs:
         self._node, self._core, self._designer = node, core, designer
         self._waiting = deque()  # values to design for, the newest last
         self._closed = Event()
+        self._carries = False  # a design for another payload is under way
         # Designs are made one at a time.
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
         values = node.parameters.values()
@@ -93,6 +94,32 @@ class Designs:
         """Set the parameters that differ from the active ones back to those."""
         old = [RosParameter(name, value=v) for name, v in active.items() if values[name] != v]
         self._node.hand_over(self._node.set_parameters_atomically, old)
+
+    def carry(self, payload):
+        """Have the control designed for another payload, in parts of the arm file's, and taken over at rest."""
+        if not self._carries:
+            self._carries = True
+            self._thread.submit(self._carry, payload)
+
+    def _carry(self, payload):
+        """In the design thread: the control for another payload."""
+        try:
+            law = self._designer.design({**self._design, "payload_scale": payload})
+        except CancelledError:
+            return
+        except Exception as error:  # of a user's law, too
+            self._node.hand_over(self._carried, None, payload, str(error))
+        else:
+            self._node.hand_over(self._carried, law, payload)
+
+    def _carried(self, law, payload, refused=""):
+        """In the node's thread: the control for another payload is there, or why it is refused."""
+        self._carries = False
+        if refused:
+            self._core.payload.discard(f"no control for a payload of {payload:g}: {refused}")
+        elif self._core.carry(law):
+            self._design = {**self._design, "payload_scale": payload}
+            self._node.parameters.adopt({"payload_scale": payload})
 
     def close(self):
         """Take no more changes; a design under way is not waited for."""

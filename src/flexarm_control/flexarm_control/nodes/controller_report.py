@@ -76,6 +76,7 @@ class Report:
             "torque delay p50 [ms]": _milliseconds(median),
             "torque delay max [ms]": _milliseconds(longest),
             **self._of_design(),
+            **self._of_payload(),
             "states lost": core.missed,
             "states too late": core.late,
             "interruptions": core.interruptions,
@@ -93,6 +94,17 @@ class Report:
         return {
             "designed for a delay of [ms]": _milliseconds(self._design.delay),
             "bears a delay of [ms]": _milliseconds(self._design.bears_delay),
+        }
+
+    def _of_payload(self):
+        found = self._core.payload
+        if found is None:
+            return {}
+        interval = f"{found.value:.3f}, {found.low:.3f} to {found.high:.3f}"
+        return {
+            "payload estimate": "-" if isnan(found.value) else interval,
+            "payload estimate is": f"not used: {found.reason}" if found.reason else "usable",
+            "payload in use": f"{self._core.payload_scale:.3f}",
         }
 
     def _not_as_designed(self, delay):

@@ -39,7 +39,7 @@ from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import KP, KV, SlowLaw
-from .payload_model import PayloadModel
+from .payload_model import PayloadModel, need_payload
 from .rigid_arm import rigid_arm
 
 #: Configurations over which the adaptation's gain is normalised.
@@ -84,14 +84,7 @@ class AdaptiveModelFollowing(SlowLaw):
         super().__init__(model, parameters)
         self.kp, self.kv = np.array(self.parameters["kp"]), np.array(self.parameters["kv"])
         self._rates()
-        load = model.arm.payload
-        if not load.mass and not np.any(load.inertia):
-            raise DesignError(
-                f"in arm {model.arm.name}: adaptive_model_following learns the payload in parts of the arm file's",
-                field="payload.mass",
-                value=0,
-                hint="write the mass that it is expected to have there",
-            )
+        need_payload(model, "adaptive_model_following")
         self.model = PayloadModel(model)
         self._one = rigid_arm(model.arm)
         self._two = self._one.with_payload(2.0)

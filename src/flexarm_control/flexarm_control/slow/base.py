@@ -3,6 +3,8 @@
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
@@ -60,6 +62,10 @@ class SlowLaw(Law, ABC):
 
     def saw(self, torque):
         """Take note of the whole torque (n,) [N m] that this sample asks for, before any limit."""
+
+    def absorb(self, torque):
+        """Take a torque (n,) [N m] into the law's own integral, if it has one; what was taken, (n,)."""
+        return np.zeros_like(torque)
 
     @abstractmethod
     def torque(self, q, qd, reference, terms):

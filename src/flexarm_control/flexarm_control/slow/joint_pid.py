@@ -92,6 +92,12 @@ class JointPid(SlowLaw):
         u += self.integral
         return self._low_pass(u)
 
+    def absorb(self, torque):
+        before = self.integral.copy()
+        self.integral += np.where(self.gain > 0.0, torque, 0.0)
+        np.clip(self.integral, -self._most, self._most, out=self.integral)
+        return self.integral - before
+
     def saw(self, torque):
         self._beyond[:] = np.sign(torque) * (np.abs(torque) > self._limit)
 

@@ -3,6 +3,7 @@
 
 import numpy as np
 
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import Terms
 
 
@@ -37,6 +38,18 @@ class PayloadModel:
             return one
         two = self._two.terms(q, qd)
         return Terms(*(_between(getattr(one, name), getattr(two, name), more) for name in _NAMES))
+
+
+def need_payload(model, who):
+    """Refuse a model without payload: `who` learns it in parts of the arm file's."""
+    load = model.arm.payload
+    if not load.mass and not np.any(load.inertia):
+        raise DesignError(
+            f"in arm {model.arm.name}: {who} learns the payload in parts of the arm file's",
+            field="payload.mass",
+            value=0,
+            hint="write the mass that it is expected to have there",
+        )
 
 
 _NAMES = ("M", "f1", "f2", "C1", "C2", "K1", "K2")

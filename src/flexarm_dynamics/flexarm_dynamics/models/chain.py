@@ -132,7 +132,8 @@ class Chain(ArmModel):
             raise ModelError("has no modes", field=f"{link} in {direction}") from None
 
     def with_payload(self, scale):
-        return type(self)(scaled(self.arm, payload=scale), self._compiled, self._shapes)
+        arm = scaled(self.arm, payload=scale)
+        return self._carrying(scale, type(self)(arm, self._compiled, self._shapes))
 
     # Equations of motion -----------------------------------------------------------------------
 

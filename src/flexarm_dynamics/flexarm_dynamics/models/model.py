@@ -69,6 +69,8 @@ class ArmModel(ABC):
 
     def __init__(self, arm):
         self.arm = arm
+        #: The arm that the mode shapes are made for, and the factor of its payload: see `with_payload`.
+        self.origin = arm, 1.0
         self.joint_names = arm.joint_names
         self.mode_names = arm.mode_names
 
@@ -152,6 +154,17 @@ class ArmModel(ABC):
             field=f"model {self.arm.model}",
             hint="take safe_action damp or zero, or model chain",
         )
+
+    @property
+    def payload_scale(self):
+        """Payload in parts of that of the arm that the mode shapes are made for [-]."""
+        return self.origin[1]
+
+    def _carrying(self, scale, model):
+        """The `model` that `with_payload` made, with its origin noted."""
+        arm, already = self.origin
+        model.origin = arm, already * scale
+        return model
 
     def with_payload(self, scale):
         """The same arm in the same mode shapes, with its payload's mass and inertia scaled.
@@ -390,6 +403,12 @@ def build(arm):
         When that model can't represent this arm.
     """
     return registry.find("flexarm.models", arm.model)(arm)
+
+
+def copy(model):
+    """Another model of the same arm in the same mode shapes: for another thread."""
+    arm, scale = model.origin
+    return build(arm) if scale == 1.0 else build(arm).with_payload(scale)
 
 
 def rotation(rpy):

@@ -102,7 +102,7 @@ class OneLinkEquations(ArmModel):
         self._terms_at_rest = self._constant_terms()
 
     def with_payload(self, scale):
-        return type(self)(scaled(self.arm, payload=scale), self.shapes)
+        return self._carrying(scale, type(self)(scaled(self.arm, payload=scale), self.shapes))
 
     def derive(self):
         """Return the `Coefficients` of this derivation."""

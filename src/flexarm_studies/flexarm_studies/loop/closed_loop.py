@@ -14,7 +14,7 @@ from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm
-from flexarm_dynamics.errors import FlexarmError, MessageError, ModelError
+from flexarm_dynamics.errors import DesignError, FlexarmError, MessageError, ModelError
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.integrators import integrate
 from flexarm_sim.simulator import PARAMETERS as SIMULATOR_PARAMETERS
@@ -84,7 +84,12 @@ class ClosedLoop:
             chosen.setdefault("rate", 1e9 / self.simulator.period_ns)
         declared = (*CONTROLLER_PARAMETERS, START_TOLERANCE)
         limits = check_all(declared, given, sizes)
-        law = design(model, slow, fast, manifold, chosen or None)
+
+        def law_for(payload):
+            settings = chosen if payload is None else {**chosen, "payload_scale": payload}
+            return design(model, slow, fast, manifold, settings or None)
+
+        self._law_for, law = law_for, law_for(None)
         self.controller = ArmController(model, law, limits, limits.pop("start_tolerance"))
         n, m, g = model.n_joints, model.n_modes, len(model.arm.gauges)
         self._measured, self._estimate = ArmSample(n, m, g), ArmSample(n, m)
@@ -169,9 +174,20 @@ class ClosedLoop:
         except MessageError as error:
             self.controller.distrust(str(error))
             enabled = False
+        self._weigh()
         if self.bag is not None:
             self.bag.answered(measured, enabled)
         return enabled
+
+    def _weigh(self):
+        """What the controller node does once the torque is sent."""
+        controller = self.controller
+        controller.weigh()
+        if (payload := controller.payload_wanted) is not None:
+            try:
+                controller.carry(self._law_for(payload))
+            except DesignError as error:
+                controller.payload.discard(str(error))
 
     def _advance(self, torque):
         """One period of the plant under what has arrived by then."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A low pass whose states have the second derivative of what it lets through.
+r"""A low pass whose states have the first and second derivative of what it lets through.
 
 Three stages, :math:`\dot y_i = \omega(y_{i-1} - y_i)` with the input as :math:`y_0`, so that
 
-.. math:: \ddot y_3 = \omega^2(y_1 - 2y_2 + y_3) .
+.. math:: \dot y_3 = \omega(y_2 - y_3), \qquad \ddot y_3 = \omega^2(y_1 - 2y_2 + y_3) .
 
 The input is taken for a straight line between two samples, whatever time h they are apart. With :math:`x = \omega h`,
 :math:`e_k = e^{-x}x^k/k!`, the step responses :math:`S_i = 1 - \sum_{k<i}e_k` and those of a ramp,
@@ -75,6 +75,11 @@ class LowPass:
     def signal(self):
         """y_3, shape (N,)."""
         return self._rows[4]
+
+    @property
+    def first(self):
+        """Its derivative, shape (N,)."""
+        return self.corner * (self._rows[3] - self._rows[4])
 
     @property
     def second(self):

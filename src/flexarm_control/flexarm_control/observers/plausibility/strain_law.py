@@ -88,8 +88,7 @@ class StrainLaw:
     def __init__(self, channels, strain_map, payload=TOLERANCE):
         c, self._map = channels, strain_map
         self.channels, self.model = c, c.model
-        lowest = self.model.frequencies().min(initial=np.inf)
-        self.corner = float(np.clip(CORNER * lowest, MIN_CORNER, MAX_CORNER))
+        self.corner = corner_of(self.model)
         gauges = self.model.arm.gauges
         places = [(a.link, a.direction) for a in gauges]
         self._groups = np.array([[a == b for b in places] for a in places])
@@ -273,6 +272,11 @@ class StrainLaw:
         )
         known = (total > DRIVEN**2 * (still + swing)) & (still > STRAINED**2 * total)
         return np.where(known, misfit / np.where(known, total, 1.0), np.inf)
+
+
+def corner_of(model):
+    """Corner of the low pass of readings that are compared with the motion of a model's arm [rad/s]."""
+    return float(np.clip(CORNER * model.frequencies().min(initial=np.inf), MIN_CORNER, MAX_CORNER))
 
 
 def _hypotheses(gauges, places):
