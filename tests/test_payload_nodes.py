@@ -27,6 +27,14 @@ def with_twice_the_payload(folder):
     return str(path)
 
 
+def taken_over(nodes):
+    """Payload that the control is made for, once it is another; the parameter; the diagnostics."""
+    controller = nodes.nodes["controller"]
+    core = controller.core
+    nodes.wait_for("another payload", lambda: core.payload_scale != 1.0)
+    return core.payload_scale, controller.parameters["payload_scale"], controller.diagnose()[2]
+
+
 def test_a_heavier_payload_is_weighed_taken_over_and_reported(tmp_path):
     start = closed_loop.TRAJECTORY_START_NS
     with InProcess() as nodes:
@@ -43,11 +51,7 @@ def test_a_heavier_payload_is_weighed_taken_over_and_reported(tmp_path):
         )
         message = lockstep.trajectory_message(("joint1",), profiles.paper_profile(), 101, start)
         nodes.record(message, 4.0)
-        controller = nodes.nodes["controller"]
-        nodes.wait_for("another payload", lambda: controller.core.payload_scale != 1.0)
-        values = controller.diagnose()[2]
-        carried, parameter = controller.core.payload_scale, controller.parameters["payload_scale"]
-        del controller
+        carried, parameter, values = taken_over(nodes)
     assert carried == parameter == pytest.approx(2.0, abs=0.1)
     assert values["payload estimate is"] == "usable"
     assert float(values["payload in use"]) == pytest.approx(carried)
