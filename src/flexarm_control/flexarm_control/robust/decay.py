@@ -10,8 +10,8 @@ Each pole :math:`s = \ln(z)/h` of each loop has the value
 so that up to omega_c, where torque reaches, v is minus the decay over the lowest bending frequency omega_1 with the
 joints locked; of modes that are much stiffer less is asked, since a motion hardly excites them. Still stiffer modes are
 only asked to keep a fraction of their own damping zeta, and of loops that are less likely a fraction of all this is
-asked. A pole that grows counts by omega_1, whatever it is. The largest v of all poles is what a design makes small. With the right and left
-eigenvectors x, y of F - G K N,
+asked. A pole that grows counts by omega_1, whatever it is. The largest v of all poles is what a design makes small.
+With the right and left eigenvectors x, y of F - G K N,
 
 .. math:: \frac{\partial s}{\partial K_{ab}} = -\frac{(y^HG)_a\,(Nx)_b}{h\,z\,y^Hx} .
 

@@ -2,6 +2,7 @@
 """The search for the gains whose slowest pole is the fastest."""
 
 import numpy as np
+
 from .nonsmooth import minimise
 
 #: Starts: natural frequency of the joints over omega_1.
