@@ -99,8 +99,8 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     """The set of loops that a design is for.
 
     In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
-    less gain, one that is later, and two whose joint speeds are measured, one of them without delay. An arm with
-    Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing makes it.
+    less gain, one that is later, and one whose joint speeds are measured; in each configuration one with measured speeds
+    and without delay. An arm with Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing makes it.
 
     Parameters
     ----------
@@ -152,8 +152,9 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     name = "joint speeds measured"
     out.append(sampled_loop(nominal, stated, at[0], measured, name=name, fraction=UNLIKELY))
     sooner = replace(measured, delay=0.0)
-    name = "joint speeds measured, no delay"
-    out.append(sampled_loop(nominal, stated, at[0], sooner, name=name, fraction=UNLIKELY))
+    for i, q in enumerate(at):
+        name = f"joint speeds measured, no delay, at configuration {i + 1}"
+        out.append(sampled_loop(nominal, stated, q, sooner, name=name, fraction=UNLIKELY))
     if any(joint.friction.coulomb for joint in arm.joints):
         for i, q in enumerate(at):
             name = f"sticking, at configuration {i + 1}"
