@@ -98,9 +98,10 @@ def richer(arm):
 def uncertain_loops(nominal, at, sampling, uncertainty):
     """The set of loops that a design is for.
 
-    In each configuration the softest, the stated and the stiffest arm; in the first one a loop with more and one with
-    less gain, one that is later, and one whose joint speeds are measured; in each configuration one with measured speeds
-    and without delay. An arm with Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing makes it.
+    In each configuration the softest, the stated and the stiffest arm, and one with measured joint speeds and without
+    delay; in the first one a loop with more and one with less gain, one that is later, and one whose joint speeds are
+    measured. An arm with Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing
+    makes it.
 
     Parameters
     ----------
