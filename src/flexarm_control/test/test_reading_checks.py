@@ -8,6 +8,7 @@ import pytest
 
 from flexarm_control.observers.plausibility.agreement import Agreement
 from flexarm_control.observers.plausibility.channels import Channels
+from flexarm_control.observers.plausibility.jumps import Jumps
 from flexarm_control.observers.plausibility.low_pass import LowPass
 from flexarm_control.observers.plausibility.standstill import Standstill
 from flexarm_control.observers.plausibility.strain_law import StrainLaw
@@ -285,3 +286,22 @@ def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(per
         value[channels.position], value[channels.velocity] = 1.3 * k * period, 1.0
         named |= agreement.update(value, period, 0.0) is not None
     assert named == found
+
+
+def test_lost_samples_in_which_a_mode_turns_far_are_no_jump_of_the_strains():
+    # A swing of the second mode, 14 Hz, at 200 Hz; every seventh sample is lost.
+    model = models.build(known_arm())
+    channels = Channels(model, StrainMap(model))
+    jumps, period, last = Jumps(channels), 5e-3, 0
+    omega = channels.fastest
+    for k in range(1, 400):
+        if k % 7 == 0 and k > 60:
+            continue
+        value = np.full(channels.size, np.nan)
+        value[channels.position] = 0.3
+        value[channels.strain] = 2e-4 * np.cos(omega * k * period) * (k > 100)
+        found = jumps.judge(value, np.array([0.5]), (k - last) * period, k - last)
+        if k > 130:
+            assert found == (None, None)
+        jumps.take(value, k * period)
+        last = k

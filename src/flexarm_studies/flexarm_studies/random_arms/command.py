@@ -10,6 +10,19 @@ from ..uncertain.controllers import CONTROLLERS
 from ..uncertain.plants import VARIANTS
 from . import generator, report, study
 
+#: Controllers and plants of the table, unless others are asked for.
+USUAL = ("default", "preview", "designed", "designed_preview", "pid_zvd", "pid_ei", "lqr")
+PLANTS = (
+    "exact",
+    "payload x0.7",
+    "payload x1.3",
+    "stiffness x0.9",
+    "stiffness x1.1",
+    "damping x0.3",
+    "damping x3",
+    "noisy",
+)
+
 
 def add_arguments(parser):
     """Arguments of the sub-command."""
@@ -26,10 +39,10 @@ def add_arguments(parser):
     add("--count", type=int, default=100, help="arms (100)")
     add("--seed", type=int, default=0, help="of the arms and of the noise (0)")
     workers.add_arguments(add)
-    names = ",".join(CONTROLLERS)
-    add("--controllers", default=names, help=f"controllers, separated by commas ({names})")
-    names = ",".join(VARIANTS)
-    add("--variants", default=names, help=f"plants, separated by commas ({names})")
+    usual, names = ",".join(USUAL), ", ".join(CONTROLLERS)
+    add("--controllers", default=usual, help=f"controllers, separated by commas ({usual}) of {names}")
+    usual, names = ",".join(PLANTS), ", ".join(VARIANTS)
+    add("--variants", default=usual, help=f"plants, separated by commas ({usual}) of {names}")
     add(
         "--out",
         metavar="FILE.jsonl",

@@ -54,9 +54,6 @@ class Agreement:
         self._count = np.concatenate([c.count, np.zeros(c.m)])
         self._noise = DEVIATIONS * np.sqrt(2.0) * c.noise[values] + self._count
         self._rate_noise = DEVIATIONS * c.noise[rates]
-        model = c.model
-        still = np.zeros(c.n)
-        self._fastest = float(model.frequencies(still)[-1]) if model.n_modes else 0.0  # [rad/s]
         size = values.size
         self.changed, self.driven, self._missed = np.zeros((3, len(WINDOWS), size))
         self._start, self._first = np.zeros((2, len(WINDOWS), size))
@@ -96,7 +93,7 @@ class Agreement:
         np.subtract(at, self._start, out=self.changed)
         self._last, self._rate = at, rate
         bound = np.maximum(np.abs(self.changed), np.abs(self.driven))
-        fast = self._fastest * dt > 1.0
+        fast = self.channels.fastest * dt > 1.0
         bound *= FAST_SCALE if fast else SCALE
         bound += FAST_MISSED * self._missed if fast else self._missed
         bound += LATE * np.abs(rate - self._first)

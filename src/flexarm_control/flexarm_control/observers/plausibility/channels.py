@@ -52,6 +52,8 @@ class Channels:
         Velocities and modal rates.
     noise : ndarray, shape (N,)
         Rms.
+    fastest : float
+        Highest frequency of the model's modes; 0 for a rigid arm [rad/s].
     count : ndarray, shape (n,)
         Steps of the encoders; zero where the arm file states none [rad].
     gain : ndarray, shape (N, n)
@@ -90,6 +92,7 @@ class Channels:
         self.strength = np.array([max(j.limits.torque, j.brake_torque or 0.0) for j in arm.joints])
         ends = np.array([g.range for g in arm.gauges]).reshape(-1, 2)
         self._middle, self._half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
+        self.fastest = float(self.model.frequencies().max(initial=0.0))
         self.noise = self._noise(strain_map)
         self.gain, self.push = self._accelerations(strain_map)
 
@@ -103,8 +106,7 @@ class Channels:
             noise[self.amplitude] = UNSTATED_AMPLITUDE
         else:
             noise[self.amplitude] = np.linalg.norm(strain_map.inverse * noise[self.strain], axis=1)
-        fastest = self.model.frequencies().max(initial=0.0)
-        noise[self.rate] = fastest * noise[self.amplitude]
+        noise[self.rate] = self.fastest * noise[self.amplitude]
         return noise
 
     def _accelerations(self, strain_map):

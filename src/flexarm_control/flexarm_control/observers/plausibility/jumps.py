@@ -29,8 +29,9 @@ DEVIATIONS, GROWTH = 6.0, 2.0
 EXCESS_TIME, RARE_TIME = 0.02, 1.0
 #: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
 FREQUENT = 8.0
-#: Over more lost samples in a row the deflections can't be extrapolated.
-MAX_STEPS = 3
+#: Over more lost samples in a row the deflections can't be extrapolated, nor over some in which the fastest mode turns by
+#: more than this [rad].
+MAX_STEPS, MAX_TURN = 3, 0.5
 #: Fraction of the largest torque that may have acted on the joints in lost samples, unreported [-].
 UNREPORTED = 0.1
 
@@ -147,9 +148,15 @@ class Jumps:
             return None, None
         return self._sort_out(value, residual > bound)
 
+    @property
+    def _gap(self):
+        """Whether so much time was lost before this sample that a line says nothing of the deflections."""
+        lost = self._steps > 1 and self.channels.fastest * self._dt > MAX_TURN
+        return lost or self._steps > MAX_STEPS
+
     def _sort_out(self, value, wrong):
         wrong &= self._grace == 0
-        if self._steps > MAX_STEPS:
+        if self._gap:
             wrong &= self._far
         if not wrong.any():
             return None, None
@@ -181,7 +188,7 @@ class Jumps:
             self._past[:, self._lasting] = value[self._lasting]
             self._grace[self._lasting] = self.span + 2
             self._excess[self._lasting] = 0.0
-        if self._steps > MAX_STEPS:
+        if self._gap:
             # The slope over the gap is none of the present motion.
             self._grace[~self._far] = self.span + 2
         if self._new_torque is None:
