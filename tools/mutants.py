@@ -526,8 +526,8 @@ LAWS = [
         (
             "model",
             "the regulator's gain: sign",
-            "    return B.T @ P @ V.T\n",
-            "    return -B.T @ P @ V.T\n",
+            "    return K @ V.T\n",
+            "    return -K @ V.T\n",
         ),
         (
             "model",

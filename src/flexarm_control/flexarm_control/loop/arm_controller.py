@@ -117,6 +117,8 @@ class ArmController:
         self.torque_delay = TorqueDelay(n)
         self._take_limits(settings)
         self.payload = self._estimator(settings)
+        # So long the joints have been slow, as far as the payload needs to know [s].
+        self._slow_for, self._bending_period = 0.0, _longest_period(model)
 
     def _estimator(self, settings):
         mode = settings["payload_estimate"]
@@ -163,7 +165,8 @@ class ArmController:
     @property
     def _rests(self):
         at_rest = self.state in (State.READY, State.HOLDING) and self.reference.resting is not None
-        return at_rest and not self._doubt
+        # An arm that swings stands at its turning points, too.
+        return at_rest and not self._doubt and self._slow_for >= 0.5 * self._bending_period
 
     def carry(self, law):
         """Go on with a control made for another payload; False where the arm does not rest: then nothing changes."""
@@ -174,6 +177,8 @@ class ArmController:
 
     def _note(self, sample, dt):
         """Keep what the estimate of the payload needs of a sample, before its torque is computed."""
+        slow = np.abs(sample.velocity).max() < AT_REST
+        self._slow_for = self._slow_for + dt if slow else 0.0
         if self._doubt:
             self.payload.discard(f"a sensor is in doubt: {self._doubt}")
             self.payload.restart()
