@@ -373,8 +373,8 @@ LAWS = [
         (
             "torque_delay",
             "torques from before an interruption",
-            "if first > LAGS + 1 and",
-            "if first > 0 and",
+            "if first <= LAGS + 1 or",
+            "if first <= 0 or",
         ),
     ),
     *of(

@@ -30,17 +30,21 @@ class LowPass:
     """
 
     def __init__(self, n, corner):
-        self._corner, self._kept = corner, None
-        self._states = np.zeros((POLES, n))
+        self._corner, self._kept, self._fresh = corner, 1.0, True
+        self._states = np.zeros(POLES * n)  # of one filter after the other
 
     def reset(self):
         """Begin anew: the next input is passed as it is."""
-        self._kept = None
+        self._fresh = True
 
     def resume(self, other):
-        """Go on from another one's states."""
+        """Go on from another one's states, if it has any."""
         self._states[:] = other._states
-        self._kept = other._kept if self._corner else None
+        self._fresh = other._fresh or not other._corner
+
+    def shift(self, torque):
+        """What is passed is more by a torque (n,) from now on, without delay: what comes in is, too."""
+        self._states += np.tile(torque, POLES)
 
     def advance(self, dt):
         """The next input comes `dt` [s] after the last one."""
@@ -48,7 +52,7 @@ class LowPass:
 
     def state_space(self, dt):
         r"""Of samples `dt` [s] apart: :math:`w' = A w + B x,\; v = C w + D x`; four matrices."""
-        n, kept = self._states.shape[1], np.exp(-self._corner * dt)
+        n, kept = self._states.size // POLES, np.exp(-self._corner * dt)
         rows, through = np.zeros((n, POLES * n)), np.eye(n)
         A, B = np.zeros((POLES * n, POLES * n)), np.zeros((POLES * n, n))
         for k in range(POLES):
@@ -62,12 +66,13 @@ class LowPass:
         """Pass a torque, shape (n,), in place."""
         if not self._corner:
             return torque
-        for state in self._states:
-            if self._kept is None:
-                state[:] = torque
-            else:
-                state -= torque
-                state *= self._kept
-                state += torque
-                torque[:] = state
+        if self._fresh:
+            self._fresh = False
+            self._states[:] = np.tile(torque, POLES)
+            return torque
+        for state in self._states.reshape(POLES, -1):
+            state -= torque
+            state *= self._kept
+            state += torque
+            torque[:] = state
         return torque

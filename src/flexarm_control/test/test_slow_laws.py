@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
+from flexarm_control.component import at_rest
 from flexarm_control.composite.design import SLOW, design, design_law
 from flexarm_control.motions import profiles
 from flexarm_control.slow.payload_model import PayloadModel
@@ -743,3 +744,28 @@ def test_joint_pids_integral_ends_at_its_limit_and_waits_while_the_torque_is_bey
     law.saw(np.array([-6.0, -3.0]))  # the error leads back inside, and farther out
     law.advance(0.01)
     assert_allclose(law.integral, [0.05, -0.05], rtol=1e-12)
+
+
+@pytest.mark.parametrize("bandwidth", [0.0, 50.0])
+def test_a_torque_that_the_integral_takes_over_does_not_go_through_the_low_pass(arm_r, bandwidth):
+    gains = {"stiffness": [9.0], "damping": [1.0], "integral": [2.0], "bandwidth": bandwidth}
+    law, still = law_of("joint_pid", arm_r, **gains), np.zeros(1)
+    for _ in range(20):
+        law.advance(1e-3)
+        before = law.feedback(np.array([0.01]), still, at_rest(still)).copy()
+    taken = law.absorb(np.array([0.4]))
+    assert_allclose(taken, 0.4)
+    law.advance(1e-3)
+    after = law.feedback(np.array([0.01]), still, at_rest(still))
+    assert_allclose(after, before + 0.4, atol=1e-3)
+
+
+def test_a_low_pass_that_takes_over_from_none_begins_with_what_it_gets(arm_r):
+    gains, still = {"stiffness": [9.0], "damping": [1.0], "integral": [2.0]}, np.zeros(1)
+    old = law_of("joint_pid", arm_r, **gains)
+    new = law_of("joint_pid", arm_r, **gains, bandwidth=50.0)
+    old.advance(1e-3)
+    before = old.feedback(np.array([0.01]), still, at_rest(still)).copy()
+    new.resume(old)
+    new.advance(1e-3)
+    assert_allclose(new.feedback(np.array([0.01]), still, at_rest(still)), before)

@@ -25,6 +25,7 @@ def measured(torques, delay, noise=0.0, skip=()):
         mean = (1.0 - part) * acting[at[0]] + part * acting[at[1]]
         meter.add(mean + noise * draw.standard_normal(mean.shape), j - last, H)
         meter.note(torque)
+        meter.judge()
         last = j
     return meter
 
@@ -78,6 +79,7 @@ def test_a_delay_that_jumps_between_two_periods_is_their_mean():
     for j, torque in enumerate(torques):
         meter.add(torques[max(j - 2 - j % 2, 0)], 1, H)
         meter.note(torque)
+        meter.judge()
     assert meter.delay == pytest.approx(1.5 * H, abs=0.1 * H)
 
 
@@ -92,6 +94,7 @@ def test_an_interruption_and_another_period_begin_the_measurement_anew(interrupt
             interrupt(meter)
         meter.add(torques[max(j - 2, 0)], 1, H)  # a period late
         meter.note(torque)
+        meter.judge()
         if 200 <= j < 200 + LAGS:
             assert meter.count == found > 5
     assert meter.count > found + 5 and meter.delay == pytest.approx(H, abs=1e-9)

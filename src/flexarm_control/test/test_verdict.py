@@ -41,7 +41,8 @@ def test_with_true_rates_it_is_the_full_order_loop(arm_r, fast, delay):
 
 
 @pytest.mark.parametrize("velocity", [False, True])
-def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity):
+@pytest.mark.parametrize("bandwidth", [0.0, 60.0])
+def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity, bandwidth):
     n, m, q = 2, 4, np.array([0.3, 0.5])
     K = np.zeros((n, 3 * n + 2 * m))
     gains = {"stiffness": [20.0, 5.0], "damping": [6.0, 1.5], "integral": [8.0, 2.0]}
@@ -51,15 +52,15 @@ def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity
     K[:, 3 * n :] = -F
     observer = {"bandwidth": 300.0, "joint_velocity_bandwidth": 200.0}
     law = design(
-        two_link, {"type": "joint_pid", **gains}, {"type": "fixed_gain", "gain": F.ravel().tolist()},
+        two_link, {"type": "joint_pid", **gains, "bandwidth": bandwidth},
+        {"type": "fixed_gain", "gain": F.ravel().tolist(), "bandwidth": bandwidth},
         {"type": "reference"}, NO_CHECK,
     )  # fmt: skip
     made = linear_controller(
         law, observe(two_link, "filtered_derivative", observer), q, T, Source(velocity)
     )
-    loop = sampled_loop(
-        two_link, two_link, q, Sampling(T, 0.0015, np.inf if velocity else 200.0, 300.0)
-    )
+    corners = np.inf if velocity else 200.0, 300.0, bandwidth or np.inf
+    loop = sampled_loop(two_link, two_link, q, Sampling(T, 0.0015, *corners))
     z = np.linalg.eigvals(loop.F - loop.G @ (K @ loop.N))
     found = np.linalg.eigvals(WholeLoop(made, 0.0015).matrix())
     for pole in z[np.abs(z) > 0.5]:

@@ -594,5 +594,6 @@ def test_the_controller_measures_the_delay_of_its_loop(delay):
         if k == 20:
             loop.controller.offer(trajectory)
         loop._advance(loop.controller.torque if enabled else None)
+        loop.controller.learn()
     assert loop.controller.torque_delay.delay == pytest.approx(delay, abs=1e-8)
     assert loop.controller.period == pytest.approx(1e-3)

@@ -86,7 +86,7 @@ class ArmController:
     controller_id : int
         Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
     payload : PayloadEstimator or None
-        What `weigh` learns of the payload; None: `payload_estimate` is off.
+        What `learn` finds of the payload; None: `payload_estimate` is off.
     """
 
     def __init__(self, model, law, settings, start_tolerance=0.01):
@@ -140,8 +140,9 @@ class ArmController:
 
     # Payload -------------------------------------------------------------------------------------
 
-    def weigh(self):
-        """Learn the payload from the last sample; call once the torque is sent."""
+    def learn(self):
+        """Learn the loop's delay and the payload from the last samples; call once the torque is sent."""
+        self.torque_delay.judge()
         if self.payload is not None and self.enabled:
             self.payload.update(self.reference.resting is not None)
 

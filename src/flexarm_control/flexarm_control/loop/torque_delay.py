@@ -78,16 +78,19 @@ class TorqueDelay:
             return
         for _ in range(min(count - 1, SENT)):
             self.note(self._sent[self._now % SENT])
-        self._reported[self._size, 0], self._at[self._size] = reported, self._now
-        self._size += 1
         if self._size == BLOCK:
             self._size = 0
-            first = int(self._at[0, 0])
-            if first > LAGS + 1 and self._now - first + LAGS + 2 <= SENT:
-                self._judge()
+        self._reported[self._size, 0], self._at[self._size] = reported, self._now
+        self._size += 1
 
-    def _judge(self):
-        """The delay that a whole block shows, if it shows one."""
+    def judge(self):
+        """Take the delay from a block that is whole, if it shows one; call once the torque is sent."""
+        if self._size < BLOCK:
+            return
+        self._size = 0
+        first = int(self._at[0, 0])
+        if first <= LAGS + 1 or self._now - first + LAGS + 2 > SENT:
+            return
         u, r, d = self._u, self._rest, self._change
         np.take(self._sent, (self._at - self._ages) % SENT, axis=0, out=u)
         np.subtract(self._reported, u[:, :-1], out=r)

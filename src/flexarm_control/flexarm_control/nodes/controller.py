@@ -135,7 +135,7 @@ class ControllerNode(ArmNode):
         self._report.answered(took)
         if enabled:
             core.answered_by.look_ahead()
-            core.weigh()
+            core.learn()
             if (payload := core.payload_wanted) is not None:
                 self._designs.carry(payload)
 

@@ -20,6 +20,7 @@ from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_dynamics.linear import linear_plant, sampled, state_at_rest, static_torque
 
 from ..loop.samples import ArmSample, SampleOrder
+from ..low_pass import LowPass
 from ..trajectory import ReferenceGenerator
 from .loop import measured_amplitudes
 
@@ -85,7 +86,9 @@ class _Asked:
         observer.observer.reset()
         law.reset()
         law.limit = np.full(n, np.inf)
-        self.parts = [observer, observer.observer, law.slow, law.fast]
+        laws = [law.slow, law.fast]
+        filters = [f for part in laws for f in vars(part).values() if isinstance(f, LowPass)]
+        self.parts = [observer, observer.observer, *laws, *filters]
         self._converge()
         self.kept = [(part, _arrays(part), dict(vars(part))) for part in self.parts]
         self.order, self.begun = copy.copy(observer._order), self.count

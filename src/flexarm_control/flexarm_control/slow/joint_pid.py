@@ -96,7 +96,9 @@ class JointPid(SlowLaw):
         before = self.integral.copy()
         self.integral += np.where(self.gain > 0.0, torque, 0.0)
         np.clip(self.integral, -self._most, self._most, out=self.integral)
-        return self.integral - before
+        taken = self.integral - before
+        self._low_pass.shift(taken)
+        return taken
 
     def saw(self, torque):
         self._beyond[:] = np.sign(torque) * (np.abs(torque) > self._limit)

@@ -174,15 +174,15 @@ class ClosedLoop:
         except MessageError as error:
             self.controller.distrust(str(error))
             enabled = False
-        self._weigh()
+        self._learn()
         if self.bag is not None:
             self.bag.answered(measured, enabled)
         return enabled
 
-    def _weigh(self):
+    def _learn(self):
         """What the controller node does once the torque is sent."""
         controller = self.controller
-        controller.weigh()
+        controller.learn()
         if (payload := controller.payload_wanted) is not None:
             try:
                 controller.carry(self._law_for(payload))

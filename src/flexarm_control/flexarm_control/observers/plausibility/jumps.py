@@ -29,7 +29,7 @@ DEVIATIONS, GROWTH = 6.0, 2.0
 EXCESS_TIME, RARE_TIME = 0.02, 1.0
 #: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
 FREQUENT = 8.0
-#: Over more lost samples in a row the deflections can't be extrapolated, nor over some in which the fastest mode turns by
+#: Over more lost samples in a row deflections can't be extrapolated, nor over some in which the fastest mode turns by
 #: more than this [rad].
 MAX_STEPS, MAX_TURN = 3, 0.5
 #: Fraction of the largest torque that may have acted on the joints in lost samples, unreported [-].
