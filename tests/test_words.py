@@ -44,8 +44,6 @@ OUT = (
 
 #: What may stay, as it stands in a line, and why.
 ALLOWED = (
-    (r"--contenders", "the old name of an option of `flexarm compare`"),
-    (r"\"(contenders|subjects)\"", "keys of docs/comparison.json, which users read"),
     (r"saturation_share", "a key of the report's JSON"),
     (r"drop share=", "the syntax of a fault, which users write"),
 )

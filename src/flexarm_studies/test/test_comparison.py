@@ -315,12 +315,12 @@ def stored(residual=0.5, settling=0.1):
         "budget": 3,
     }
     case["combinations"] = [parts | {"row": {"refused": "a pole", "cost": 1e4}}]
-    case["contenders"] = {
+    case["controllers"] = {
         controllers.SHIPPED: {"row": row, "noisy": row, **fill, "gains": {}},
         controllers.PID: {"row": pid, "noisy": {"lost": "far off", "cost": 1e3}, **fill},
         "full-state LQR": {"row": lqr, "noisy": lqr, **fill},
     }
-    return {"seed": 0, "subjects": [case]}
+    return {"seed": 0, "cases": [case]}
 
 
 def test_tables_of_stored_rows(tmp_path, flexarm):
@@ -340,23 +340,23 @@ def test_tables_of_stored_rows(tmp_path, flexarm):
 
 
 def test_a_baseline_that_is_better_in_both_is_named():
-    verdicts = report.verdicts(stored(residual=2.0)["subjects"][0])
+    verdicts = report.verdicts(stored(residual=2.0)["cases"][0])
     assert verdicts[-1].endswith(" residual: full-state LQR.")
-    half = stored(residual=2.0)["subjects"][0]
-    half["contenders"]["full-state LQR"]["row"]["rms_tip_mm"] = 9.0
+    half = stored(residual=2.0)["cases"][0]
+    half["controllers"]["full-state LQR"]["row"]["rms_tip_mm"] = 9.0
     assert report.verdicts(half)[-1].startswith("No baseline beats")
-    late = report.verdicts(stored(settling=None)["subjects"][0])
+    late = report.verdicts(stored(settling=None)["cases"][0])
     assert late[0] == "The shipped controller does not settle within 2 s."
 
 
 def test_runs_are_merged_and_must_agree():
     one, other = stored(), stored()
-    del one["subjects"][0]["contenders"][controllers.PID]
-    one["subjects"][0]["combinations"] = []
+    del one["cases"][0]["controllers"][controllers.PID]
+    one["cases"][0]["combinations"] = []
     whole = command.merged([one, other])
-    assert set(whole["subjects"][0]["contenders"]) == set(other["subjects"][0]["contenders"])
-    assert len(whole["subjects"][0]["combinations"]) == 1
-    other["subjects"][0]["budget"] = 9
+    assert set(whole["cases"][0]["controllers"]) == set(other["cases"][0]["controllers"])
+    assert len(whole["cases"][0]["combinations"]) == 1
+    other["cases"][0]["budget"] = 9
     with pytest.raises(FlexarmError, match="budget"):
         command.merged([one, other])
 
@@ -370,7 +370,7 @@ def test_a_file_without_markers_is_refused(tmp_path):
 
 def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
     def interrupted(keep, function, calls, *where):
-        found = stored()["subjects"][0]["contenders"][controllers.PID]
+        found = stored()["cases"][0]["controllers"][controllers.PID]
         keep.append({"sample": "R: joint PID", "found": found})
         yield 1, None
         raise KeyboardInterrupt
@@ -380,7 +380,7 @@ def test_an_interrupted_run_leaves_what_is_done(tmp_path, monkeypatch):
     words = ["--arms", "R", "--controllers", "composite (shipped),joint PID", "--no-combinations"]
     with pytest.raises(KeyboardInterrupt):
         command.main([*words, "--json", str(out)])
-    assert list(command.load(out)["subjects"][0]["contenders"]) == [controllers.PID]
+    assert list(command.load(out)["cases"][0]["controllers"]) == [controllers.PID]
 
 
 def test_the_command_runs(tmp_path, capsys, monkeypatch):
@@ -389,10 +389,10 @@ def test_the_command_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(command, "QUICK_WINDOW", 0.1)
     out = tmp_path / "rows.json"
     words = ["--quick", "--workers", "1", "--no-combinations", "--json", str(out)]
-    command.main([*words, "--contenders", "composite (shipped),joint PID, ZV shaper"])
+    command.main([*words, "--controllers", "composite (shipped),joint PID, ZV shaper"])
     found = json.loads(out.read_text())
-    (case,) = found["subjects"]
-    assert set(case["contenders"]) == {controllers.SHIPPED, "joint PID, ZV shaper"}
-    assert case["contenders"]["joint PID, ZV shaper"]["simulations"] == command.QUICK_BUDGET
-    assert "residual_mm" in case["contenders"][controllers.SHIPPED]["row"]
+    (case,) = found["cases"]
+    assert set(case["controllers"]) == {controllers.SHIPPED, "joint PID, ZV shaper"}
+    assert case["controllers"]["joint PID, ZV shaper"]["simulations"] == command.QUICK_BUDGET
+    assert "residual_mm" in case["controllers"][controllers.SHIPPED]["row"]
     assert "joint PID, ZV shaper" in capsys.readouterr().out

@@ -258,9 +258,9 @@ def test_compare_judges_on_uncertain_plants_and_goes_on(tmp_path, monkeypatch, c
     words = ["--arms", "R", "--controllers", "shipped,pid", "--plants", "nominal,payload x1.3"]
     words += ["--no-combinations", "--workers", "1", "--json", str(out), "--out", str(kept)]
     command.main(words)
-    (case,) = command.load(out)["subjects"]
+    (case,) = command.load(out)["cases"]
     rows = {(r["controller"], r["variant"]): r for r in case["plants"]}
-    assert len(rows) == 4 and case["contenders"] == {}
+    assert len(rows) == 4 and case["controllers"] == {}
     own = [rows["shipped", v]["peak_joint_error_deg"] for v in ("nominal", "payload x1.3")]
     assert 0.0 < own[0] < own[1]
     text = capsys.readouterr().out

@@ -61,7 +61,6 @@ def add_arguments(parser):
     add("--arms", default=arms, help=f"arms, separated by commas ({arms})")
     add(
         "--controllers",
-        "--contenders",
         help=f"controllers, separated by commas; or none (all); on the uncertain set: {','.join(ON_PLANTS)}",
     )
     names = ",".join(plants.VARIANTS)
@@ -123,7 +122,7 @@ def load(path):
     """Stored rows; a file that --json did not write is refused."""
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
-        found["subjects"][0]["contenders"]
+        found["cases"][0]["controllers"]
         return found
     except (ValueError, LookupError, TypeError) as error:
         raise FlexarmError(f"was not written by --json: {error}", field=str(path)) from None
@@ -133,19 +132,19 @@ def merged(runs):
     """Merge `runs` into one comparison: rows of the same arm, which must agree in motion, rate, window and so on."""
     by_arm = {}
     for run_ in runs:
-        for case in run_["subjects"]:
-            empty = {"contenders": {}, "combinations": [], "plants": []}
+        for case in run_["cases"]:
+            empty = {"controllers": {}, "combinations": [], "plants": []}
             whole = by_arm.setdefault(case["arm"], case | empty)
             for name in ("motion", "rate_Hz", "window_s", "budget"):
                 if whole[name] != case[name] or runs[0]["seed"] != run_["seed"]:
                     raise FlexarmError(f"the runs differ in {name} or seed", field=case["arm"])
-            whole["contenders"] |= case["contenders"]
+            whole["controllers"] |= case["controllers"]
             whole["combinations"] += case["combinations"]
             whole["plants"] += case.get("plants", [])
     order = [s.arm for s in cases.CASES]
     return {
         "seed": runs[0]["seed"],
-        "subjects": sorted(by_arm.values(), key=lambda s: order.index(s["arm"])),
+        "cases": sorted(by_arm.values(), key=lambda s: order.index(s["arm"])),
     }
 
 
@@ -282,7 +281,7 @@ def study(options, progress, each=lambda found: None):
     keep = Store(options.out, Specification(options.seed, kinds))
 
     def gathered():
-        return {"seed": options.seed, "subjects": [_of_arm(s, jobs, keep.results) for s in wanted]}
+        return {"seed": options.seed, "cases": [_of_arm(s, jobs, keep.results) for s in wanted]}
 
     calls = [(job, options.seed) for job in jobs if label(job) not in keep.results]
     done = len(jobs) - len(calls)
@@ -307,7 +306,7 @@ def _of_arm(case, jobs, results):
         "rate_Hz": case.rate,
         "window_s": case.window,
         "budget": case.budget,
-        "contenders": {what: found for what, found in mine if isinstance(what, str)},
+        "controllers": {what: found for what, found in mine if isinstance(what, str)},
         "combinations": [
             dict(zip(combinations.PARTS, what, strict=True)) | found
             for what, found in mine

@@ -41,7 +41,7 @@ def settled(row, window):
 
 def text(found):
     """All tables, Markdown."""
-    return "\n\n".join(part for case in found["subjects"] for part in _case(case))
+    return "\n\n".join(part for case in found["cases"] for part in _case(case))
 
 
 def _case(case):
@@ -56,14 +56,14 @@ def _case(case):
         yield f"### {case['arm']}, uncertain plants\n\nMedian and worst of {others} plants; {uncertain.legend(rows)}."
         yield "\n".join(uncertain.table(rows))
         yield uncertain.bullets(uncertain.verdicts(rows))
-    if case["contenders"] or case["combinations"]:
+    if case["controllers"] or case["combinations"]:
         yield f"### {case['arm']}, on the controllers' model"
-    if case["contenders"]:
+    if case["controllers"]:
         yield _table(
             ("controller", *HEAD, "with noise: residual [mm]", "settled [s]", "cost"),
-            [_candidate(name, c, window) for name, c in case["contenders"].items()],
+            [_candidate(name, c, window) for name, c in case["controllers"].items()],
         )
-        yield _gains(case["contenders"])
+        yield _gains(case["controllers"])
         yield "\n".join(f"- {line}" for line in verdicts(case))
     if case["combinations"]:
         parts = ("slow", "fast", "manifold", "feedforward")
@@ -99,7 +99,7 @@ def _gains(controllers):
 
 def verdicts(case):
     """Conclusions from the rows, one sentence each."""
-    controllers, window = case["contenders"], case["window_s"]
+    controllers, window = case["controllers"], case["window_s"]
     if SHIPPED not in controllers:
         return []
     own = controllers[SHIPPED]["row"]

@@ -40,7 +40,11 @@ def add_arguments(parser):
     add("--seed", type=int, default=0, help="of the arms and of the noise (0)")
     workers.add_arguments(add)
     usual, names = ",".join(USUAL), ", ".join(CONTROLLERS)
-    add("--controllers", default=usual, help=f"controllers, separated by commas ({usual}) of {names}")
+    add(
+        "--controllers",
+        default=usual,
+        help=f"controllers, separated by commas ({usual}) of {names}",
+    )
     usual, names = ",".join(PLANTS), ", ".join(VARIANTS)
     add("--variants", default=usual, help=f"plants, separated by commas ({usual}) of {names}")
     add(
