@@ -214,8 +214,10 @@ class Arm:
         return self.state.supervisor_state not in (CompositeState.INACTIVE, CompositeState.FAULT)
 
     def wait_ready(self):
-        """Until the controller sends torque, and every topic of the line has been found."""
+        """Until the driver applies the controller's torque, and every topic of the line has been found."""
         self.bench.wait_for("the controller to be ready", self.ready)
+        named = lambda: self.measured.newest and self.measured.newest.controller_id
+        self.bench.wait_for("the driver to apply the controller's torque", named)
         line = (self.measured, self.estimated, self.torques)
         self.bench.wait_for("something on every topic", lambda: all(t.messages for t in line))
 

@@ -539,6 +539,18 @@ def test_after_a_time_on_the_safe_action_torque_returns_in_a_ramp_and_the_motion
     assert core.reason.startswith("the driver has applied no torque for 0.1 s: torque returns")
 
 
+def test_a_driver_that_takes_the_torque_late_for_the_first_time_gets_it_in_a_ramp(arm_r):
+    core = started(arm_r, Scripted(*[5.0] * 400), return_time=0.065)
+    core.controller_id = 7
+    core.offer(motion(end=5.0, duration=9.0))
+    assert all(applying(core, range(1, 100), controller_id=0))
+    assert core.torque[0] == 5.0
+    assert all(applying(core, range(100, 120), controller_id=7))
+    assert 0.0 < core.torque[0] < 0.5
+    assert core.interruptions == 1 and not core.reference.active
+    assert core.reason.startswith("the driver has applied no torque for 0.099 s: torque returns")
+
+
 def test_another_driver_that_confirms_no_controller_may_follow_one_that_does(arm_r):
     core = started(arm_r)
     core.controller_id = 7

@@ -5,6 +5,9 @@ A driver that refuses, clips or replaces the torque leaves the arm on its safe a
 Two reports show it. The torque that it says it applied must lie between the least and the largest sent in the last
 `SENT` answers, within `torque_mismatch` times the torque limit; so no delay needs to be known. A driver that
 confirms its controller (``controller_id``) must name this one. What contradicts for `PATIENCE` is a refusal.
+
+A driver names its controller one sample before it applies its torque. When it does so for the first time long after
+the first torque was sent (DDS had not found it yet, say), the torque has to begin anew: the reference may be far away.
 """
 
 import numpy as np
@@ -57,7 +60,7 @@ class Applied:
         """The first torque (n,) [N m] after an interruption."""
         self._sent[:] = torque
         self._at = 0
-        self._other_for = self._wrong_for = 0.0
+        self._other_for = self._wrong_for = self._unconfirmed_for = 0.0
 
     def note(self, torque):
         """Remember a torque (n,) [N m] that is sent."""
@@ -76,6 +79,7 @@ class Applied:
             Time since the last sample [s].
         """
         self._other_for = self._other_for + dt if self._is_other(sample, controller_id) else 0.0
+        self._unconfirmed_for = 0.0 if self._confirms else self._unconfirmed_for + dt
         if self._other_for > PATIENCE:
             if sample.controller_id:
                 return f"the driver applies the torque of another controller ({sample.controller_id}): stop it"
@@ -102,7 +106,9 @@ class Applied:
 
     def back_after(self, sample, controller_id):
         """How long the driver applied none of this controller's torque, if it applies it again by this sample [s]."""
-        return self._other_for if controller_id and sample.controller_id == controller_id else 0.0
+        if not controller_id or sample.controller_id != controller_id:
+            return 0.0
+        return max(self._other_for, self._unconfirmed_for)
 
     def _mismatch(self, reported):
         """The joint whose reported torque is none of those sent; None where all are, or are unknown."""
