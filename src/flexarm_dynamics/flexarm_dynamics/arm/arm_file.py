@@ -2,22 +2,16 @@
 """Arm files: YAML, validated; every error names its field by its path, as ``links[0].length``.
 
 A file gives an `Arm` or an `ArmFileError`, never half an arm.
-
-PyYAML reads them, and `_check_keys` refuses a key that is given twice. ruamel.yaml refuses one too, but without its
-path, takes three times as long, and reads YAML 1.1 differently: `direction: y` would be `true`, `name: 1e3` a number.
 """
 
-import difflib
 import math
 import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from ..errors import ArmFileError
-from ..shown import number, show
 from .description import (
     DIRECTIONS,
     MAX_MODES,
@@ -32,201 +26,12 @@ from .description import (
     Link,
     Payload,
 )
-from .units import SI_UNIT, to_si
+from .entries import Section, kind_of, read_yaml, value_error
 
-#: Largest number in a file, in SI; powers and products of smaller ones are finite.
-MAX_NUMBER = 1e30
 #: Largest resolution of a gauge's bridge [bit].
 MAX_BITS = 32
 #: Largest full scale of a gauge [-].
 MAX_STRAIN = 0.1
-
-
-def _read_yaml(text, where):
-    """The file as dicts, lists and scalars; refuses a key that is given twice."""
-    try:
-        loader = yaml.SafeLoader(text)
-        root = loader.get_single_node()
-        if root is None:
-            return None
-        _check_keys(root, "", set())
-        return loader.construct_document(root)
-    except ArmFileError:
-        raise
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" line {mark.line + 1}" if mark else ""
-        reason = getattr(error, "problem", None) or error
-        raise ArmFileError(where + line, f"not YAML: {reason}") from None
-    except Exception as error:
-        # What PyYAML lets through on a scalar that is not what its tag says, or on endless nesting.
-        raise ArmFileError(where, f"not YAML: {type(error).__name__}: {error}") from None
-
-
-def _check_keys(node, path, visited):
-    if id(node) in visited:  # an alias
-        return
-    visited.add(id(node))
-    if isinstance(node, yaml.SequenceNode):
-        for i, child in enumerate(node.value):
-            _check_keys(child, f"{path}[{i}]", visited)
-    elif isinstance(node, yaml.MappingNode):
-        seen = set()
-        for key, child in node.value:
-            line = f"line {key.start_mark.line + 1}"
-            if key.tag != "tag:yaml.org,2002:str" or not key.value:
-                what = repr(key.value) if isinstance(key, yaml.ScalarNode) else "a collection"
-                raise ArmFileError(path or line, f"the key {what} ({line}) is not a name")
-            at = f"{path}.{key.value}" if path else key.value
-            if key.value in seen:
-                raise ArmFileError(at, f"given twice ({line})")
-            seen.add(key.value)
-            _check_keys(child, at, visited)
-
-
-class _Section:
-    """A mapping of the file, which knows its path and which of its keys were read."""
-
-    def __init__(self, data, path, system):
-        if not isinstance(data, dict):
-            raise ArmFileError(path or "file", f"a mapping is wanted, not {_kind(data)}")
-        self.data, self.path, self.system = data, path, system
-        self.read = set()
-
-    def at(self, key):
-        name = number(key) if isinstance(key, str) else show(key)
-        return f"{self.path}.{name}" if self.path else name
-
-    def error(self, key, problem, **more):
-        """The error about one of its fields."""
-        return ArmFileError(self.at(key), problem, **more)
-
-    def has(self, key):
-        self.read.add(key)
-        return self.data.get(key) is not None
-
-    def raw(self, key, default=None, required=False):
-        if not self.has(key):
-            if required:
-                raise self.error(key, "missing", hint=self._near(key))
-            return default
-        return self.data[key]
-
-    def _near(self, key):
-        """A hint when a key not yet read looks like the missing one."""
-        close = difflib.get_close_matches(key, [k for k in self.data if k not in self.read], 1)
-        return f"is {close[0]!r} meant to be it?" if close else ""
-
-    def number(self, key, dimension="none", default=None, low=None, positive=False):
-        """A finite number in SI; `default` None makes it required."""
-        value = self.raw(key, default, required=default is None)
-        if not self.has(key):
-            return value
-        value = _number(value, self.at(key))
-        if positive and not value >= 1.0 / MAX_NUMBER:
-            unit = "" if SI_UNIT[dimension] == "-" else f" {SI_UNIT[dimension]}"
-            limit = f"at least {1.0 / MAX_NUMBER:g}" if value > 0.0 else f"greater than 0{unit}"
-            raise self.error(key, "is too small", value=value, limit=limit)
-        if low is not None and value < low:
-            raise self.error(key, "is too small", value=value, limit=f"at least {low:g}")
-        return value * to_si(self.system, dimension)
-
-    def vector(self, key, length, dimension="none", default=None):
-        """A tuple of `length` finite numbers in SI."""
-        value = self.raw(key, default, required=default is None)
-        if not self.has(key):
-            return value
-        if not isinstance(value, list) or len(value) != length:
-            what = f"{len(value)} values" if isinstance(value, list) else _kind(value)
-            raise self.error(key, f"a list of {length} numbers is wanted, not {what}")
-        factor = to_si(self.system, dimension)
-        return tuple(_number(v, f"{self.at(key)}[{i}]") * factor for i, v in enumerate(value))
-
-    def integer(self, key, default=None, low=None, high=None):
-        value = self.raw(key, default, required=default is None)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise _error(self.at(key), value, "is not an integer")
-        if (low is not None and value < low) or (high is not None and value > high):
-            raise _error(self.at(key), value, "is out of range", limit=f"{low} to {high}")
-        return value
-
-    def text(self, key, default=None, choices=None):
-        value = self.raw(key, default, required=default is None)
-        if not isinstance(value, str):
-            raise _error(self.at(key), value, "is not text")
-        if choices and value not in choices:
-            limit, hint = ", ".join(choices), _meant(value, choices)
-            problem = "is not one of the choices"
-            raise self.error(key, problem, value=value, limit=limit, hint=hint)
-        return value
-
-    def flag(self, key):
-        value = self.raw(key, False)
-        if not isinstance(value, bool):
-            raise _error(self.at(key), value, "is neither true nor false")
-        return value
-
-    def name(self):
-        value = self.text("name")
-        if not value.strip():
-            raise self.error("name", "empty")
-        return value
-
-    def section(self, key):
-        return _Section(self.raw(key, required=True), self.at(key), self.system)
-
-    def sections(self, key, required=False):
-        value = self.raw(key, [], required)
-        if not isinstance(value, list):
-            raise self.error(key, f"a list is wanted, not {_kind(value)}")
-        return [_Section(v, f"{self.at(key)}[{i}]", self.system) for i, v in enumerate(value)]
-
-    def done(self):
-        """Refuse a field that was not read: a misspelt one is an error, not a default."""
-        for key in self.data:
-            if key not in self.read:
-                known = sorted(self.read)
-                limit, hint = f"known here: {', '.join(known)}", _meant(str(key), known)
-                raise self.error(key, "no such field", limit=limit, hint=hint)
-
-
-def _meant(name, known):
-    """A hint at the known name that is spelt like this one."""
-    close = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {close[0]!r}?" if close else ""
-
-
-def _error(path, value, problem, **more):
-    """The error for a value; a collection, or none at all, is shown by its kind."""
-    if isinstance(value, (str, bool, float)) or _kind(value) == show(value):
-        return ArmFileError(path, problem, value=value, **more)
-    return ArmFileError(path, f"{_kind(value)} {problem}", **more)
-
-
-def _kind(value):
-    if value is None:
-        return "nothing"
-    if isinstance(value, dict):
-        return "a mapping"
-    if isinstance(value, int) and value.bit_length() > 64:
-        return "an integer of more than 64 bits"
-    return "a list" if isinstance(value, list) else show(value)
-
-
-def _number(value, path):
-    if isinstance(value, str):
-        # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
-        try:
-            value = float(value)
-        except ValueError:
-            raise ArmFileError(path, "is not a number", value=value) from None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _error(path, value, "is not a number")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ArmFileError(path, "is not finite", value=value)
-    if abs(value) > MAX_NUMBER:
-        raise _error(path, value, "is too large", limit=f"at most {MAX_NUMBER:g}")
-    return float(value)
 
 
 def _friction(joint):
@@ -468,12 +273,14 @@ def _unique(things, path):
 def _observed(s, modes, gauges):
     names = s.raw("observed_modes", [m.name for m in modes])
     if not isinstance(names, list):
-        raise ArmFileError("observed_modes", f"a list of mode names is wanted, not {_kind(names)}")
+        raise ArmFileError(
+            "observed_modes", f"a list of mode names is wanted, not {kind_of(names)}"
+        )
     known = {m.name: m for m in modes}
     for i, name in enumerate(names):
         if not isinstance(name, str) or name not in known:
             problem, limit = "is not a mode of this arm", ", ".join(known)
-            raise _error(f"observed_modes[{i}]", name, problem, limit=limit)
+            raise value_error(f"observed_modes[{i}]", name, problem, limit=limit)
         if name in names[:i]:
             raise ArmFileError(f"observed_modes[{i}]", "given twice", value=name)
     for key in {(known[n].link, known[n].direction) for n in names}:
@@ -508,7 +315,7 @@ def parse(text, where="arm"):
     ArmFileError
         Naming the field by its path, the value, and what is wanted.
     """
-    top = _Section(_read_yaml(text, where), "", "si")
+    top = Section(read_yaml(text, where), "", "si")
     top.system = top.text("units", "si", ("si", "imperial"))
     joints = tuple(_joint(s) for s in top.sections("joints", required=True))
     links = tuple(_link(s) for s in top.sections("links", required=True))
