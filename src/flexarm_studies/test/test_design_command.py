@@ -11,7 +11,7 @@ import pytest
 from flexarm_bringup import cli
 from flexarm_control.robust import cache
 from flexarm_studies.commands.design import _yaml
-from flexarm_studies.loop import parameter_files
+from flexarm_studies.loop import parameter_files, scenario
 from flexarm_studies.random_arms import generator
 
 
@@ -193,3 +193,32 @@ def test_a_delay_that_the_design_does_not_bear_is_reported(tmp_path, capsys, mon
     ]
     main([*words, "--delay", "0.05"])
     assert "longer than the" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "residual"),
+    [
+        ("two_link_designed", "quintic:to=0.8;0.8,duration=4", 1.0),
+        (
+            "long_reach_designed",
+            "quintic:from=0;1.2;0.8;-0.8,to=1.0472;0.1528;1.8472;0.2472,duration=3",
+            4.0,
+        ),
+    ],
+)
+def test_shipped_designs_of_several_links_bear_a_late_torque_and_a_heavier_payload(
+    name, motion, residual
+):
+    arm = name.removesuffix("_designed")
+    loop = scenario.Scenario(
+        arm,
+        scenario.parameters(name),
+        motion,
+        payload_scale=4.0 / 3.0,
+        rate=500.0,
+        delay=0.002,
+        window=3.0,
+    )
+    metrics = scenario.run_loop(loop)[1]
+    assert np.rad2deg(max(metrics["peak_joint_error_rad"])) < 10.0
+    assert metrics["residual_tip_rms_mm"] < residual

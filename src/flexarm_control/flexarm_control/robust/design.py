@@ -67,6 +67,8 @@ class Settings:
         Of the search; 1.0 is the default.
     seed : int
         Of the starts.
+    feedforward : str
+        Name of the feed-forward that the controller file takes; the gains do not depend on it.
     """
 
     rate: float = 1000.0
@@ -75,6 +77,7 @@ class Settings:
     configurations: tuple = ()
     effort: float = 1.0
     seed: int = 0
+    feedforward: str = "model"
 
     def __post_init__(self):
         if self.delay is None:
@@ -147,7 +150,7 @@ class Design:
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
-            "feedforward": "model",
+            "feedforward": self.settings.feedforward,
             "slow.type": "joint_pid",
             "slow.stiffness": numbers(np.diag(K[:, :n])),
             "slow.damping": numbers(np.diag(K[:, n : 2 * n])),

@@ -17,7 +17,7 @@ from .options import add_arm_arguments, angles, check_file, in_range, new_path, 
 COMMENTS = {
     "rate": "[Hz] samples per second that the design is for",
     "stability_margin": "[1/s] not checked again without filters and delay, for which these gains are not made",
-    "feedforward": "the nominal arm simulated alongside; preview: planned to end at rest",
+    "feedforward": "model: the nominal arm simulated alongside; preview: planned on receipt to end at rest",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
     "slow.damping": "[N m s/rad]",
@@ -34,7 +34,7 @@ COMMENTS = {
 }
 #: Options that make a design another one.
 OF_THE_DESIGN = (
-    "rate", "delay", "payload", "stiffness", "damping", "gain", "speed", "at", "effort",
+    "rate", "delay", "payload", "stiffness", "damping", "gain", "speed", "at", "effort", "feedforward",
 )  # fmt: skip
 
 
@@ -86,6 +86,12 @@ def add_arguments(parser):
         help="a table of designs of several speeds: decay, what is borne, noise; writes no controller file",
     )
     add("--effort", type=float, default=1.0, help="of the search, 0.1 to 100 (1)")
+    add(
+        "--feedforward",
+        choices=("model", "preview", "none"),
+        default="model",
+        help="of the file: model, or preview, which plans each motion on receipt to end at rest (model)",
+    )
 
 
 def design(options):
@@ -109,6 +115,7 @@ def design(options):
         delay=delay,
         speed=in_range("--speed", options.speed, 0.0, 1.0),
         effort=in_range("--effort", options.effort, 0.1, 100.0),
+        feedforward=options.feedforward,
         configurations=at,
     )
     uncertainty = Uncertainty(
