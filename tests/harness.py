@@ -213,11 +213,13 @@ class Arm:
         """Whether the controller sends torque."""
         return self.state.supervisor_state not in (CompositeState.INACTIVE, CompositeState.FAULT)
 
+    def _confirmed(self):
+        return self.measured.newest and self.measured.newest.controller_id
+
     def wait_ready(self):
         """Until the driver applies the controller's torque, and every topic of the line has been found."""
         self.bench.wait_for("the controller to be ready", self.ready)
-        named = lambda: self.measured.newest and self.measured.newest.controller_id
-        self.bench.wait_for("the driver to apply the controller's torque", named)
+        self.bench.wait_for("the driver to apply the controller's torque", self._confirmed)
         line = (self.measured, self.estimated, self.torques)
         self.bench.wait_for("something on every topic", lambda: all(t.messages for t in line))
 

@@ -376,6 +376,13 @@ LAWS = [
             "if first <= LAGS + 1 or",
             "if first <= 0 or",
         ),
+        (
+            "applied",
+            "a first confirmation that comes late is no interruption",
+            "return max(self._other_for, self._unconfirmed_for)",
+            "return self._other_for",
+            TESTS + "test_arm_controller.py",
+        ),
     ),
     *of(
         "flexarm_control",
