@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How tests are spread over processes, and which of them get a second try."""
 
+import os
+from pathlib import Path
+
 import pytest
 from hypothesis import Phase, settings
 
@@ -42,3 +45,14 @@ def flexarm(capsys):
         return stop.value.code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def real_arm():
+    """Folder of the measured data of a real arm, which are not part of this project; the test is skipped without."""
+    folder = Path(
+        os.environ.get("FLEXARM_REAL_ARM") or Path(__file__).parents[1] / "shared" / "real_arm"
+    )
+    if not (folder / "exp1.csv").is_file():
+        pytest.skip(f"no measured data in {folder}: set FLEXARM_REAL_ARM to their folder")
+    return folder

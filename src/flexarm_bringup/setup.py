@@ -21,6 +21,7 @@ setup(
         # `config` here is a link to the project's own: setuptools takes no file from above the package.
         (f"share/{name}/config/arms", sorted(glob("config/arms/*.yaml"))),
         (f"share/{name}/config/controllers", sorted(glob("config/controllers/*.yaml"))),
+        (f"share/{name}/config/recordings", sorted(glob("config/recordings/*.yaml"))),
     ],
     zip_safe=False,
     entry_points={

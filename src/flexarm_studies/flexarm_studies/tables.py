@@ -3,7 +3,6 @@
 
 import csv
 import io
-import math
 import sys
 from pathlib import Path
 
@@ -32,7 +31,7 @@ def read(path, prefix, names):
     for line, row in zip(lines[1:], rows, strict=True):
         if len(row) != len(wanted):
             raise TableError(f"{len(row)} values for {len(wanted)} columns", field=f"{path}:{line}")
-    table = _numbers(path, lines, header, rows, wanted, finite=True)
+    table = _numbers(path, lines, header, rows, wanted)
     if not table.size:
         raise TableError("no rows below the header", field=str(path))
     back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
@@ -45,54 +44,85 @@ def read(path, prefix, names):
     return table[:, 0], table[:, 1:]
 
 
-def read_columns(path, wanted, optional=()):
-    """The `wanted` columns of a CSV file in any order, shape (k, len(wanted)); others in the file are ignored.
+def cells(path, delimiter=","):
+    """Line numbers and words of the rows of a text file, without empty lines and lines that begin with ``#``.
 
-    Those of them that are `optional` may be missing: NaN. A file that is no table, a missing column, and text that is
-    no number, with its line and column, are refused.
+    Parameters
+    ----------
+    path : str or Path
+    delimiter : str, optional
+        Between words; of blanks any number counts as one. None: the one of ``; tab , blank`` that is first found in the
+        first line.
+
+    Returns
+    -------
+    lines : list of int
+    rows : list of list of str
+
+    Raises
+    ------
+    TableError
+        For a file that is no text.
     """
-    lines, header, rows = _rows(path, wanted)
-    missing = [n for n in wanted if n not in header and n not in optional]
-    if missing:
-        raise TableError(
-            f"no column {', '.join(missing)} (wanted: {', '.join(wanted)})", field=str(path)
-        )
-    return _numbers(path, lines, header, rows, wanted)
-
-
-def _rows(path, wanted):
-    """Line numbers, header and rows of a CSV file, without empty lines."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = [(reader.line_num, row) for reader in [csv.reader(file)] for row in reader]
+            text = ["" if line.lstrip()[:1] == "#" else line for line in file]
+        first = next((line for line in text if line.strip()), "")
+        if delimiter is None:
+            delimiter = next((d for d in ";\t, " if d in first.strip()), ",")
+        reader = csv.reader(text, delimiter=delimiter, skipinitialspace=delimiter == " ")
+        rows = [(reader.line_num, [word.strip() for word in row]) for row in reader]
     except UnicodeDecodeError:
         raise TableError("not a text file", field=str(path)) from None
     except (OSError, csv.Error) as error:
         raise TableError(f"can't be read as a table: {error}", field=str(path)) from None
-    rows = [(line, [word.strip() for word in row]) for line, row in rows if any(row)]
+    rows = [(line, row) for line, row in rows if any(row)]
+    return [line for line, _ in rows], [row for _, row in rows]
+
+
+def _rows(path, wanted):
+    """Line numbers, header and rows of a CSV file, without empty lines."""
+    lines, rows = cells(path)
     if not rows:
         raise TableError(f"empty; its first line must be {','.join(wanted)}", field=str(path))
-    return [line for line, _ in rows], rows[0][1], [row for _, row in rows[1:]]
+    return lines, rows[0], rows[1:]
 
 
-def _numbers(path, lines, header, rows, wanted, finite=False):
-    """The wanted columns, shape (k, len(wanted)); NaN for one that is not there."""
-    table = np.full((len(rows), len(wanted)), np.nan)
-    for j, name in enumerate(wanted):
-        if name not in header:
-            continue
-        at = header.index(name)
-        for i, row in enumerate(rows):
-            where = f"{path}:{lines[i + 1]}: {name}"
-            try:
-                table[i, j] = float(row[at])
-            except IndexError:
-                raise TableError("is missing", field=where) from None
-            except ValueError:
-                raise TableError("is not a number", field=where, value=row[at]) from None
-            if finite and not math.isfinite(table[i, j]):
-                raise TableError("is not finite", field=where, value=float(row[at]))
-    return table
+def _numbers(path, lines, header, rows, wanted):
+    """The wanted columns, shape (k, len(wanted)), finite."""
+    found = [numbers(path, lines[1:], rows, header.index(n), n, blank=False) for n in wanted]
+    return np.column_stack(found)
+
+
+def numbers(path, lines, rows, at, name, blank=True, decimal="."):
+    """Column `at` of `rows`, shape (k,); `lines` are their numbers and `name` is the column's, for messages.
+
+    With `blank` an empty cell and ``nan`` are NaN, else they are refused, as any other number that is not finite.
+    The `decimal` sign may be a comma.
+    """
+    try:
+        values = np.array([float(row[at].replace(decimal, ".") or "nan") for row in rows])
+    except (IndexError, ValueError):
+        numbered = zip(lines, rows, strict=True)
+        values = np.array([_number(path, *row, at, name, decimal) for row in numbered], float)
+    wrong = np.flatnonzero(np.isinf(values) if blank else ~np.isfinite(values))
+    if wrong.size:
+        k, hint = int(wrong[0]), "correct it, or leave the row out"
+        field = f"{path}:{lines[k]}: {name}"
+        raise TableError("is not finite", field=field, value=float(values[k]), hint=hint)
+    return values
+
+
+def _number(path, line, row, at, name, decimal):
+    where = f"{path}:{line}: {name}"
+    if at >= len(row):
+        hint = f"the row has {len(row)} cells: complete it or leave it out"
+        raise TableError("is missing", field=where, hint=hint)
+    try:
+        return float(row[at].replace(decimal, ".") or "nan")
+    except ValueError:
+        hint = "correct it, or leave the cell empty"
+        raise TableError("is not a number", field=where, value=row[at], hint=hint) from None
 
 
 class Steps:

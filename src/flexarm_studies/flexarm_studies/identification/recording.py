@@ -2,7 +2,7 @@
 """A recorded motion for identification: from a CSV file, or from the topics of a bag.
 
 Row k of a recording holds the joint angles and strains at time k, and the torque that acted over the interval
-that ends there, as `ArmState` carries it.
+that ends there, as `ArmState` carries it. What else was measured stands beside them.
 """
 
 from dataclasses import dataclass, replace
@@ -12,6 +12,7 @@ import numpy as np
 from flexarm_dynamics.errors import FlexarmError
 
 from .. import tables
+from ..recordings import mapping as mappings
 
 #: Stamps may be off their grid by this fraction of the period [-].
 JITTER = 0.2
@@ -21,11 +22,14 @@ MIN_SAMPLES = 20
 ENABLED = 1
 #: Samples after the first enabled torque (and before the last) that are left out: a safe action may still act.
 MARGIN = 2
+#: What is measured of joints, gauges and modes: the attributes of a `Recording` that have a row per sample.
+OF_JOINTS = ("position", "velocity", "acceleration", "torque", "current")
+SIGNALS = (*OF_JOINTS, "strain", "amplitude")
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recorded motion, without gaps.
+    """A recorded motion, without gaps. Values that were not measured are NaN, or None where none of a kind was.
 
     Attributes
     ----------
@@ -36,9 +40,21 @@ class Recording:
     torque : ndarray, shape (s, n)
         Over the interval that ends at the sample; the first row is not used [N m].
     strain : ndarray, shape (s, g)
-        In the order of the arm's gauges [-]; NaN where a gauge gave none.
+        In the order of the arm's gauges [-].
     notes : tuple of str
         What was left out of it, and why.
+    velocity, acceleration, current : ndarray, shape (s, n), or None
+        Of the joints [rad/s], [rad/s^2], [A].
+    amplitude : ndarray, shape (s, m), or None
+        Of the modes [m, rad].
+    joint_names, gauge_names, mode_names : tuple of str
+        Of the columns; empty where only the arm has them.
+    start : float
+        Time of the first sample, as the source counts it [s].
+    stamps : ndarray, shape (k,), or None
+        Times of all samples of the source, those that were left out too, as it counts them [s].
+    held : tuple of str
+        Joints that were not measured, since they stand still.
     """
 
     period: float
@@ -46,6 +62,16 @@ class Recording:
     torque: np.ndarray
     strain: np.ndarray
     notes: tuple = ()
+    velocity: np.ndarray | None = None
+    acceleration: np.ndarray | None = None
+    current: np.ndarray | None = None
+    amplitude: np.ndarray | None = None
+    joint_names: tuple = ()
+    gauge_names: tuple = ()
+    mode_names: tuple = ()
+    start: float = 0.0
+    stamps: np.ndarray | None = None
+    held: tuple = ()
 
     @property
     def time(self):
@@ -54,38 +80,72 @@ class Recording:
 
     def part(self, samples):
         """Its first so many samples."""
-        return replace(
-            self,
-            position=self.position[:samples],
-            torque=self.torque[:samples],
-            strain=self.strain[:samples],
-        )
+        return self._cut(slice(0, samples))
+
+    def between(self, start, end):
+        """The samples from `start` to `end` [s], as the source counts the time.
+
+        Raises
+        ------
+        FlexarmError
+            For fewer than 20 samples.
+        """
+        # Half a period: stamps are rounded.
+        first, last = np.ceil((np.array([start, end]) - self.start) / self.period - [0.5, -0.5])
+        made = self._cut(slice(max(int(first), 0), max(int(last), 0)))
+        if len(made.position) < MIN_SAMPLES:
+            whole = self.start + self.period * len(self.position)
+            raise FlexarmError(
+                f"has {len(made.position)} samples", field=f"part {start:g}:{end:g} of the recording",
+                limit=f"at least {MIN_SAMPLES}; it is from {self.start:g} to {whole:g} s",
+            )  # fmt: skip
+        return made
+
+    def _cut(self, rows):
+        signals = {name: getattr(self, name) for name in SIGNALS}
+        cut = {name: values[rows] for name, values in signals.items() if values is not None}
+        return replace(self, start=self.start + self.period * (rows.start or 0), **cut)
+
+    def need_torque(self):
+        """Refuse a recording without torque.
+
+        Raises
+        ------
+        FlexarmError
+        """
+        if not np.isfinite(self.torque).any():
+            hint = "the driver must report the torque that it applies"
+            raise FlexarmError("is unknown (NaN) in every sample", field="joint_torque", hint=hint)
 
 
-def uniform(arm, time, position, torque, strain, usable=None):
+def uniform(time, signals, usable=None, **more):
     """The longest stretch of samples without a gap, as a `Recording`.
 
     Parameters
     ----------
-    arm : Arm
-    time : ndarray, shape (s,)
+    time : ndarray, shape (k,)
         Ascending [s].
-    position, torque, strain : ndarray, shape (s, n), (s, n), (s, g)
-        [rad], [N m], [-].
-    usable : ndarray of bool, shape (s,), optional
-        Samples whose torque says what moved the arm.
+    signals : dict
+        Of `SIGNALS`, ``position`` and ``strain`` among them, to arrays with k rows.
+    usable : ndarray of bool, shape (k,), optional
+        Samples whose torque says what moved the arm; None: all.
+    more
+        Further attributes of the `Recording`.
 
     Raises
     ------
     FlexarmError
-        For fewer than 20 samples, for joint angles that are not finite, and where no torque is known.
+        For fewer than 20 samples, and for joint angles that are not finite.
     """
     time, notes = np.asarray(time, float), []
-    known = np.isfinite(torque).all(axis=1)
+    signals = {name: np.asarray(values, float) for name, values in signals.items()}
+    signals.setdefault("torque", np.full(signals["position"].shape, np.nan))
+    known = np.isfinite(signals["torque"]).all(axis=1)
+    if known.any():
+        signals["torque"] = np.nan_to_num(signals["torque"])
+    else:  # it is the motion that was recorded
+        known[:] = True
     usable = known if usable is None else known & usable
-    if time.size >= MIN_SAMPLES and not known.any():
-        hint = "the driver must report the torque that it applies"
-        raise FlexarmError("is unknown (NaN) in every sample", field="joint_torque", hint=hint)
     steps = np.diff(time)
     if time.size < MIN_SAMPLES or not (steps > 0.0).all():
         limit = f"at least {MIN_SAMPLES}, with ascending stamps"
@@ -106,13 +166,12 @@ def uniform(arm, time, position, torque, strain, usable=None):
         raise FlexarmError(problem, value=kept, limit=f"at least {MIN_SAMPLES}")
     if left > 2 * MARGIN + 2:
         notes.append(f"{left} of {time.size} samples left out: gaps, or torque not known")
-    position = np.asarray(position, float)[keep]
-    if not np.isfinite(position).all():
+    signals = {name: values[keep] for name, values in signals.items()}
+    if not np.isfinite(signals["position"]).all():
         raise FlexarmError("is not finite in some sample", field="joint_position")
     period = float((time[keep][-1] - time[keep][0]) / (kept - 1))
-    strain = np.asarray(strain, float).reshape(time.size, len(arm.gauges))[keep]
-    torque = np.nan_to_num(np.asarray(torque, float)[keep])
-    return Recording(period, position, torque, strain, tuple(notes))
+    stretch = {"start": float(time[keep][0]), "stamps": time, "notes": tuple(notes)}
+    return Recording(period, **signals, **stretch, **more)
 
 
 # CSV -------------------------------------------------------------------------------------------
@@ -126,13 +185,143 @@ def columns(arm):
     return names + [f"{g}_strain" for g in arm.gauge_names]
 
 
-def read_csv(path, arm):
-    """Read a CSV file with `columns` in any order; others are ignored, those of gauges may be missing."""
-    optional = [f"{g}_strain" for g in arm.gauge_names]
-    table = tables.read_columns(path, columns(arm), optional)
-    n = len(arm.joints)
-    t, q, u, e = np.split(table, [1, 1 + n, 1 + 2 * n], axis=1)
-    return uniform(arm, t[:, 0], q, u, e)
+def read_csv(path, arm=None, mapping=None):
+    """Read a CSV file.
+
+    Parameters
+    ----------
+    path : str or Path
+    arm : Arm, optional
+        Whose joints, gauges and modes are wanted, in its order; all of the file, in its order, if not given.
+    mapping : Mapping, optional
+        What the columns are; the names in the first line if not given, see `recordings.mapping`.
+
+    Returns
+    -------
+    Recording
+
+    Raises
+    ------
+    TableError
+        With the file, the line, the column and the value.
+    """
+    lines, rows = tables.cells(path, "," if mapping is None else mapping.delimiter)
+    if not rows:
+        problem = "empty"
+        raise tables.TableError(
+            problem, field=str(path), hint="a row of numbers per sample is wanted"
+        )
+    header = rows[0] if _has_header(rows[0], mapping) else ()
+    if header:
+        lines, rows = lines[1:], rows[1:]
+    if mapping is None:
+        mapping = _named_columns(path, header, arm)
+    names = _names(mapping, arm)
+    made, time = {}, None
+    for column in mapping.columns:
+        values = _column(path, lines, rows, header, column, mapping.decimal)
+        if column.quantity == "time":
+            time = values
+            continue
+        kind = mappings.QUANTITIES[column.quantity][0]
+        shape = len(rows), len(names[kind])
+        block = made.setdefault(column.quantity, np.full(shape, np.nan))
+        block[:, names[kind].index(column.of)] = values
+    position = made.setdefault("position", np.full((len(rows), len(names["joint"])), np.nan))
+    for joint, angle in mapping.held.items():
+        if joint in names["joint"]:
+            position[:, names["joint"].index(joint)] = angle
+    made.setdefault("strain", np.full((len(rows), len(names["gauge"])), np.nan))
+    if time is None:
+        time = np.arange(len(rows)) / mapping.rate
+    _check_ascending(path, lines, time)
+    known = {f"{kind}_names": tuple(found) for kind, found in names.items()}
+    return uniform(time, made, held=tuple(mapping.held), **known)
+
+
+def _has_header(first, mapping):
+    """Whether the first row has names: as the mapping says, else if a cell is no number."""
+    if mapping is None:
+        return True
+    if mapping.header is not None:
+        return mapping.header
+    return not all(_is_number(word.replace(mapping.decimal, ".")) for word in first)
+
+
+def _is_number(word):
+    try:
+        float(word or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def _named_columns(path, header, arm):
+    """The mapping that the names in the first line make; one that misses what is wanted is refused."""
+    made = mappings.by_names(header, arm)
+    joints = arm.joint_names if arm is not None else made.names("joint")
+    wanted = ["t", *(f"{joint}_position" for joint in joints)]
+    missing = [name for name in wanted if name not in header]
+    if missing or not joints:
+        wanted = wanted if joints else ["t", "<joint>_position", "<gauge>_strain"]
+        raise tables.TableError(
+            f"no column {', '.join(missing or wanted[1:2])} (wanted: {', '.join(wanted)})",
+            field=str(path), hint="name the columns so, or say with --mapping what they are",
+        )  # fmt: skip
+    return made
+
+
+def _names(mapping, arm):
+    """Names of joints, gauges and modes, in the arm's order, or in the file's without one; foreign ones are refused."""
+    names = {kind: mapping.names(kind) for kind in ("joint", "gauge", "mode")}
+    if arm is None:
+        return names
+    known = {kind: getattr(arm, f"{kind}_names") for kind in names}
+    for kind, found in names.items():
+        # A joint that stands still need not be in the arm's model.
+        foreign = [n for n in found if n not in known[kind] and n not in mapping.held]
+        if foreign:
+            problem, limit = f"is no {kind} of {arm.name}", ", ".join(known[kind]) or "it has none"
+            hint = "give it the arm file's name in the mapping"
+            raise tables.TableError(problem, field=kind, value=foreign[0], limit=limit, hint=hint)
+    missing = [n for n in known["joint"] if n not in names["joint"]]
+    if missing:
+        hint = "give its column in the mapping, or its angle under held if it stands still"
+        field = f"position of {missing[0]}"
+        raise tables.TableError("is not in the mapping", field=field, hint=hint)
+    return known
+
+
+def _column(path, lines, rows, header, column, decimal):
+    """Values of one column in SI, shape (k,)."""
+    if isinstance(column.at, int):
+        index = column.at - 1
+        width = len(rows[0]) if rows else 0
+        if rows and index >= width:
+            problem, limit = "is no column of the file", f"it has {width}"
+            field = f"{path}: column of {column.name}"
+            hint = "correct the number, or give the delimiter"
+            raise tables.TableError(problem, field=field, value=column.at, limit=limit, hint=hint)
+        title = f"column {column.at}, {column.name}"
+    else:
+        if column.at not in header:
+            limit = ", ".join(header) or "it has no names"
+            field, hint = f"{path}: column of {column.name}", "correct the name, or give the number"
+            problem = "is not in the first line"
+            raise tables.TableError(problem, field=field, value=column.at, limit=limit, hint=hint)
+        index, title = header.index(column.at), column.at
+    blank = column.quantity not in ("time", "position")
+    return column.factor * tables.numbers(path, lines, rows, index, title, blank, decimal)
+
+
+def _check_ascending(path, lines, time):
+    back = np.flatnonzero(np.diff(time) <= 0.0)
+    if back.size:
+        k = int(back[0]) + 1
+        raise tables.TableError(
+            f"comes after {time[k - 1]:g}; times must ascend", field=f"{path}:{lines[k]}: time [s]",
+            value=float(time[k]), hint="leave the row out, or cut the file there",
+        )  # fmt: skip
 
 
 # Topics ----------------------------------------------------------------------------------------
@@ -143,7 +332,8 @@ def from_tables(states, torques, arm):
 
     With torques, only those samples count over which an enabled torque acted: the safe action before and after
     moves the arm in ways that no torque tells of. The tables `states` and `torques` are those of a bag's `Contents`:
-    arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once.
+    arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once. Of the `arm` only
+    its ``joint_names``, ``gauge_names`` and ``mode_names`` are used.
     """
     if states is None or not states.stamp.size:
         raise FlexarmError("is not in the recording", field="arm_state")
@@ -152,12 +342,16 @@ def from_tables(states, torques, arm):
     rows = np.flatnonzero(states.session == session)[::-1]
     sequence, last = np.unique(states.sequence[rows], return_index=True)
     rows = rows[last]
+    names = {
+        f"{kind}_names": tuple(getattr(arm, f"{kind}_names")) for kind in ("joint", "gauge", "mode")
+    }
+    n, g = len(names["joint_names"]), len(names["gauge_names"])
 
     def column(name, width):
         values = states.columns.get(name)
         return np.full((rows.size, width), np.nan) if values is None else values[rows]
 
-    position = column("joint_position", len(arm.joints))
+    position = column("joint_position", n)
     if not np.isfinite(position).all():
         raise FlexarmError("is empty or not finite in some sample", field="joint_position")
     usable = None
@@ -165,8 +359,15 @@ def from_tables(states, torques, arm):
         answered = (torques.session == session) & (torques.columns["mode"] == ENABLED)
         usable = _enabled(np.isin(sequence - 1, torques.sequence[answered]))
     time = 1e-9 * (states.stamp[rows] - states.stamp[rows[0]])
-    torque = column("joint_torque", len(arm.joints))
-    return uniform(arm, time, position, torque, column("strain", len(arm.gauges)), usable)
+    signals = {
+        "position": position,
+        "torque": column("joint_torque", n),
+        "strain": column("strain", g),
+    }
+    for field, name in (("joint_velocity", "velocity"), ("modal_amplitude", "amplitude")):
+        if field in states.columns:
+            signals[name] = states.columns[field][rows]
+    return uniform(time, signals, usable, **names)
 
 
 def _enabled(enabled):

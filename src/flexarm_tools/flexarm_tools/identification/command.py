@@ -32,6 +32,7 @@ def add_arguments(parser):
     add = parser.add_argument
     add("recording", metavar="BAG|CSV", nargs="?", help="a bag's directory, or a CSV file")
     add("arm", metavar="ARM", help="arm file that the fit starts from: a shipped name or a path")
+    recordings.add_mapping(parser)
     add("--live", type=float, metavar="SECONDS", help="record a running arm's topics for so long")
     add("--namespace", default="", help="of the arm's topics")
     add("--out", metavar="FILE", help="write the arm file with the values found")
@@ -78,7 +79,8 @@ def identify(options):
 
         measured = record(arm, options.live, options.namespace)
     else:
-        measured = recordings.read(options.recording, arm, options.namespace)
+        measured = recordings.read(options.recording, arm, options.namespace, options.mapping)
+    measured.need_torque()
     progress.step(f"fit {arm.name} to {len(measured.position)} samples")
     found = fit(arm, measured, options.hold, options.undetermined)
     progress.done()
