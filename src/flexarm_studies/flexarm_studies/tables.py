@@ -44,6 +44,18 @@ def read(path, prefix, names):
     return table[:, 0], table[:, 1:]
 
 
+def has_columns(path, *names):
+    """Whether a path is of a CSV file whose first line has columns with these names."""
+    if not Path(path).is_file():
+        return False
+    try:
+        with open(path, encoding="utf-8-sig") as file:
+            header = next(csv.reader([file.readline()]), [])
+    except (UnicodeDecodeError, csv.Error):
+        return False
+    return set(names) <= {word.strip() for word in header}
+
+
 def cells(path, delimiter=","):
     """Line numbers and words of the rows of a text file, without empty lines and lines that begin with ``#``.
 

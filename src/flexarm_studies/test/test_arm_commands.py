@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.models.chain import Chain
 from flexarm_studies import tables
 
@@ -144,12 +145,51 @@ def test_columns_are_as_documented(flexarm):
         expected += "".join(
             f" {link}_{c}" for c in ("tip_x", "tip_y", "tip_z", "base_angle", "defl_y", "defl_z")
         )
+    expected += "".join(f" link{i}_{place}_strain" for i in (1, 2) for place in ("root", "middle"))
     assert header.split(",") == expected.split()
     assert len(rows) == 3
     values = dict(zip(header.split(","), map(float, rows[0].split(",")), strict=True))
     assert values["link1_base_angle"] == pytest.approx(0.1)
     assert values["link2_base_angle"] == pytest.approx(-0.1)
     assert values["tip_x"] == pytest.approx(0.5 * np.cos(0.1) + 0.5 * np.cos(-0.1), rel=1e-10)
+
+
+def test_joints_that_are_prescribed_to_stand_carry_links_at_rest_and_gauges_show_their_sag(
+    simulated, table_file
+):
+    arm = arm_file.load("long_reach")
+    built, q, t = Chain(arm), [0.3, -0.4, 0.5], np.linspace(0.0, 0.5, 6)
+    q += [0.1] * (built.n_joints - len(q))
+    got = simulated("long_reach", "--prescribed", table_file("q", t, *(0.0 * t + x for x in q)))
+    delta = built.static_deflection(np.array(q))
+    assert np.abs(delta).max() > 1e-3
+    wanted = gauge_rows(built, arm.gauges) @ delta
+    for gauge, strain in zip(arm.gauges, wanted, strict=True):
+        read = got[f"{gauge.name}_strain"]
+        np.testing.assert_allclose(read, gauge.gain * strain + gauge.bias, rtol=1e-6, atol=1e-12)
+
+
+def test_a_recorded_motion_is_prescribed_as_it_was_measured(simulated, table_file, tmp_path):
+    t = np.arange(0.0, 1.0005, 0.01)
+    angle = 0.3 * np.sin(np.pi * t) ** 4
+    same = simulated("one_link", "--prescribed", table_file("q", t, angle), "--rate", "100")
+    (tmp_path / "m.yaml").write_text(
+        "columns:\n- {column: 1, quantity: time, unit: ms}\n"
+        "- {column: 2, quantity: position, joint: joint1, unit: deg, sign: -1}\n"
+    )
+    path = tmp_path / "run.csv"
+    np.savetxt(path, np.column_stack([1e3 * t, -np.degrees(angle)]), "%.17g", ",")
+    words = ("one_link", "--prescribed", path, "--mapping", tmp_path / "m.yaml")
+    got = simulated(*words, "--smooth", "1000")
+    assert len(got["t"]) == t.size  # at the recording's rate, as long as it
+    np.testing.assert_allclose(got["root_strain"], same["root_strain"], atol=1e-12)
+    noisy = np.column_stack([1e3 * t, -np.degrees(np.round(angle / 1e-3) * 1e-3)])  # an encoder
+    np.savetxt(path, noisy, "%.17g", ",")
+    rms = [
+        np.std(simulated(*words, *smooth)["tau1"] - same["tau1"])
+        for smooth in ((), ("--smooth", "1000"))
+    ]
+    assert rms[0] < 0.2 * rms[1]
 
 
 def test_a_spatial_arm_has_no_base_angles_and_falls_under_gravity(result):

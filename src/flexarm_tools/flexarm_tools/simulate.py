@@ -6,6 +6,8 @@ from functools import partial
 from flexarm_studies.commands import simulate as without_bag
 from flexarm_studies.commands.simulate import add_arguments
 
+from .identification.recording import read
+
 __all__ = ["add_arguments", "simulate"]
 
 
@@ -16,4 +18,4 @@ def simulate(options):
         from .recording.loop_bag import LoopBag
 
         recorder = partial(LoopBag, options.bag)
-    without_bag.simulate(options, recorder)
+    without_bag.simulate(options, recorder, read)

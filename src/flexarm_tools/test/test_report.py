@@ -23,6 +23,7 @@ from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
 from flexarm_studies.commands import arm_figure
 from flexarm_studies.loop import metrics, scenario
+from flexarm_studies.recordings import mapping as mappings
 from flexarm_tools.identification import recording as recordings
 from flexarm_tools.recording import mcap
 from flexarm_tools.recording import record as recording
@@ -72,6 +73,41 @@ def test_identify_reads_the_same_bag(recorded):
     with pytest.raises(FlexarmError) as error:
         recordings.read(folder, other)
     assert error.value.field == "gauge_names"
+
+
+def test_a_csv_file_makes_a_report_of_what_it_holds(recorded, tmp_path, flexarm):
+    """The same run as a table: angles in degrees, strains in microstrain; other columns are not there."""
+    folder, _, loop = recorded["composite"]
+    arm = loop.model.arm
+    found = recordings.read(folder, arm)
+    (tmp_path / "m.yaml").write_text(
+        "rate: 500.0\ncolumns:\n- {column: 1, quantity: position, joint: joint1, unit: deg}\n"
+        + "".join(
+            f"- {{column: {i + 2}, quantity: strain, gauge: {name}, unit: microstrain}}\n"
+            for i, name in enumerate(arm.gauge_names)
+        )
+    )
+    table = np.hstack([np.degrees(found.position), 1e6 * found.strain])
+    np.savetxt(tmp_path / "run.csv", table, "%.17g", ",")
+    words = (tmp_path / "run.csv", "--mapping", tmp_path / "m.yaml", "--out", tmp_path / "r.html")
+    code, out, err = flexarm("report", *words, "--arm", "R", "--json")
+    assert code == 0, err
+    numbers = json.loads(out)["runs"]["run"]
+    assert numbers["samples"] == len(table) and numbers["rate_hz"] == pytest.approx(500.0)
+    (run,) = command.read([words[0]], "R", mapping=mappings.load(words[2]))
+    np.testing.assert_allclose(run.position(0), found.position[:, 0], atol=1e-12)
+    wanted = StrainMap(loop.model).amplitudes(found.strain[-1])
+    np.testing.assert_allclose(run.deflections()[-1], wanted, atol=1e-12)
+    assert "<svg" in (tmp_path / "r.html").read_text()
+
+
+def test_a_mapping_is_of_no_use_for_a_bag(recorded):
+    with pytest.raises(FlexarmError, match="--mapping: is of no use for a bag"):
+        recordings.read(recorded["slow"][0], mapping=mappings.parse("rate: 1.0\ncolumns: []"))
+    assert (
+        recordings.read(recorded["slow"][0]).gauge_names
+        == recorded["slow"][2].model.arm.gauge_names
+    )
 
 
 def test_a_bag_of_the_loop_holds_what_the_loop_did(recorded, runs):

@@ -10,12 +10,16 @@ import sys
 
 import numpy as np
 
+from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS, substeps
 
 from .. import tables
+from ..identification.recording import read_csv
 from ..progress import Progress
+from ..recordings import mapping as mappings
+from ..recordings.motion import CORNER, motion_of
 from . import run_controller
 from .options import add_arm_arguments, add_model_arguments, angles, chain_of, load_arm
 
@@ -51,8 +55,16 @@ def add_arguments(parser):
     )
     parser.add_argument(
         "--prescribed",
-        metavar="FILE.csv",
-        help="joint angles in place of torques: columns t,q1,... [s], [rad]; the torques come out",
+        metavar="FILE",
+        help="joint angles in place of torques, from columns t,q1,... [s], [rad], or a recording (bag, CSV); the "
+        "torques come out; the links start at rest under gravity",
+    )
+    mappings.add_option(parser)
+    parser.add_argument(
+        "--smooth",
+        type=float,
+        metavar="HZ",
+        help=f"corner of the low pass of a recording's joint angles ({CORNER:g})",
     )
     parser.add_argument(
         "--initial",
@@ -63,13 +75,13 @@ def add_arguments(parser):
         "--duration",
         type=float,
         default=None,
-        help="simulated time [s] (4; with a controller the motion and the window after it)",
+        help="simulated time [s] (4, or the prescribed motion; with a controller the motion and the window after it)",
     )
     parser.add_argument(
         "--rate",
         type=float,
         default=None,
-        help="rows per second (100); with a controller samples per second (1000)",
+        help="rows per second (100, or the recording's); with a controller samples per second (1000)",
     )
     parser.add_argument(
         "--step", type=float, default=None, help="longest step of the integrator [s] (0.001)"
@@ -87,15 +99,16 @@ def add_arguments(parser):
     run_controller.add_arguments(parser)
 
 
-def simulate(options, recorder=None):
-    """Run the sub-command; `recorder` writes the bag that ``--bag`` asks for, see `scenario.run_loop`."""
+def simulate(options, recorder=None, reader=read_csv):
+    """Run the sub-command.
+
+    `recorder` writes the bag that ``--bag`` asks for, see `scenario.run_loop`; ``reader(path, arm, mapping)`` reads
+    recordings, of CSV files alone if not given.
+    """
     run_controller.check_arguments(options)
     if run_controller.is_closed(options):
         run_controller.run_controller(options, recorder)
         return
-    for name, value in DEFAULTS.items():
-        if getattr(options, name) is None:
-            setattr(options, name, value)
     arm = load_arm(options)
     arm_model = model.build(arm)
     kinematics = chain_of(arm_model)
@@ -111,10 +124,12 @@ def simulate(options, recorder=None):
         if options.initial:
             problem = "is not possible: a prescribed motion starts where its table does"
             raise FlexarmError(problem, field="--initial")
-        table = tables.read(options.prescribed, "q", arm.joint_names)
-        motion = tables.Motion(*table, options.prescribed)
+        motion = _motion(options, arm, reader)
+    for name, value in DEFAULTS.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
     times = _times(options, motion)
-    columns = column_names(kinematics)
+    columns, strains = column_names(kinematics), _strains(kinematics)
     q = angles(options.initial, arm, "--initial")
     rows = np.empty((times.size, len(columns)))
     if motion is None:
@@ -131,13 +146,36 @@ def simulate(options, recorder=None):
                 field=arm.name,
                 hint="take a shorter --step, or --foreshortening where links spin fast",
             )
-        rows[k] = row(kinematics, times[k], state, torque)
+        rows[k] = row(kinematics, times[k], state, torque, strains)
         if progress and k % (times.size // 50) == 0:
             progress.fraction(k / times.size)
     if progress:
         progress.done()
     _report(options, arm_model, columns, rows)
     return columns, rows
+
+
+def _motion(options, arm, reader):
+    """The prescribed motion: of a table with the columns t,q1,..., or of a recording."""
+    path = options.prescribed
+    if options.mapping is None and tables.has_columns(path, "t", "q1"):
+        if options.smooth is not None:
+            problem, hint = "is of recordings", "a table of t,q1,... is taken as it is"
+            raise FlexarmError(problem, field="--smooth", value=options.smooth, hint=hint)
+        return tables.Motion(*tables.read(path, "q", arm.joint_names), path)
+    recording = reader(path, arm, mappings.of_options(options))
+    if options.rate is None:
+        options.rate = 1.0 / recording.period
+    return motion_of(recording, CORNER if options.smooth is None else options.smooth)
+
+
+def _strains(chain):
+    """Function from modal amplitudes (m,) to what the gauges read (g,), without noise."""
+    gauges = chain.arm.gauges
+    gains = np.array([g.gain for g in gauges])
+    rows = gains[:, None] * gauge_rows(chain, gauges)
+    bias = np.array([g.bias for g in gauges])
+    return lambda delta: rows @ delta + bias
 
 
 def _times(options, motion):
@@ -148,7 +186,7 @@ def _times(options, motion):
     start, end = (0.0, np.inf) if motion is None else (motion.start, motion.end)
     duration = options.duration
     if duration is None:
-        duration = min(4.0, end - start)
+        duration = min(4.0, end - start) if motion is None else end - start
     if not 0.0 <= duration < np.inf:
         limit = "finite, at least 0"
         raise FlexarmError("is out of range", field="--duration", value=duration, limit=limit)
@@ -195,6 +233,7 @@ def _prescribed(chain, motion, times, options):
         )
     advance = chain.driven_stepper(METHODS[options.method])
     state = np.zeros(2 * (n + m))
+    state[n : n + m] = chain.static_deflection(motion(times[0])[0])
     longest = options.step / substeps(chain, options.step, options.method)
     for k, t in enumerate(times):
         if k:
@@ -228,11 +267,11 @@ def column_names(chain):
         if chain.planar_axis is not None:
             names.append(f"link{i + 1}_base_angle")
         names += [f"link{i + 1}_defl_{axis}" for axis in "yz"]
-    return names
+    return names + [f"{name}_strain" for name in chain.arm.gauge_names]
 
 
-def row(chain, t, state, torque):
-    """One row of the table."""
+def row(chain, t, state, torque, strains):
+    """One row of the table; `strains` is of `_strains`."""
     n, m = chain.n_joints, chain.n_modes
     q, delta, qd, _ = np.split(state, [n, n + m, 2 * n + m])
     ends = chain.link_ends(q, delta)
@@ -243,6 +282,7 @@ def row(chain, t, state, torque):
         if base is not None:
             values.append(base[i : i + 1])
         values.append(chain.tip_deflection(delta, link.name))
+    values.append(strains(delta))
     return np.concatenate(values)
 
 

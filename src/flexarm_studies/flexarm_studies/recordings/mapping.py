@@ -229,3 +229,18 @@ def by_names(header, arm=None):
         if of and kind and (arm is None or of in wanted[kind]):
             columns.append(Column(title, quantity, of))
     return Mapping(tuple(dict.fromkeys(columns)), header=True)
+
+
+def add_option(parser):
+    """Give a command's `parser` the option ``--mapping``."""
+    parser.add_argument(
+        "--mapping",
+        metavar="M",
+        help="what the columns of a CSV file are: a mapping file, by path or shipped name (tudor); not given: "
+        "the names in its first line (t, <joint>_position, <gauge>_strain, ...)",
+    )
+
+
+def of_options(options):
+    """The `Mapping` that ``--mapping`` asks for; None without."""
+    return None if options.mapping is None else load(options.mapping)

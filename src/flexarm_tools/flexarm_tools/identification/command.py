@@ -13,6 +13,7 @@ from flexarm_studies.identification.arm_text import rewritten
 from flexarm_studies.identification.derived import derived
 from flexarm_studies.identification.fit import identify as fit
 from flexarm_studies.progress import Progress
+from flexarm_studies.recordings import mapping as mappings
 
 from . import recording as recordings
 
@@ -32,7 +33,7 @@ def add_arguments(parser):
     add = parser.add_argument
     add("recording", metavar="BAG|CSV", nargs="?", help="a bag's directory, or a CSV file")
     add("arm", metavar="ARM", help="arm file that the fit starts from: a shipped name or a path")
-    recordings.add_mapping(parser)
+    mappings.add_option(parser)
     add("--live", type=float, metavar="SECONDS", help="record a running arm's topics for so long")
     add("--namespace", default="", help="of the arm's topics")
     add("--out", metavar="FILE", help="write the arm file with the values found")
@@ -79,7 +80,9 @@ def identify(options):
 
         measured = record(arm, options.live, options.namespace)
     else:
-        measured = recordings.read(options.recording, arm, options.namespace, options.mapping)
+        measured = recordings.read(
+            options.recording, arm, mappings.of_options(options), options.namespace
+        )
     measured.need_torque()
     progress.step(f"fit {arm.name} to {len(measured.position)} samples")
     found = fit(arm, measured, options.hold, options.undetermined)

@@ -4,10 +4,11 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.shown import listed
 from flexarm_studies.identification.recording import from_tables, read_csv
-from flexarm_studies.recordings import mapping as mappings
 
 
 def of_contents(contents, arm=None):
@@ -28,7 +29,7 @@ def of_contents(contents, arm=None):
     return from_tables(tables.get("arm_state"), tables.get("joint_torque"), arm)
 
 
-def read(path, arm=None, namespace="", mapping=None):
+def read(path, arm=None, mapping=None, namespace=""):
     """A `Recording` of a bag or a CSV file, by what `path` is.
 
     Parameters
@@ -36,10 +37,10 @@ def read(path, arm=None, namespace="", mapping=None):
     path : str or Path
     arm : Arm, optional
         Whose names and order are wanted; those of the recording if not given.
+    mapping : Mapping, optional
+        What the columns of a CSV file are, see `recordings.mapping`.
     namespace : str
         Of the topics in a bag.
-    mapping : str or Path, optional
-        What the columns of a CSV file are: a shipped name or a path, see `recordings.mapping`.
 
     Raises
     ------
@@ -50,26 +51,39 @@ def read(path, arm=None, namespace="", mapping=None):
     if not path.exists():
         raise FlexarmError("no such file or bag", field=str(path))
     if not is_bag(path):
-        return read_csv(path, arm, mappings.load(mapping) if mapping else None)
-    if mapping:
+        return read_csv(path, arm, mapping)
+    if mapping is not None:
         problem, hint = "is of no use for a bag", "its messages have names and units"
-        raise FlexarmError(problem, field="--mapping", value=str(mapping), hint=hint)
+        raise FlexarmError(problem, field="--mapping", hint=hint)
     from ..recording import bag
 
     (contents,) = bag.read(path, arm, namespace)
     return of_contents(contents, arm)
 
 
+def to_contents(recording, path, arm=None):
+    """The `Contents` that a bag with the samples of a `recording` would have; `path` is where it came from."""
+    from ..recording import bag
+
+    columns = {
+        "joint_position": recording.position,
+        "joint_velocity": recording.velocity,
+        "joint_torque": recording.torque,
+        "strain": recording.strain,
+        "modal_amplitude": recording.amplitude,
+    }
+    columns = {name: v for name, v in columns.items() if v is not None and v.shape[1]}
+    known = {name for name, values in columns.items() if np.isfinite(values).any()}
+    count = len(recording.position)
+    stamp = np.rint(1e9 * (recording.start + recording.time)).astype(np.int64)
+    session, none = np.zeros(count, np.int64), np.full(count, -1, np.int32)
+    state = bag.Table(stamp, session, np.arange(count), columns, known, none)
+    names = {
+        f"{kind}_names": getattr(recording, f"{kind}_names") for kind in ("joint", "gauge", "mode")
+    }
+    return bag.Contents(path, "", arm, names, {"arm_state": state}, [], list(recording.notes))
+
+
 def is_bag(path):
     """Whether a path is a bag, and not a CSV file."""
     return Path(path).is_dir() or Path(path).suffix in (".mcap", ".db3")
-
-
-def add_mapping(parser):
-    """The option ``--mapping`` of commands that read recordings."""
-    parser.add_argument(
-        "--mapping",
-        metavar="M",
-        help="what the columns of a CSV file are: a mapping file, by path or shipped name (tudor); not given: "
-        "the names in its first line (t, <joint>_position, <gauge>_strain, …)",
-    )

@@ -6,24 +6,29 @@ import time
 import webbrowser
 from pathlib import Path
 
+from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.progress import Progress
+from flexarm_studies.recordings import mapping as mappings
+
+from ..identification import recording as recordings
 
 
 def add_arguments(parser):
     """Arguments of the sub-command."""
     parser.description = (
         "Reads bags of `flexarm record`, `flexarm simulate --bag`, `flexarm demo` or `ros2 "
-        "bag record`, and writes one page that needs no network."
+        "bag record`, and CSV files, and writes one page that needs no network."
     )
     parser.epilog = "example: flexarm report results/run1 results/run2 --out results/report.html"
     add = parser.add_argument
     add(
         "bags",
         nargs="+",
-        metavar="BAG",
-        help="folder of a rosbag2 bag, a folder with one in it, or a .mcap or .db3 file; several are compared",
+        metavar="BAG|CSV",
+        help="folder of a rosbag2 bag, a folder with one in it, a .mcap, .db3 or .csv file; several are compared",
     )
+    mappings.add_option(parser)
     add(
         "--out",
         default="results/report.html",
@@ -43,7 +48,9 @@ def add_arguments(parser):
 def report(options):
     """Run ``report``; the page's path."""
     progress, out = Progress(), _page_file(options.out)
-    runs = read(options.bags, options.arm, options.namespace, progress)
+    runs = read(
+        options.bags, options.arm, options.namespace, progress, mappings.of_options(options)
+    )
     made = _write(runs, out, progress)
     if options.json:
         from .analysis import summary
@@ -113,8 +120,11 @@ def _write(runs, out, progress, opening=""):
     return out
 
 
-def read(bags, arm=None, namespace=None, progress=None):
-    """The runs in some bags, a list of `Run`; each has a label of its own."""
+def read(bags, arm=None, namespace=None, progress=None, mapping=None):
+    """The runs in some bags or CSV files, a list of `Run`; each has a label of its own.
+
+    `arm`, `namespace` and `progress` are as in `make`; `mapping` says what the columns of CSV files are.
+    """
     from ..recording import bag
     from .run import Run
 
@@ -130,6 +140,11 @@ def read(bags, arm=None, namespace=None, progress=None):
                 shown = time.monotonic()
                 progress.fraction(done)
 
+        if Path(path).suffix == ".csv" or (mapping is not None and not recordings.is_bag(path)):
+            of = arm_file.load(arm) if isinstance(arm, str) else arm
+            table = recordings.read(path, of, mapping=mapping)
+            found.append((recordings.to_contents(table, Path(path), of), str(path)))
+            continue
         for contents in bag.read(path, arm, namespace, fraction):
             found.append((contents, str(path)))
     names = labels([p for _, p in found], [c.namespace for c, _ in found])
@@ -141,7 +156,7 @@ def labels(paths, namespaces):
     parts = []
     for path in paths:
         path = Path(path).resolve()
-        path = path.with_suffix("") if path.suffix in (".mcap", ".db3") else path
+        path = path.with_suffix("") if path.suffix in (".mcap", ".db3", ".csv") else path
         pieces = [p for p in path.parts if p != path.anchor] or [str(path)]
         # The demo's bags are called `bag`, a file in a bag as the bag.
         if len(pieces) > 1 and pieces[-1] == "bag":
