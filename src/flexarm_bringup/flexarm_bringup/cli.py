@@ -160,6 +160,11 @@ COMMANDS = {
         "record",
         "record the topics of a running arm to a bag, driver or simulator, until Ctrl-C",
     ),
+    "recording": Command(
+        "flexarm_tools.recording.show",
+        "recording",
+        "what a recording shows, a bag or a CSV file: gaps, rest, noise, drift, delays, ring-downs, spectra",
+    ),
     "report": Command(
         "flexarm_tools.report.command",
         "report",

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the joints of a recording stand still, and what its gauges read there: noise, and its common part."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Corner of the low pass before speeds are taken from angles [Hz], at most this fraction of the rate.
+CORNER, OF_RATE = 10.0, 0.2
+#: A joint stands below this fraction of its speed, which is its 99th percentile [-] ...
+SLOW = 0.05
+#: ... or below so many steps of its encoder per second.
+STEPS = 10.0
+#: A shorter stretch is none of rest [s].
+MIN_REST = 0.6
+
+
+def low_passed(values, period, corner):
+    """The columns of `values` (s, k) without what is above a `corner` [Hz], without phase; `period` is of a row [s]."""
+    from scipy.signal import butter, sosfiltfilt
+
+    corner = min(corner, OF_RATE / period)
+    return sosfiltfilt(butter(2, corner, fs=1.0 / period, output="sos"), values, axis=0)
+
+
+def derivative(values, period):
+    """Rates of the columns of `values` (s, k) by central differences, shape (s, k); `period` is of a row [s]."""
+    return np.gradient(values, period, axis=0)
+
+
+def step_of(values):
+    """Smallest change from one row to the next of `values` (s,), the step of an encoder or converter; 0 without."""
+    change = np.abs(np.diff(values))
+    change = change[change > 1e-9 * np.abs(values).max(initial=0.0)]
+    return float(change.min()) if change.size else 0.0
+
+
+def still(recording):
+    """Samples at which every joint stands, shape (s,) bool."""
+    position, period = recording.position, recording.period
+    speed = np.abs(derivative(low_passed(position, period, CORNER), period))
+    floor = STEPS * np.array([step_of(column) for column in position.T])
+    return (speed <= np.maximum(SLOW * np.percentile(speed, 99.0, axis=0), floor)).all(axis=1)
+
+
+def stretches(recording):
+    """Rests of at least `MIN_REST`, a list of slices of samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still(recording).astype(int), [0]])))
+    least = MIN_REST / recording.period
+    return [
+        slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > least
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """What the gauges read while nothing moves.
+
+    Attributes
+    ----------
+    part : slice
+        The samples.
+    rms : ndarray, shape (g,)
+        About a straight line [-]; NaN for a gauge that misses values.
+    correlation : ndarray, shape (g, g)
+        Between the gauges [-].
+    corrected : ndarray, shape (g,)
+        Rms of each gauge less what the others tell of it by linear regression [-].
+    """
+
+    part: slice
+    rms: np.ndarray
+    correlation: np.ndarray
+    corrected: np.ndarray
+
+
+def noise(recording, part):
+    """The `Noise` of the gauges in a `part` of a recording, a slice of samples at rest."""
+    values = recording.strain[part]
+    g, time = values.shape[1], np.linspace(-1.0, 1.0, len(values))
+    line = np.column_stack([np.ones(time.size), time])
+    known = np.isfinite(values).all(axis=0)
+    rest = values[:, known] - line @ np.linalg.lstsq(line, values[:, known], rcond=None)[0]
+    rms, corrected, correlation = np.full(g, np.nan), np.full(g, np.nan), np.full((g, g), np.nan)
+    rms[known] = rest.std(axis=0)
+    live = known.copy()
+    live[known] = rms[known] > 0.0
+    rest = rest[:, live[known]]
+    if rest.size:
+        correlation[np.ix_(live, live)] = np.atleast_2d(np.corrcoef(rest.T))
+        # Of a covariance C the part of one that the others do not tell has the variance 1 / (C^-1)_ii.
+        inverse = np.linalg.pinv(np.atleast_2d(np.cov(rest.T, bias=True)), hermitian=True)
+        corrected[live] = 1.0 / np.sqrt(np.diag(inverse))
+    return Noise(part, rms, correlation, corrected)

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Free vibration while the joints stand: frequency and damping of what a gauge reads.
+
+.. math::
+    \varepsilon(t) = e^{-\sigma t}(a\cos\omega t + b\sin\omega t) + c + dt,
+    \qquad \zeta = \sigma/\sqrt{\sigma^2 + \omega^2}
+
+fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals are those of
+white residuals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+#: What counts as a ring-down: this fraction of the variance is explained, amplitude over noise, damping ratio, periods.
+EXPLAINED, OVER_NOISE, MAX_DAMPING, MIN_PERIODS = 0.9, 5.0, 0.3, 1.5
+#: Start of the fit: damping rate over frequency [-].
+START = 0.01
+NORMAL = 1.959964
+
+
+@dataclass(frozen=True)
+class RingDown:
+    """One ring-down.
+
+    Attributes
+    ----------
+    part : slice
+        The samples.
+    gauge : int
+        Of the largest amplitude over its noise.
+    frequency, frequency_width : float
+        Damped frequency, and half of its 95 % interval [Hz].
+    damping, damping_width : float
+        Ratio [-].
+    amplitude : float
+        At the beginning [-].
+    explained : float
+        Fraction of the variance, apart from the line [-].
+    """
+
+    part: slice
+    gauge: int
+    frequency: float
+    frequency_width: float
+    damping: float
+    damping_width: float
+    amplitude: float
+    explained: float
+
+
+def find(recording, parts, noise):
+    """The ring-downs of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+    parts : sequence of slice
+        Samples at which the joints stand.
+    noise : ndarray, shape (g,)
+        Rms of each gauge at rest [-].
+
+    Returns
+    -------
+    list of RingDown
+    """
+    found = []
+    for part in parts:
+        best, ratio = None, OVER_NOISE
+        for gauge, rms in enumerate(noise):
+            values = recording.strain[part, gauge]
+            if not np.isfinite(values).all() or not rms > 0.0 or values.std() < rms:
+                continue
+            made = fit(values, recording.period, part, gauge)
+            if _is_one(made, recording.period) and made.amplitude > ratio * rms:
+                best, ratio = made, made.amplitude / rms
+        if best is not None:
+            found.append(best)
+    return found
+
+
+def _is_one(made, period):
+    length = period * (made.part.stop - made.part.start)
+    rings = 0.0 < made.damping < MAX_DAMPING and made.damping_width < MAX_DAMPING
+    return rings and made.explained > EXPLAINED and made.frequency * length > MIN_PERIODS
+
+
+def fit(values, period, part=None, gauge=0):
+    """The `RingDown` that is nearest to `values` (s,), one per `period` [s]; `part` and `gauge` say whose they are."""
+    count, size_of = len(values), max(float(np.std(values)), 1e-300)
+    values = (values - np.mean(values)) / size_of
+    time = period * np.arange(count)
+    line = np.column_stack([np.ones(count), time])
+    straight = values - line @ np.linalg.lstsq(line, values, rcond=None)[0]
+    begin = 2.0 * np.pi * _strongest(straight, period)
+
+    def basis(x):
+        decay = np.exp(np.clip(-x[1] * time, -50.0, 50.0))
+        return np.column_stack([decay * np.cos(x[0] * time), decay * np.sin(x[0] * time), line])
+
+    def residual(x):
+        B = basis(x)
+        return values - B @ np.linalg.lstsq(B, values, rcond=None)[0]
+
+    scale = np.array([0.05, 0.02]) * begin
+    made = least_squares(residual, [begin, START * begin], x_scale=scale, max_nfev=100)
+    omega, sigma = abs(made.x[0]), made.x[1]
+    linear = np.linalg.lstsq(basis(made.x), values, rcond=None)[0]
+    left = float(np.mean(made.fun**2))
+    width = NORMAL * np.sqrt(left * np.diag(np.linalg.pinv(made.jac.T @ made.jac)))
+    total = float(np.var(values - line @ linear[2:]))
+    size = np.hypot(omega, sigma)
+    numbers = (
+        omega / (2.0 * np.pi),
+        width[0] / (2.0 * np.pi),
+        sigma / size,
+        width[1] * omega**2 / size**3,
+        size_of * np.hypot(*linear[:2]),
+        1.0 - left / max(total, 1e-300),
+    )
+    return RingDown(part, gauge, *map(float, numbers))
+
+
+def _strongest(values, period):
+    """Frequency of the largest peak of a series, at least one period in it [Hz]."""
+    size = 16 * len(values)
+    power = np.abs(np.fft.rfft(values * np.hanning(len(values)), size))
+    frequencies = np.fft.rfftfreq(size, period)
+    power[frequencies < 1.0 / (period * len(values))] = 0.0
+    return float(frequencies[np.argmax(power)])
