@@ -72,7 +72,7 @@ def test_every_ring_down_is_found_with_its_frequency_and_damping(found):
     assert np.abs((starts - 11.5 + 2.0) % 4.0 - 2.0).max() < 0.35
 
 
-def test_drift_and_delay_are_told_from_the_motion(found):
+def test_drift_and_delay_are_found_from_the_motion(found):
     a, b = found["drift"]
     assert abs(a["drift"] - DRIFT) < 2.0 * a["drift_half_width"] < 4e-6
     assert abs(b["drift"]) < 2.0 * b["drift_half_width"] < 2e-6
