@@ -414,10 +414,20 @@ def test_a_verdict_names_the_trajectory_that_is_replaced():
 def test_a_past_stamp_is_refused():
     generator = held(0.0)
     at(generator, 3)
-    reason = "header.stamp: 2750000000 ns is 0.25 s in the past; use stamp 0 for now"
+    reason = "header.stamp: 2750000000 ns is 0.25 s in the past: the arm's clock shows 3 s; use stamp 0 for now"
     assert generator.offer(one([(1, 1.0)], stamp=2.75)) == Verdict(False, reason, 0)
     assert generator.offer(one([(1, 1.0)], stamp=3)).accepted
     assert at(generator, 3.5)[0] == 0.5
+
+
+def test_a_stamp_of_another_clock_is_refused_with_both_clocks():
+    generator = held(0.0)
+    at(generator, 3)
+    verdict = generator.offer(one([(1, 1.0)], stamp=1795361236.8))
+    assert not verdict.accepted and not generator.pending
+    assert verdict.reason.startswith("header.stamp: 1795361236800000000 ns is 1795361233.8 s ahead")
+    assert "the arm's clock shows 3 s" in verdict.reason
+    assert generator.offer(one([(1, 1.0)], stamp=3603)).accepted
 
 
 def test_nothing_is_accepted_before_there_is_a_state():

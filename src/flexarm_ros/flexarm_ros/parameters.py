@@ -47,6 +47,13 @@ def descriptor(parameter):
     return out
 
 
+def _give_empty_list(node, name, parameter):
+    """A parameter file's ``[]`` has no type for ROS, which hands it on as None; `ros2 param dump` writes it."""
+    given = node._parameter_overrides.get(name)
+    if given is not None and given.value is None and parameter.kind.endswith("array"):
+        node._parameter_overrides[name] = Parameter(name, value=[])
+
+
 class NodeParameters:
     """All parameters of one node.
 
@@ -76,6 +83,7 @@ class NodeParameters:
         self._sizes = {}
         self._listener = None
         for name, (prefix, parameter) in self._declared.items():
+            _give_empty_list(node, name, parameter)
             try:
                 node.declare_parameter(name, parameter.default, descriptor(parameter))
             except InvalidParameterValueException as error:

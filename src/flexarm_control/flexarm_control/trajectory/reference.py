@@ -24,6 +24,8 @@ from .values import (
 
 #: Deceleration from a measured velocity, where none is given [rad/s^2].
 GENTLE = 2.0
+#: A start that is farther ahead is a stamp of another clock [ns].
+FARTHEST_START = 3600 * SECOND
 #: A stop's acceleration and jerk over the motion's own largest.
 MORE = 1.15, 1.3
 #: A motion that is slower than this fraction of what the joint could do is stopped faster than it would stop itself.
@@ -230,10 +232,20 @@ class ReferenceGenerator:
             )
         if 0 < trajectory.stamp_ns < self._last_ns:
             raise TrajectoryError(
-                f"ns is {seconds(self._last_ns - trajectory.stamp_ns)} in the past",
+                f"ns is {seconds(self._last_ns - trajectory.stamp_ns)} in the past: the arm's clock shows"
+                f" {seconds(self._last_ns)}",
                 field="header.stamp",
                 value=trajectory.stamp_ns,
                 hint="use stamp 0 for now",
+            )
+        if trajectory.stamp_ns - self._last_ns > FARTHEST_START:
+            raise TrajectoryError(
+                f"ns is {seconds(trajectory.stamp_ns - self._last_ns)} ahead: the arm's clock shows"
+                f" {seconds(self._last_ns)}, and the stamp may be of another clock",
+                field="header.stamp",
+                value=trajectory.stamp_ns,
+                limit=f"{seconds(FARTHEST_START)} ahead",
+                hint="use stamp 0 for now, or a stamp of arm_state plus the wait",
             )
         self._reference_at_start(trajectory.stamp_ns)
         distance = np.abs(trajectory.positions[0] - self._scratch[0])
