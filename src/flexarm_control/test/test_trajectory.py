@@ -16,6 +16,7 @@ from flexarm_control.trajectory import (
     Verdict,
     validate,
 )
+from flexarm_control.trajectory.reference import FARTHEST_START
 from flexarm_dynamics.errors import NOT_GIVEN, TrajectoryError
 
 S = 10**9  # [ns]
@@ -247,7 +248,7 @@ pairs = st.lists(coordinates, min_size=2, max_size=2)
 @given(
     st.lists(st.tuples(st.integers(0, 2**62), pairs, pairs, pairs), min_size=1, max_size=4),
     st.integers(1, 3),
-    st.integers(0, 2**62 - 1),
+    st.integers(0, FARTHEST_START),
     st.lists(st.integers(0, 2**63), max_size=5),
 )
 def test_whatever_is_accepted_gives_a_finite_reference(rows, fields, stamp, samples):
