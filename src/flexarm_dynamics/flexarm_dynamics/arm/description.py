@@ -29,6 +29,28 @@ class Friction:
 
 
 @dataclass(frozen=True)
+class Transmission:
+    r"""Gear, belt or shaft between a joint's motor and its link: a spring and a damper behind play.
+
+    The joint's coordinate q is then the motor's angle (seen through the gear), on which torque and friction act;
+    :math:`\gamma`, the link's angle less the motor's, is one of the modal coordinates. From link to motor goes
+
+    .. math::
+        \tau = k\,s + (e\,d + c\,|k\,s|)\,\dot\gamma, \qquad
+        s = \gamma - \mathrm{clip}(\gamma, -\tfrac b2, \tfrac b2), \qquad
+        e = \frac{s^2}{s^2 + (b/20)^2} \ (1 \text{ without play}).
+
+    Within the play nothing is transmitted. The damper d takes hold gradually as the flanks are pressed, so that the
+    torque has no jump; c is damping that grows with the transmitted torque (Hunt & Crossley 1975).
+    """
+
+    stiffness: float  # [N m/rad] k
+    damping: float = 0.0  # [N m s/rad] d
+    play: float = 0.0  # [rad] b: the whole way that the link moves freely while the motor is held
+    load_damping: float = 0.0  # [s/rad] c
+
+
+@dataclass(frozen=True)
 class Limits:
     """What a joint may do; infinite where the file says nothing."""
 
@@ -60,6 +82,7 @@ class Joint:
     damp_torque: float | None = None  # [N m] largest of damp; None: from limits, gauges and weight
     damp_time: float | None = None  # [s] of its soft start; None: half a period, at most 0.25
     encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
+    transmission: Transmission | None = None  # None: the link is fixed to the motor
 
     @property
     def inertia(self):
@@ -140,9 +163,13 @@ class Gauge:
         return float(np.hypot(self.noise, self.step / np.sqrt(12.0)))
 
 
+#: `Mode.direction` of the deflection of a joint's transmission.
+TRANSMISSION = "transmission"
+
+
 @dataclass(frozen=True)
 class Mode:
-    """Where a modal coordinate stands: which link, direction and number (from 1)."""
+    """Where a modal coordinate stands: which link (of a transmission: joint), direction and number (from 1)."""
 
     link: str
     direction: str
@@ -150,7 +177,9 @@ class Mode:
 
     @property
     def name(self):
-        """Name on every topic: ``link1_y_mode1``."""
+        """Name on every topic: ``link1_y_mode1``, ``joint1_transmission``."""
+        if self.direction == TRANSMISSION:
+            return f"{self.link}_{TRANSMISSION}"
         return f"{self.link}_{self.direction}_mode{self.number}"
 
 
@@ -179,14 +208,15 @@ class Arm:
 
     @property
     def modes(self):
-        """All modal coordinates, link by link, direction by direction, mode by mode."""
-        return tuple(
+        """All modal coordinates: link by link, direction by direction, mode by mode; then the transmissions."""
+        bending = tuple(
             Mode(link.name, direction, i + 1)
             for link in self.links
             for direction in DIRECTIONS
             if direction in link.flexible
             for i in range(link.flexible[direction].modes)
         )
+        return bending + tuple(Mode(j.name, TRANSMISSION, 1) for j in self.joints if j.transmission)
 
     @property
     def mode_names(self):

@@ -31,6 +31,10 @@ from collections import namedtuple
 
 import numpy as np
 
+#: Whether joints have transmissions: compiled apart for arms that have none, which then cost nothing more.
+SPRINGS = True
+#: Deflection beyond the play, in parts of half of it, at which a transmission has half of its damping.
+ENGAGEMENT = 0.1
 TWIST, Y, Z = 0, 1, 2
 FIRST_ORDER, FORESHORTENING, FINITE_SLOPE = 0, 1, 2
 
@@ -47,6 +51,8 @@ DATA = {
     "turn": ("N", 3, 3),  # and its orientation
     "gear": ("N",),
     "rotor": ("N",),  # rotor inertia, motor side
+    "spring": ("N",),  # place in delta of the deflection of each joint's transmission; -1: it has none
+    "transmission": ("N", 4),  # stiffness, damping, half the play, damping per transmitted torque
     "length": ("N",),
     "mass": ("N",),  # beam, and the motor at its base
     "moment": ("N",),  # int x dm
@@ -76,6 +82,7 @@ DATA = {
 #: Work space, filled by `prepare` (kinematics and inertia) and by the recursions. Row N is the tip's.
 WORK = {
     "frame": ("N+1", 3, 3),  # link to previous link's coordinates
+    "rate": ("N",),  # at which each link turns about its joint
     "omega": ("N+1", 3),  # angular velocity of each link's frame, in its coordinates
     # angular velocity of what carries the joint, link coordinates; N: of the tip, link N - 1's
     "carrier": ("N+1", 3),
@@ -111,6 +118,10 @@ WORK = {
     "Uf": ("N", 3),
     "D": ("N",),
     "u": ("N",),
+    # of a link behind a transmission: what Ua, Uf are before the motor; inverse of D, u, D without `extra`
+    "Sa": ("N", 3),
+    "Sf": ("N", 3),
+    "S": ("N", 3),
     "t": (12, 3),  # scratch
     "tm": (6, 3, 3),  # scratch
     "node": (5, "G+1"),  # integrands at the nodes and what they integrate to
@@ -611,7 +622,13 @@ def prepare(d, w, q, delta, qd, delta_d):
         for m in range(3):
             w.frame[0, k, m] = d.turn[0, k, m]
     for i in range(N):
-        turn_joint(d, w, i, q[i], qd[i])
+        angle, rate = q[i], qd[i]
+        if SPRINGS:
+            if d.spring[i] >= 0:
+                angle += delta[d.spring[i]]
+                rate += delta_d[d.spring[i]]
+            w.rate[i] = rate
+        turn_joint(d, w, i, angle, rate)
         if d.level == FIRST_ORDER or d.count[i] == 0:
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
@@ -661,8 +678,11 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
     """
     N = d.links
     start(w, gravity)
+    turning = qdd[0]
+    if SPRINGS and d.spring[0] >= 0:
+        turning += delta_dd[d.spring[0]]
     for k in range(3):
-        w.al[0, k] = d.axis[0, k] * qdd[0]
+        w.al[0, k] = d.axis[0, k] * turning
     for i in range(N):
         n = i + 1
         K, first = d.count[i], d.first[i]
@@ -677,8 +697,13 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
             cross(w.carrier[n], d.axis[n], w.t[2])
             # Spin of the rotor as seen from the base: its rate needs the carrier's acceleration.
             w.u[n] = d.rotor[n] * (dot(d.axis[n], w.al[n]) + d.gear[n] * qdd[n])
+            turning, rate = qdd[n], qd[n]
+            if SPRINGS:
+                rate = w.rate[n]
+            if SPRINGS and d.spring[n] >= 0:
+                turning += delta_dd[d.spring[n]]
             for k in range(3):
-                w.al[n, k] += w.t[2, k] * qd[n] + d.axis[n, k] * qdd[n]
+                w.al[n, k] += w.t[2, k] * rate + d.axis[n, k] * turning
     w.u[0] = d.rotor[0] * d.gear[0] * qdd[0]
     # Wrench on the payload, then link by link inwards; zn, zf hold it in link coordinates at the link's base.
     payload(d, w)
@@ -712,6 +737,8 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
                 zf[k] += w.p[i, j, k] * x
             modal[first + j] = acc
         torque[i] = dot(d.axis[i], zn) + d.gear[i] * w.u[i]
+        if SPRINGS and d.spring[i] >= 0:
+            modal[d.spring[i]] = dot(d.axis[i], zn)
         add_rotor(d, w, i, qd[i], zn)
 
 
@@ -840,9 +867,11 @@ def eliminate_modes(d, w, i, force, extra):
             w.zf[i, a] += gf * r
 
 
-def eliminate_joint(d, w, i, qd, force, extra, driven, qdd):
+def eliminate_joint(d, w, i, qd, force, modal_force, extra, driven, qdd):
     """Eliminate joint i from row i; what is left is the inertia that its carrier feels, in link i's coordinates."""
-    a, t = d.axis[i], w.t
+    a, t, rate = d.axis[i], w.t, qd
+    if SPRINGS:
+        rate = w.rate[i]
     X, Y, Z, zn, zf = w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
     bias = t[0]
     cross(w.carrier[i], a, bias)
@@ -851,11 +880,13 @@ def eliminate_joint(d, w, i, qd, force, extra, driven, qdd):
     for k in range(3):
         Ua[k] = dot(X[k], a)
         Uf[k] = Y[0, k] * a[0] + Y[1, k] * a[1] + Y[2, k] * a[2]
-    D = dot(a, Ua) + d.gear[i] * d.gear[i] * d.rotor[i] + extra
-    u = force - dot(a, zn) - qd * dot(Ua, bias)
+    D = dot(a, Ua) + d.gear[i] * d.gear[i] * d.rotor[i] + extra[0]
+    u = force - dot(a, zn) - rate * dot(Ua, bias)
     for k in range(3):
-        zf[k] += qd * (Y[0, k] * bias[0] + Y[1, k] * bias[1] + Y[2, k] * bias[2])
-        t[1, k] = qd * dot(X[k], bias)
+        zf[k] += rate * (Y[0, k] * bias[0] + Y[1, k] * bias[1] + Y[2, k] * bias[2])
+        t[1, k] = rate * dot(X[k], bias)
+    if SPRINGS and d.spring[i] >= 0:
+        D, u = eliminate_spring(d, w, i, force, u - force, modal_force[d.spring[i]], extra)
     for k in range(3):
         zn[k] += t[1, k] + spin * bias[k]
         Ua[k] += d.gear[i] * d.rotor[i] * a[k]
@@ -882,22 +913,58 @@ def eliminate_joint(d, w, i, qd, force, extra, driven, qdd):
             Z[m, k] = Z[k, m]
 
 
+def eliminate_spring(d, w, i, force, u, spring_force, extra):
+    r"""Eliminate the deflection gamma of joint i's transmission; return D and u of the motor, and put its Ua and Uf.
+
+    With the link's inertia D about the joint, e = extra/(D + extra) and the motor's acceleration qdd:
+
+    .. math:: \ddot\gamma = (u + f_\gamma - D\ddot q - U_a\cdot al - U_f\cdot a_0) / (D + extra).
+
+    Without `extra` (explicit methods) the motor feels the spring's torque alone.
+    """
+    Ua, Uf, X, Y, Z, zn, zf = w.Ua[i], w.Uf[i], w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
+    D = dot(d.axis[i], Ua)
+    inverse = 1.0 / (D + extra[1])
+    left = extra[1] * inverse
+    w.S[i, 0], w.S[i, 1], w.S[i, 2] = inverse, u + spring_force, D
+    for k in range(3):
+        ga, gf = Ua[k] * inverse, Uf[k] * inverse
+        zn[k] += ga * w.S[i, 1]
+        zf[k] += gf * w.S[i, 1]
+        for m in range(3):
+            Y[k, m] -= ga * Uf[m]
+        for m in range(k + 1):
+            X[k, m] -= ga * Ua[m]
+            Z[k, m] -= gf * Uf[m]
+            X[m, k] = X[k, m]
+            Z[m, k] = Z[k, m]
+    for k in range(3):
+        w.Sa[i, k], w.Sf[i, k] = Ua[k], Uf[k]
+        Ua[k] *= left
+        Uf[k] *= left
+    D = left * D + d.gear[i] * d.gear[i] * d.rotor[i] + extra[0]
+    return D, force + left * u - (1.0 - left) * spring_force
+
+
 def forward_dynamics(
     d, w, qd, joint_force, modal_force, joint_extra, modal_extra, driven, qdd, delta_dd
 ):
     """Accelerations under generalised forces (articulated-body recursion), after `prepare`.
 
-    Joints with `driven` move with the given qdd; for the others, qdd is written. `joint_extra` (N,) and
-    `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix; the implicit integrator uses them.
+    Joints with `driven` move with the given qdd; for the others, qdd is written. `joint_extra` (N, 2), of motor and
+    transmission, and `modal_extra` (N, K, K) are added to the diagonal blocks of the mass matrix; the implicit
+    integrator uses them.
 
-    `joint_force` is (N,) [N m], `modal_force` (N, K) [N, N m].
+    `joint_force` is (N,) [N m], `modal_force` (m,) [N, N m].
     """
     N = d.links
     payload(d, w)
     for i in range(N - 1, -1, -1):
         articulate_tip(d, w, i)
         eliminate_modes(d, w, i, modal_force, modal_extra)
-        eliminate_joint(d, w, i, qd[i], joint_force[i], joint_extra[i], driven[i], qdd[i])
+        eliminate_joint(
+            d, w, i, qd[i], joint_force[i], modal_force, joint_extra[i], driven[i], qdd[i]
+        )
     start(w, d.gravity)
     for k in range(3):
         w.al[0, k] = 0.0
@@ -907,9 +974,16 @@ def forward_dynamics(
         al, a0 = w.al[i], w.a0[i]
         if not driven[i]:
             qdd[i] = w.D[i] * (w.u[i] - dot(w.Ua[i], al) - dot(w.Uf[i], a0))
+        turning, rate = qdd[i], qd[i]
+        if SPRINGS:
+            rate = w.rate[i]
+        if SPRINGS and d.spring[i] >= 0:
+            acc = w.S[i, 1] - w.S[i, 2] * qdd[i] - dot(w.Sa[i], al) - dot(w.Sf[i], a0)
+            delta_dd[d.spring[i]] = w.S[i, 0] * acc
+            turning += delta_dd[d.spring[i]]
         cross(w.carrier[i], d.axis[i], w.t[0])
         for k in range(3):
-            al[k] += d.axis[i, k] * qdd[i] + w.t[0, k] * qd[i]
+            al[k] += d.axis[i, k] * turning + w.t[0, k] * rate
         for j in range(K - 1, -1, -1):
             acc = w.rhs[i, j] - dot(w.Ca[i, j], al) - dot(w.Cf[i, j], a0)
             acc *= w.B[i, j, j]
@@ -922,9 +996,35 @@ def forward_dynamics(
             apply_transposed(w.frame[n], w.t[2], w.a0[n])
 
 
-def modal_force(d, w, delta_d, force):
-    """Elastic and damping force of all modes, after `prepare`."""
+def dead_zone(x, half):
+    """What a deflection x has left beyond a play of +-half."""
+    return x - 0.5 * (abs(x + half) - abs(x - half))
+
+
+def spring_damping(c, s):
+    """Damping of a transmission with the constants c, whose spring is deflected by s.
+
+    Within the play it is zero; it rises with s^2/(s^2 + w^2), w a tenth of half the play, so that the torque has no
+    jump where the flanks meet.
+    """
+    value = c[1]
+    if c[2] != 0.0 and c[1] != 0.0:
+        value = c[1] * (s * s / (s * s + ENGAGEMENT * ENGAGEMENT * c[2] * c[2]))
+    return value + c[3] * c[0] * abs(s)
+
+
+def spring_torque(c, x, rate):
+    """Torque that a transmission with the constants c transmits from link to motor, deflected by x."""
+    s = dead_zone(x, c[2])
+    return c[0] * s + spring_damping(c, s) * rate
+
+
+def modal_force(d, w, delta, delta_d, force):
+    """Elastic and damping force of all modes and transmissions, after `prepare`."""
     for i in range(d.links):
+        row = d.spring[i]
+        if SPRINGS and row >= 0:
+            force[row] = -spring_torque(d.transmission[i], delta[row], delta_d[row])
         for j in range(d.count[i]):
             acc = -w.elastic[i, j]
             for k in range(d.count[i]):
@@ -945,7 +1045,7 @@ def derivative(state, torque, data, out):
     q, delta = state[:n], state[n : n + m]
     qd, delta_d = state[n + m : 2 * n + m], state[2 * n + m :]
     prepare(d, w, q, delta, qd, delta_d)
-    modal_force(d, w, delta_d, force)
+    modal_force(d, w, delta, delta_d, force)
     forward_dynamics(
         d, w, qd, torque, force, joint_extra, modal_extra, driven,
         out[n + m : 2 * n + m], out[2 * n + m :],
@@ -953,7 +1053,7 @@ def derivative(state, torque, data, out):
 
 
 def bias_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out):
-    """All generalised forces of (2) but the inertial ones and joint friction."""
+    """All generalised forces of (2) but the inertial ones, joint friction and the transmissions' torque."""
     d, w = data[0], work[0]
     n = q.size
     prepare(d, w, q, delta, qd, delta_d)
@@ -1018,6 +1118,9 @@ def potential_energy(data, work, q, delta, zero, modal_zero):
                 c = 1.0 - sz * sz
                 ky2 = (by + sy * sz * bz / c) ** 2 * c / (c - sy * sy)
                 energy += 0.5 * (d.node_ei[i, g, 0] * ky2 + d.node_ei[i, g, 1] * bz * bz / c)
+        if SPRINGS and d.spring[i] >= 0:
+            s = dead_zone(delta[d.spring[i]], d.transmission[i, 2])
+            energy += 0.5 * d.transmission[i, 0] * s * s
     apply(R[N], d.payload_moment, w.t[0])
     return energy - d.payload_mass[0] * dot(d.gravity, p[N]) - dot(d.gravity, w.t[0])
 
@@ -1084,6 +1187,8 @@ def point(data, work, index, q, delta, zero, modal_zero, offset, place, jacobian
     for i in range(index + 1):
         apply(R[i], d.axis[i], t[1])
         put_column(jacobian, i, t[1], place, p[i], t)
+        if SPRINGS and d.spring[i] >= 0:
+            put_column(jacobian, n + d.spring[i], t[1], place, p[i], t)
         for j in range(d.count[i]):
             column = n + d.first[i] + j
             apply(R[i], w.turning[i + 1, j], t[1])
@@ -1101,6 +1206,13 @@ def put_column(jacobian, column, axis, place, origin, t):
     for k in range(3):
         jacobian[k, column] = t[9, k]
         jacobian[3 + k, column] = axis[k]
+
+
+def spring_terms(c, state, row, step):
+    """Stiffness and damping of a transmission that `implicit_step` takes implicitly: where it is or gets in contact."""
+    x, rate = state[row], state[state.size // 2 + row]
+    touches = abs(x) >= c[2] or abs(x + step * rate) >= c[2]
+    return c[0] if touches else 0.0, spring_damping(c, dead_zone(x, c[2]))
 
 
 def implicit_step(state, torque, change, step, substeps, stages, net, extra, friction, data):
@@ -1124,7 +1236,7 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
         Work space.
     net : ndarray, shape (n,)
         Work space.
-    extra : tuple of ndarray, shapes (N,) and (N, K, K)
+    extra : tuple of ndarray, shapes (N, 2) and (N, K, K)
         Work space: what is added to the mass matrix.
     data : tuple
         As for `derivative`.
@@ -1151,17 +1263,26 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
             fraction = (number + 0.5) / substeps
             net_torque(torque, change, fraction, friction, point, net)  # noqa: F821 - of kernels.integrators
             prepare(d, w, q, delta, qd, delta_d)
-            modal_force(d, w, delta_d, force)
+            modal_force(d, w, delta, delta_d, force)
             for i in range(n):
+                s = d.spring[i]
+                if SPRINGS and s >= 0:
+                    stiff, damp = spring_terms(d.transmission[i], state, n + s, step)
+                    if stage == 0:
+                        joint_extra[i, 1] = g * damp + g * g * stiff
+                        force[s] -= g * stiff * state[size + n + s]
+                    else:
+                        force[s] += 2.0 * joint_extra[i, 1] * k1[size + n + s]
+                        force[s] -= g * stiff * (point[size + n + s] - 2.0 * k1[n + s])
                 if stage == 0:
                     slip = friction[i, 0]
                     if friction[i, 1] != 0.0:
                         # The secant, not the tangent: a joint that slips now may stick within the step.
                         x = max(abs(qd[i]) / friction[i, 2], 1e-6)
                         slip += friction[i, 1] / friction[i, 2] * np.tanh(x) / x
-                    joint_extra[i] = g * slip
+                    joint_extra[i, 0] = g * slip
                 else:
-                    net[i] += 2.0 * joint_extra[i] * k1[size + i]
+                    net[i] += 2.0 * joint_extra[i, 0] * k1[size + i]
                 first = d.first[i]
                 for j in range(d.count[i]):
                     acc = 0.0

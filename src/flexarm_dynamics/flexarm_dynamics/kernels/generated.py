@@ -54,7 +54,8 @@ def right_hand_side(data, work):
     constants : ndarray
     operations : int
     """
-    n, K, m = data.links, data.s.shape[1], int(data.count.sum())
+    n, K = data.links, data.s.shape[1]
+    m = int(data.count.sum()) + int((data.spring >= 0).sum())
     graph = symbols.Graph()
     state, torque = graph.inputs("x", 2 * (n + m)), graph.inputs("u", n)
     out = np.zeros(2 * (n + m), dtype=object)
@@ -66,7 +67,8 @@ def right_hand_side(data, work):
         }
     )
     zeros = np.zeros((n, K, K), dtype=object)
-    packed = ((exact,), (work,), zeros[:, 0, 0], zeros, np.zeros(n, int), np.zeros(m, dtype=object))
+    none = np.zeros((n, 2), dtype=object)
+    packed = ((exact,), (work,), none, zeros, np.zeros(n, int), np.zeros(m, dtype=object))
     chain.derivative(state, torque, packed, out)
     lines, words, constants, operations = symbols.emit(graph, out)
     lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]

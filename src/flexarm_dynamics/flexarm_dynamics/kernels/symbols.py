@@ -168,6 +168,9 @@ class Symbol:
         """The cosine, as numpy asks it of an object."""
         return self.graph.symbol("np.cos", self)
 
+    def __abs__(self):
+        return self.graph.symbol("abs", self)
+
     def sqrt(self):
         """The square root, as numpy asks it of an object."""
         return self.graph.symbol("np.sqrt", self)

@@ -230,6 +230,8 @@ def assemble(arm, shapes, loads):
         "turn": np.array([rotation(j.origin_rpy) for j in arm.joints]),
         "gear": np.array([j.gear_ratio for j in arm.joints]),
         "rotor": np.array([j.rotor_inertia for j in arm.joints]),
+        "spring": _springs(arm.joints, sum(len(m) for m in modes)),
+        "transmission": np.array([_spring_constants(j.transmission) for j in arm.joints]),
         "length": np.array([link.length for link in arm.links]),
         "mass": z(N), "moment": z(N), "inertia": z((N, 3, 3)), "s": z((N, K)), "e": z((N, K)),
         "gram": z((N, K, K)), "stiffness": z((N, K, K)), "damping": z((N, K, K)), "tip": z((N, K)),
@@ -277,6 +279,16 @@ def assemble(arm, shapes, loads):
         for i in range(N):
             data.bishop[i] = bishop_integrals(data, i, data.cumulate[i, -1])
     return data
+
+
+def _springs(joints, bending):
+    """Place of each joint's transmission in delta, after the links' modes; -1: it has none."""
+    has = np.array([j.transmission is not None for j in joints])
+    return np.where(has, bending + np.cumsum(has) - 1, -1).astype(np.int64)
+
+
+def _spring_constants(t):
+    return (0.0,) * 4 if t is None else (t.stiffness, t.damping, 0.5 * t.play, t.load_damping)
 
 
 def _fill_mode(a, i, j, link, shape, number, direction, points):

@@ -39,6 +39,11 @@ from .assembly import (
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
+#: For arms without transmissions.
+STIFF_SOURCES = (
+    CHAIN_SOURCES[0].replace("SPRINGS = True", "SPRINGS = False"),
+    CHAIN_SOURCES[1],
+)
 
 #: Short enough to be written out in the integrators' loops.
 INLINE = ("derivative", "net_torque", "low_storage")
@@ -73,15 +78,19 @@ class Chain(ArmModel):
         self.data = assemble(arm, self._shapes, loads)
         self._check_inertia()
 
+    @property
+    def _sources(self):
+        return CHAIN_SOURCES if self._transmissions else STIFF_SOURCES
+
     @cached_property
     def kernel(self):
         """The kernels: compiled on first use, or plain."""
-        return load.joined("chain", CHAIN_SOURCES, self._compiled)
+        return load.joined("chain", self._sources, self._compiled)
 
     @cached_property
     def complex_kernel(self):
         """The same for complex numbers: a module of its own, so that both can be compiled at once."""
-        return load.joined("chain_complex", CHAIN_SOURCES, self._compiled)
+        return load.joined("chain_complex", self._sources, self._compiled)
 
     @cached_property
     def _room(self):
@@ -154,11 +163,20 @@ class Chain(ArmModel):
         """
         n, m = self.n_joints, self.n_modes
         out = np.zeros(n + m)
+        delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
         self.kernel.bias_forces(
-            self._data, self._work, self._joint(q, "q"), self._modal(delta, "delta"),
-            self._joint(qd, "qd"), self._modal(delta_d, "delta_d"), np.zeros(n), np.zeros(m), out,
+            self._data, self._work, self._joint(q, "q"), delta,
+            self._joint(qd, "qd"), delta_d, np.zeros(n), np.zeros(m), out,
         )  # fmt: skip
+        for j, constants in self._transmissions:
+            out[n + j] += plain.spring_torque(constants, delta[j], delta_d[j])
         return out
+
+    @cached_property
+    def _transmissions(self):
+        """(place in delta, constants) of each transmission."""
+        d = self.data
+        return [(d.spring[i], d.transmission[i]) for i in np.flatnonzero(d.spring >= 0)]
 
     def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
         """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
@@ -172,6 +190,8 @@ class Chain(ArmModel):
 
     def linearisation(self, q, qd, delta=None, delta_d=None):
         r"""Derivatives of `forces` by delta and by its rates, to machine precision (complex step).
+
+        Without deflections, play is taken as closed: transmissions have their stiffness and damping in contact.
 
         Returns
         -------
@@ -190,7 +210,30 @@ class Chain(ArmModel):
         self.complex_kernel.linearise(
             self._data, self._complex_work, *(a.astype(complex) for a in arrays), STEP, *zeros, K, C
         )
+        if delta is None:
+            self._close_play(K, C)
+        else:
+            self._add_transmissions(K, C, arrays[1], arrays[3])
         return K, C
+
+    def _close_play(self, K, C):
+        """Add stiffness and damping of the transmissions in contact to derivatives of the forces."""
+        for j, (stiffness, damping, _, _) in self._transmissions:
+            K[self.n_joints + j, j] += stiffness
+            C[self.n_joints + j, j] += damping
+
+    def _add_transmissions(self, K, C, delta, delta_d):
+        """Add derivatives of the transmissions' torque, play and all."""
+        for j, c in self._transmissions:
+            stiffness, damping, half, load = c
+            s, row = plain.dead_zone(delta[j], half), self.n_joints + j
+            C[row, j] += plain.spring_damping(c, s)
+            if abs(delta[j]) < half:
+                continue
+            width2 = (plain.ENGAGEMENT * half) ** 2
+            rise = 2.0 * s * width2 / (s * s + width2) ** 2 if half else 0.0
+            K[row, j] += stiffness
+            K[row, j] += (damping * rise + load * stiffness * np.sign(s)) * delta_d[j]
 
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
@@ -231,6 +274,7 @@ class Chain(ArmModel):
             self._data, self._complex_work, position, delta, velocity, delta_d, STEP, zero, modal_zero, out,
             K, C,
         )  # fmt: skip
+        self._close_play(K, C)
         # The last derivative's real part: an imaginary step does not change it.
         return K, C, out.real.copy()
 
@@ -247,7 +291,7 @@ class Chain(ArmModel):
     def _none(self):
         """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
         n, K = self.data.links, self.data.s.shape[1]
-        return np.zeros(n), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
+        return np.zeros((n, 2)), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
 
     def stiffness_matrix(self):
         m = self.n_modes
@@ -255,7 +299,51 @@ class Chain(ArmModel):
         for i in range(self.data.links):
             a, k = self.data.first[i], self.data.count[i]
             out[a : a + k, a : a + k] = self.data.stiffness[i, :k, :k]
+        for j, constants in self._transmissions:
+            out[j, j] = constants[0]
         return out
+
+    def transmission_rates(self):
+        """As `ArmModel.transmission_rates`: of spring or damper with the rest of the arm free, in a straight arm."""
+        if not self._transmissions:
+            return 0.0, 0.0
+        H = np.linalg.inv(self.mass_matrix(np.zeros(self.n_joints)))
+        rates = []
+        for j, (stiffness, damping, half, _) in self._transmissions:
+            h = H[self.n_joints + j, self.n_joints + j]
+            rates.append((np.sqrt(stiffness * h), 0.5 * damping * h, half > 0.0))
+        fastest = max(max(omega, damped) for omega, damped, _ in rates)
+        return fastest, max((omega for omega, _, play in rates if play), default=0.0)
+
+    def static_deflection(self, q):
+        """As `ArmModel.static_deflection`; with play, each link rests on the flank to which its load presses it.
+
+        A link that no load turns rests in the middle of its play; one that hangs in it, where it hangs.
+        """
+        play = [(j, c) for j, c in self._transmissions if c[2] > 0.0]
+        if not play or not any(self.arm.gravity):
+            return super().static_deflection(q)
+        rest, none = np.zeros(self.n_joints), np.zeros(self.n_modes)
+        load = -self.forces(q, rest, none, none)[self.n_joints :]
+        side = {j: np.sign(load[j]) * (abs(load[j]) > 1e-9 * c[0] * c[2]) for j, c in play}
+        turned, hangs = set(), set()
+
+        def replace_forces(delta, force, K2):
+            for j, c in play:
+                force[j] -= plain.spring_torque(c, delta[j], 0.0)
+                if j in hangs:
+                    K2[j, j] -= c[0]
+                else:
+                    force[j] += c[0] * (delta[j] - side[j] * c[2])
+
+        while True:
+            delta = self._rest(q, replace_forces)
+            pulled = [j for j, c in play if j not in hangs and side[j] * (delta[j] - side[j] * c[2]) < 0.0]
+            if not pulled:
+                return delta
+            for j in pulled:  # a flank can't pull: the other one, else none
+                (hangs if j in turned else turned).add(j)
+                side[j] = -side[j]
 
     def kinetic_energy(self, q, qd, delta, delta_d):
         v = np.concatenate([self._joint(qd, "qd"), self._modal(delta_d, "delta_d")])
@@ -391,7 +479,9 @@ class Chain(ArmModel):
         for i in range(self.n_joints - 1):
             # The next joint sits off the tip by its origin, in the tip's frame: undo that joint's turn.
             joint = self.arm.joints[i + 1]
-            turn = rotation(joint.origin_rpy) @ about_axis(joint.axis, q[i + 1])
+            place = self.data.spring[i + 1]
+            angle = q[i + 1] + (delta[place] if delta is not None and place >= 0 else 0.0)
+            turn = rotation(joint.origin_rpy) @ about_axis(joint.axis, angle)
             ends[i] -= R[i + 1] @ turn.T @ np.asarray(joint.origin_xyz)
         return ends
 
@@ -467,7 +557,10 @@ class Chain(ArmModel):
         return Stepper(self, step, trajectory, arguments, data, lock)
 
     def driven_stepper(self, method):
-        """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion."""
+        """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
+
+        Of a joint with a transmission the motor's motion is prescribed; the link's follows.
+        """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1
         data = (self._data, self._new_work(), *none)

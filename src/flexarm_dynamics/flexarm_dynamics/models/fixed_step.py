@@ -31,12 +31,17 @@ METHODS = {
 
 #: Highest angular frequency times substep of the explicit methods.
 PHASE_PER_STEP = {"dop853": 0.5, "rk4": 0.1}
+#: Where there is play, fastest transmission's angular frequency times substep, of all methods: each time flanks meet
+#: or part, a step loses some 1e-6 of the energy.
+PLAY_PHASE_PER_STEP = 0.05
 #: More substeps than this per sample is no simulation any more.
 MAX_SUBSTEPS = 10_000
 
 
 def substeps(model, period, method="dop853"):
     """Substeps per sample that keep the highest free mode's phase below `PHASE_PER_STEP`; implicit: one.
+
+    With play in a transmission, all methods also keep that one's phase below `PLAY_PHASE_PER_STEP`.
 
     Parameters
     ----------
@@ -55,10 +60,12 @@ def substeps(model, period, method="dop853"):
     ModelError
         When the highest mode would need more than `MAX_SUBSTEPS`.
     """
-    if method not in PHASE_PER_STEP:
-        return 1
-    highest = float(model.frequencies()[-1]) if model.n_modes else 0.0
-    count = max(1, int(np.ceil(highest * period / PHASE_PER_STEP[method])))
+    fastest, with_play = model.transmission_rates()
+    count = max(1, int(np.ceil(with_play * period / PLAY_PHASE_PER_STEP)))
+    highest = with_play
+    if method in PHASE_PER_STEP:
+        highest = max(fastest, float(model.frequencies()[-1]) if model.n_modes else 0.0)
+        count = max(count, int(np.ceil(highest * period / PHASE_PER_STEP[method])))
     if count > MAX_SUBSTEPS:
         raise ModelError(
             f"rad/s needs {count} substeps per sample of {period:g} s",

@@ -264,6 +264,10 @@ class ArmModel(ABC):
         """Natural frequencies of `normal_modes` [rad/s]."""
         return self.normal_modes(q, locked)[0]
 
+    def transmission_rates(self):
+        """How fast the fastest transmission is, of all and of those with play [rad/s]; 0 where there is none."""
+        return 0.0, 0.0
+
     def static_deflection(self, q):
         """Deflections at which the arm rests under gravity with its joints held, shape (m,).
 
@@ -272,13 +276,20 @@ class ArmModel(ABC):
         ModelError
             When there is none near the straight arm: it buckles or folds under its own weight.
         """
+        return self._rest(q)
+
+    def _rest(self, q, replace_forces=None):
+        """`static_deflection`; ``replace_forces(delta, force, K2)`` may change forces and their derivative in place."""
         n, m = self.n_joints, self.n_modes
         delta, rest = np.zeros(m), np.zeros(n)
         if not m or not any(self.arm.gravity):
             return delta
         for _ in range(50):
             t = self.terms(q, rest, delta, np.zeros(m))
-            change = np.linalg.solve(t.K2, -(t.f2 + t.K2 @ delta))
+            force = t.f2 + t.K2 @ delta
+            if replace_forces is not None:
+                replace_forces(delta, force, t.K2)
+            change = np.linalg.solve(t.K2, -force)
             delta = delta + change
             if np.abs(change).max() <= 1e-12 * max(np.abs(delta).max(), 1e-12):
                 return delta
