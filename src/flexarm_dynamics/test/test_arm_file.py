@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import Arm
+from flexarm_dynamics.arm.description import Arm, Transmission
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import ArmFileError, ModelError
 from flexarm_dynamics.models import model
@@ -45,6 +45,7 @@ joints:
     damp_torque: 2.5
     damp_time: 0.2
     encoder_counts: 4096
+    transmission: {stiffness: 850.0, damping: 3.0, play: 0.012, load_damping: 0.7}
   - name: elbow
 links:
   - name: upper
@@ -142,6 +143,7 @@ def test_every_field_is_read():
     assert (joint.safe_action, joint.brake_torque, joint.damp_coefficient) == ("brake", 20.0, 0.7)
     assert (joint.damp_torque, joint.damp_time) == (2.5, 0.2)
     assert joint.encoder_counts == 4096
+    assert joint.transmission == Transmission(850.0, 3.0, 0.012, 0.7)
     upper, fore = arm.links
     assert upper.stiffness == {"y": 11.0, "z": 12.0, "twist": 5.0}
     assert upper.polar_inertia_per_length == 1e-5
@@ -170,6 +172,7 @@ def test_what_is_left_out_takes_its_default():
     assert joint.safe_action == "damp"
     assert joint.brake_torque is joint.damp_torque is joint.damp_time is None
     assert arm.payload.mass == 0.0
+    assert joint.transmission is None
     assert arm.modes == () and arm.observed_modes == () and arm.gauges == ()
     assert (arm.foreshortening, arm.finite_slope, arm.model) == (False, False, "chain")
     gauge = arm_file.parse(FULL).gauges[2]
@@ -185,12 +188,13 @@ def test_observed_modes_come_in_the_order_of_the_modal_coordinates():
         "upper_z_mode1",
         "upper_twist_mode1",
         "fore_y_mode1",
+        "shoulder_transmission",
     )
     assert arm.observed_modes == ("upper_y_mode1", "upper_y_mode2", "fore_y_mode1")
     tree = copy.deepcopy(TREE)  # all, unless the file names some
     del tree["observed_modes"], tree["gauges"]
     arm = arm_file.parse(dumped(tree))
-    assert arm.observed_modes == arm.mode_names
+    assert arm.observed_modes == arm.mode_names[:-1]  # no gauge sees a transmission
 
 
 def test_sections_have_the_stiffnesses_of_the_textbook():
@@ -360,7 +364,7 @@ COUNTS_AND_FLAGS = ("foreshortening", "finite_slope", "modes", "bits", "encoder_
 ANY_SIGN = ("position", "surface_distance", "gain", "bias")
 ABOVE_ZERO = (
     "gear_ratio", "smoothing", "velocity", "torque", "length", "mass_per_length", "EI_y", "EI_z", "GJ",
-    "size_y", "size_z", "density", "youngs_modulus", "full_scale",
+    "size_y", "size_z", "density", "youngs_modulus", "full_scale", "stiffness",
 )  # fmt: skip
 #: Path of every number in `FULL`.
 NUMBERS = [
@@ -447,6 +451,7 @@ def test_a_missing_field_is_named(path):
     "path, wrong, hint",
     [
         (("links", 0, "length"), "lenght", "'lenght'"),
+        (("joints", 0, "transmission", "stiffness"), "stifness", "'stifness'"),
         (("joints", 0, "hub_inertia"), "hub_intertia", "'hub_inertia'"),
         (("joints", 0, "limits", "torque"), "torqe", "'torque'"),
         (("links", 0, "flexible", "y", "damping"), "dampng", "'damping'"),
@@ -517,6 +522,9 @@ def test_a_field_given_twice_is_refused(text, start):
         (("joints", 0, "limits", "position"), [1.0, 1.0], "low must be below high"),
         (("joints", 0, "safe_action"), "stop", "'stop' is not one of the choices (brake, damp, zero)"),
         (("joints", 0, "encoder_counts"), 1.5, "1.5 is not an integer"),
+        (("joints", 0, "transmission", "play"), 0.7, "0.7 rad is too large (at most 0.2 rad); the whole way"),
+        (("joints", 0, "rotor_inertia"), 0.0, "must be greater than 0 kg m^2; with a transmission"),
+        (("observed_modes", 0), "shoulder_transmission", "is not a mode of this arm"),
         (("joints", 0, "encoder_counts"), True, "True is not an integer"),
         (("joints", 0, "encoder_counts"), -1, "-1 is out of range (0 to"),
         (("joints", 0, "encoder_counts"), 10**400, "more than 64 bits is out of range (0 to"),

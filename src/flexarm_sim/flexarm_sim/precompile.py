@@ -5,10 +5,12 @@ Otherwise the first node that uses a kernel would wait for it.
 """
 
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Transmission
 from flexarm_dynamics.models import model
 
 from .integrators import METHODS
@@ -21,19 +23,29 @@ ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
 def main():
     """Run each kernel once, on two cores; numba caches what it compiles for that."""
     with ProcessPoolExecutor(2) as pool:
-        for job in [pool.submit(linearise), pool.submit(loops), pool.submit(arms)]:
+        jobs = [pool.submit(job, geared) for geared in (False, True) for job in (linearise, loops)]
+        for job in [*jobs, pool.submit(arms)]:
             job.result()
 
 
-def linearise():
+def two_links(geared):
+    """A chain of two links, with transmissions or without."""
+    arm = arm_file.load("two_link")
+    if geared:
+        gear = {"rotor_inertia": 1e-4, "gear_ratio": 50.0, "transmission": Transmission(1e3)}
+        arm = replace(arm, joints=tuple(replace(joint, **gear) for joint in arm.joints))
+    return model.build(arm)
+
+
+def linearise(geared):
     """The recursion on complex numbers."""
-    chain = model.build(arm_file.load("two_link"))
+    chain = two_links(geared)
     chain.linearisation(np.zeros(2), np.zeros(2))
 
 
-def loops():
+def loops(geared):
     """The recursion on real numbers, and the integrators around it."""
-    chain = model.build(arm_file.load("two_link"))
+    chain = two_links(geared)
     state = np.zeros(2 * (chain.n_joints + chain.n_modes))
     evaluate(chain)
     for method in METHODS.values():

@@ -17,6 +17,7 @@ from .description import (
     MAX_MODES,
     SAFE_ACTIONS,
     SHAPES,
+    TRANSMISSION,
     Arm,
     Flexibility,
     Friction,
@@ -25,11 +26,14 @@ from .description import (
     Limits,
     Link,
     Payload,
+    Transmission,
 )
 from .entries import Section, kind_of, read_yaml, value_error
 
 #: Largest resolution of a gauge's bridge [bit].
 MAX_BITS = 32
+#: Largest play of a transmission [rad].
+MAX_PLAY = 0.2
 #: Largest full scale of a gauge [-].
 MAX_STRAIN = 0.1
 
@@ -44,6 +48,28 @@ def _friction(joint):
         smoothing=s.number("smoothing", "none", 0.01, positive=True),
     )
     s.done()
+    return out
+
+
+def _transmission(joint):
+    if not joint.has("transmission"):
+        return None
+    s = joint.section("transmission")
+    out = Transmission(
+        stiffness=s.number("stiffness", "torque", positive=True),
+        damping=s.number("damping", "viscous", 0.0, low=0.0),
+        play=s.number("play", "angle", 0.0, low=0.0),
+        load_damping=s.number("load_damping", "time", 0.0, low=0.0),
+    )
+    s.done()
+    if out.play > MAX_PLAY:
+        hint = "the whole way from flank to flank; in degrees?"
+        raise s.error(
+            "play", "rad is too large", value=out.play, limit=f"at most {MAX_PLAY} rad", hint=hint
+        )
+    if not joint.number("rotor_inertia", "inertia", 0.0) > 0.0:
+        hint = "with a transmission the motor turns by itself: give the inertia of its rotor"
+        raise joint.error("rotor_inertia", "must be greater than 0 kg m^2", hint=hint)
     return out
 
 
@@ -101,6 +127,7 @@ def _joint(s):
         rotor_inertia=s.number("rotor_inertia", "inertia", 0.0, low=0.0),
         gear_ratio=s.number("gear_ratio", "none", 1.0, positive=True),
         friction=_friction(s),
+        transmission=_transmission(s),
         limits=_limits(s),
         safe_action=s.text("safe_action", "damp", SAFE_ACTIONS),
         encoder_counts=s.integer("encoder_counts", 0, low=0, high=2**31),
@@ -350,7 +377,8 @@ def parse(text, where="arm"):
     # Misspelt fields first: a misspelt observed_modes would be taken for too few gauges.
     top.has("observed_modes")
     top.done()
-    return replace(arm, observed_modes=_observed(top, arm.modes, gauges))
+    bending = [m for m in arm.modes if m.direction != TRANSMISSION]  # what gauges can see
+    return replace(arm, observed_modes=_observed(top, bending, gauges))
 
 
 def _model(top):

@@ -51,7 +51,8 @@ DATA = {
     "turn": ("N", 3, 3),  # and its orientation
     "gear": ("N",),
     "rotor": ("N",),  # rotor inertia, motor side
-    "spring": ("N",),  # place in delta of the deflection of each joint's transmission; -1: it has none
+    # place in delta of the deflection of each joint's transmission; -1: it has none
+    "spring": ("N",),
     "transmission": ("N", 4),  # stiffness, damping, half the play, damping per transmitted torque
     "length": ("N",),
     "mass": ("N",),  # beam, and the motor at its base
@@ -916,11 +917,12 @@ def eliminate_joint(d, w, i, qd, force, modal_force, extra, driven, qdd):
 def eliminate_spring(d, w, i, force, u, spring_force, extra):
     r"""Eliminate the deflection gamma of joint i's transmission; return D and u of the motor, and put its Ua and Uf.
 
-    With the link's inertia D about the joint, e = extra/(D + extra) and the motor's acceleration qdd:
+    With the link's inertia D about the joint and the motor's acceleration qdd:
 
     .. math:: \ddot\gamma = (u + f_\gamma - D\ddot q - U_a\cdot al - U_f\cdot a_0) / (D + extra).
 
-    Without `extra` (explicit methods) the motor feels the spring's torque alone.
+    `force` acts on the motor, `spring_force` between motor and link, `u` is what the link's motion adds. Without
+    `extra` (explicit methods) the motor feels the spring's torque alone.
     """
     Ua, Uf, X, Y, Z, zn, zf = w.Ua[i], w.Uf[i], w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
     D = dot(d.axis[i], Ua)

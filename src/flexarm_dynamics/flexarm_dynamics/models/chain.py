@@ -338,7 +338,9 @@ class Chain(ArmModel):
 
         while True:
             delta = self._rest(q, replace_forces)
-            pulled = [j for j, c in play if j not in hangs and side[j] * (delta[j] - side[j] * c[2]) < 0.0]
+            pulled = [
+                j for j, c in play if j not in hangs and side[j] * (delta[j] - side[j] * c[2]) < 0.0
+            ]
             if not pulled:
                 return delta
             for j in pulled:  # a flank can't pull: the other one, else none
@@ -559,7 +561,7 @@ class Chain(ArmModel):
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
 
-        Of a joint with a transmission the motor's motion is prescribed; the link's follows.
+        `method` is an explicit one. Of a joint with a transmission the motor's motion is prescribed; the link's follows.
         """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1

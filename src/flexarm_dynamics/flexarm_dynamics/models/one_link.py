@@ -88,6 +88,9 @@ class OneLinkEquations(ArmModel):
         super().__init__(arm)
         _check_planar(arm)
         self.link, self.joint = arm.links[0], arm.joints[0]
+        if self.joint.transmission is not None:
+            field, hint = f"transmission of {self.joint.name}", "use model chain"
+            raise ModelError("is not in this model", field=field, hint=hint)
         self.flexibility = self.link.flexible["y"]
         if shapes is None:
             shapes = shapes_of(self.link, "y", self.flexibility, outboard(arm)[0])
