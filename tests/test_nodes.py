@@ -426,6 +426,16 @@ def test_the_last_of_many_sets_is_the_law_in_the_end(running):
     assert obeys(running.state, 6.25, gain(alpha=4.0))
 
 
+def last_set(bench):
+    """What the controller's diagnostics say of the parameters that were set last."""
+    said = bench.diagnostics("controller")
+    return (
+        next((v.value for v in said[-1].values if v.key == "last parameters set"), "")
+        if said
+        else ""
+    )
+
+
 def test_a_law_that_another_process_designs_is_taken_and_a_bad_one_refused(bench):
     file = parameter_files.find("paper_composite")
     bench.start("simulator", {**LOCKSTEP, "pause_at": -1.0}, file=file)
@@ -435,9 +445,13 @@ def test_a_law_that_another_process_designs_is_taken_and_a_bad_one_refused(bench
     arm.wait_ready()
     assert bench.set("controller", fast__alpha=8.0)[0].successful
     bench.wait_for("the new law", lambda: obeys(arm.state, 6.25, gain(alpha=8.0)))
+    says = r"INFO.*fast\.alpha 8\.0 \(was \S+\): active"
+    bench.wait_for("the log", lambda: re.search(says, bench.log("controller")))
     assert bench.set_atomically("controller", fast__alpha=0.0, fast__q=[0.0]).successful
     bench.wait_for("the refusal", lambda: "design refused" in bench.log("controller"))
     bench.wait_for("the old value", lambda: bench.get("controller", "fast.alpha") == 8.0)
+    bench.wait_for("a diagnosis", lambda: ": refused: fast" in last_set(bench))
+    assert "fast.alpha 0.0 (was 8.0)" in last_set(bench)
     goes_on(arm)
     assert obeys(arm.state, 6.25, gain(alpha=8.0))
     assert bench.stop("controller", signal.SIGTERM) == 0

@@ -210,7 +210,7 @@ class ControllerNode(ArmNode):
         super().destroy_node()
 
     def diagnose(self):
-        return self._report.diagnose()
+        return self._report.diagnose(self._designs.last_change)
 
 
 def main(args=None):

@@ -16,6 +16,11 @@ from .controller_parameters import of_design, of_limits
 MAX_PAUSE = 0.2
 
 
+def _difference(values, active):
+    """The values that differ from the active ones, for people."""
+    return ", ".join(f"{k} {v} (was {active[k]})" for k, v in values.items() if v != active[k])
+
+
 class Designs:
     """Applies changed parameters, or sets them back to the active ones.
 
@@ -28,6 +33,11 @@ class Designs:
         With its parameters, whose changes come to `changed`.
     core : ArmController
     designer : Designer
+
+    Attributes
+    ----------
+    last_change : str
+        The last parameters that were set, and what became of them; empty before.
     """
 
     def __init__(self, node, core, designer):
@@ -39,6 +49,7 @@ class Designs:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="design")
         values = node.parameters.values()
         self._limits, self._design = of_limits(values), of_design(values)
+        self.last_change = ""
         node.parameters.on_change(self.changed)
 
     def changed(self, names):
@@ -46,7 +57,10 @@ class Designs:
         if of_limits(dict.fromkeys(names)):
             self._take_limits()
         if of_design(dict.fromkeys(names)):
-            self._waiting.append(of_design(self._node.parameters.values()))
+            values = of_design(self._node.parameters.values())
+            if values != self._design or self._waiting:
+                self.last_change = f"{_difference(values, self._design)}: being designed"
+            self._waiting.append(values)
             self._thread.submit(self._redesign)
 
     def _take_limits(self):
@@ -54,10 +68,18 @@ class Designs:
         try:
             self._core.configure(limits)
         except FlexarmError as error:
+            self.last_change = f"{_difference(limits, self._limits)}: refused: {error}"
             self._node.get_logger().error(f"limits refused, the old ones stay: {error}")
             self._set_back(limits, self._limits)
         else:
+            self._report(limits, self._limits)
             self._limits = limits
+
+    def _report(self, values, active):
+        """Tell that values are active now, beside those that were."""
+        if values != active:
+            self.last_change = f"{_difference(values, active)}: active"
+            self._node.get_logger().info(self.last_change)
 
     def _redesign(self):
         """In the design thread: the new control replaces the old one whole, or the parameters are set back."""
@@ -79,6 +101,7 @@ class Designs:
             for warning in law.warnings():
                 log.warning(warning)
             self._node.hand_over(self._core.replace_law, law)
+            self._report(values, self._design)
             self._design = values
         except CancelledError:
             pass
@@ -86,6 +109,7 @@ class Designs:
             # A user's law may raise anything, and a thread drops what it raises.
             if not self._designer.closed:
                 kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
+                self.last_change = f"{_difference(values, self._design)}: refused: {kind}{error}"
                 log.error(f"design refused, the old law goes on: {kind}{error}")
                 return False
         return True

@@ -58,8 +58,11 @@ class Report:
         elif state == State.STOPPING:
             log.warning(f"stopping: {reason}")
 
-    def diagnose(self):
-        """Level, message and values for `/diagnostics`, of the time since the last call."""
+    def diagnose(self, last_change=""):
+        """Level, message and values for `/diagnostics`, of the time since the last call.
+
+        `last_change` is that of `Designs`.
+        """
         rate, self._samples_before = self._samples - self._samples_before, self._samples
         saturated = self._saturated - self._saturated_before
         self._saturated_before = self._saturated
@@ -85,6 +88,7 @@ class Report:
             "fast control": "on" if core.fast_enabled else "off",
             "saturated samples": self._saturated,
             "trajectory": core.trajectory_id,
+            "last parameters set": last_change or "-",
         }
         return *self._level(saturated, rate, median), values
 
