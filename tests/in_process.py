@@ -25,9 +25,15 @@ from flexarm_ros.session import WaitError
 from flexarm_sim.nodes.simulator import SimulatorNode
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 from flexarm_tools.recording.recorder import Recorder, raw_stamp_ns
+from flexarm_tools.replay.node import ReplayNode
 from flexarm_tools.running.processes import arguments, own_domain
 
-CLASSES = {"simulator": SimulatorNode, "observer": ObserverNode, "controller": ControllerNode}
+CLASSES = {
+    "simulator": SimulatorNode,
+    "observer": ObserverNode,
+    "controller": ControllerNode,
+    "replay": ReplayNode,
+}
 
 
 class Queue:

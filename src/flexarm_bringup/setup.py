@@ -29,6 +29,7 @@ setup(
             "flexarm = flexarm_bringup.cli:entry",
             "publish_trajectory = flexarm_tools.publish_trajectory:entry",
             "shape = flexarm_tools.shape:start_shape",
+            "replay = flexarm_tools.replay:start_replay",
             "ros2_control_adapter = flexarm_tools.adapters:start_ros2_control_adapter",
         ],
     },

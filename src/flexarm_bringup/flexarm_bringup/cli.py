@@ -165,6 +165,11 @@ COMMANDS = {
         "recording",
         "what a recording shows, a bag or a CSV file: gaps, rest, noise, drift, delays, ring-downs, spectra",
     ),
+    "replay": Command(
+        "flexarm_tools.replay.command",
+        "replay",
+        "publish a recording as a driver does: observer, view and report run on it; no torque is applied",
+    ),
     "report": Command(
         "flexarm_tools.report.command",
         "report",

@@ -15,11 +15,14 @@ def groups():
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
 
+    from .replay import node as replay
+
     given = {
         "simulator": {"": (*simulator.PARAMETERS, *simulator_node.PARAMETERS)},
         "observer": observer.parameter_groups(),
         "controller": controller.parameter_groups(),
         "excite": excite.parameter_groups(),
+        "replay": {"": replay.PARAMETERS},
     }
     return {node: {**groups, "": (*COMMON, *groups[""])} for node, groups in given.items()}
 
