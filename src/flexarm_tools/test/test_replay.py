@@ -144,7 +144,10 @@ def test_in_lockstep_a_sample_without_an_answer_is_sent_again(replay):
         True,
     ]
     assert node.diagnose()[0] == OK
-    assert node.diagnose()[:2] == (WARN, "nothing is played: nobody listens, or nothing answers")
+    assert node.diagnose()[:2] == (
+        WARN,
+        "nothing is played: no node subscribes to arm_state, or none answers",
+    )
 
 
 def test_in_real_time_it_waits_for_a_listener_and_goes_on_its_grid(replay):

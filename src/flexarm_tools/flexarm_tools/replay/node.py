@@ -18,7 +18,7 @@ from .playback import Playback, part
 NONE, OBSERVER, CONTROLLER = "none", "observer", "controller"
 #: In lockstep a sample without an answer is sent again after so long (wall time), and this is reported after [s].
 RESEND, UNANSWERED = 0.1, 5.0
-#: The first sample waits so long for somebody who listens [s].
+#: The first sample waits so long for a subscription [s].
 LISTENERS = 2.0
 
 OWN = (
@@ -136,7 +136,7 @@ class ReplayNode(Driver):
             return
         self._waited += RESEND
         if self.playback.over and self._waited > 10.0 * RESEND:
-            self._end()  # nobody has answered the last sample
+            self._end()  # the last sample has no answer
         elif self._waited >= 2.0 * RESEND:
             self.writer.message.clock_stopped = True
             self.state_publisher.publish(self.writer.message)
@@ -187,7 +187,9 @@ class ReplayNode(Driver):
         if self.playback.over:
             return OK, "the recording is over"
         return (
-            (OK, "") if samples else (WARN, "nothing is played: nobody listens, or nothing answers")
+            (OK, "")
+            if samples
+            else (WARN, "nothing is played: no node subscribes to arm_state, or none answers")
         )
 
 
