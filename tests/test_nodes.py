@@ -428,10 +428,10 @@ def test_the_last_of_many_sets_is_the_law_in_the_end(running):
 
 def last_set(bench):
     """What the controller's diagnostics say of the parameters that were set last."""
-    said = bench.diagnostics("controller")
+    states = bench.diagnostics("controller")
     return (
-        next((v.value for v in said[-1].values if v.key == "last parameters set"), "")
-        if said
+        next((v.value for v in states[-1].values if v.key == "last parameters set"), "")
+        if states
         else ""
     )
 
