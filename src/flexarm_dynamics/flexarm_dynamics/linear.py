@@ -81,7 +81,7 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
 
 
 def linear_plant(model, q, coulomb=True):
-    """The arm (2) linearised at rest, held by its torque against gravity.
+    """The arm (2) linearised at rest, held by its torque against gravity; play is taken as closed.
 
     Parameters
     ----------
@@ -96,6 +96,7 @@ def linear_plant(model, q, coulomb=True):
     A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
         Of the state (q, delta, qd, delta_d) and the joint torque.
     """
+    model = model.without_play()
     n, rest, hold = model.n_joints, state_at_rest(model, q), static_torque(model, q)
     A = state_matrix(model, rest, hold, coulomb)
     # The arm is exactly linear in the torque: a step of one.

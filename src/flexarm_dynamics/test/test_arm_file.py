@@ -46,6 +46,7 @@ joints:
     damp_time: 0.2
     encoder_counts: 4096
     transmission: {stiffness: 850.0, damping: 3.0, play: 0.012, load_damping: 0.7}
+    encoder: link
   - name: elbow
 links:
   - name: upper
@@ -144,6 +145,7 @@ def test_every_field_is_read():
     assert (joint.damp_torque, joint.damp_time) == (2.5, 0.2)
     assert joint.encoder_counts == 4096
     assert joint.transmission == Transmission(850.0, 3.0, 0.012, 0.7)
+    assert (joint.encoder, arm.joints[1].encoder) == ("link", "motor")
     upper, fore = arm.links
     assert upper.stiffness == {"y": 11.0, "z": 12.0, "twist": 5.0}
     assert upper.polar_inertia_per_length == 1e-5
@@ -523,6 +525,7 @@ def test_a_field_given_twice_is_refused(text, start):
         (("joints", 0, "safe_action"), "stop", "'stop' is not one of the choices (brake, damp, zero)"),
         (("joints", 0, "encoder_counts"), 1.5, "1.5 is not an integer"),
         (("joints", 0, "transmission", "play"), 0.7, "0.7 rad is too large (at most 0.2 rad); the whole way"),
+        (("joints", 0, "encoder"), "load", "'load' is not one of the choices (motor, link)"),
         (("joints", 0, "rotor_inertia"), 0.0, "must be greater than 0 kg m^2; with a transmission"),
         (("observed_modes", 0), "shoulder_transmission", "is not a mode of this arm"),
         (("joints", 0, "encoder_counts"), True, "True is not an integer"),

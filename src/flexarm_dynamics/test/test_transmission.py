@@ -15,8 +15,11 @@ from flexarm_dynamics.arm.description import (
     Link,
     Payload,
     Transmission,
+    scaled,
 )
+from flexarm_dynamics.arm.encoders import encoder_rows, motors_at_rest
 from flexarm_dynamics.kernels import chain as kernel
+from flexarm_dynamics.linear import linear_plant
 from flexarm_dynamics.models.chain import Chain
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import rotation
@@ -337,3 +340,43 @@ def test_arms_without_transmissions_run_code_without_them():
     bare, geared = Chain(spatial((None,) * 3)), Chain(spatial(GEARS))
     assert not bare.kernel.SPRINGS and geared.kernel.SPRINGS
     assert not bare.complex_kernel.SPRINGS
+
+
+# --- what controllers know ---------------------------------------------------------------------
+
+
+def test_a_controller_knows_the_arm_with_its_links_fixed_to_the_motors():
+    arm = replace(spatial(GEARS), observed_modes=("link1_y_mode1",))
+    known = arm.known
+    assert known.mode_names == spatial((None,) * 3).mode_names
+    assert known.joints[0].inertia == arm.joints[0].inertia
+    assert known.whole is arm and arm.whole is arm and known.known is known
+    assert bare_arm().known.simplifies is None
+    changed = scaled(known.with_modes(2), payload=2.0)
+    assert changed.whole.payload.mass == changed.payload.mass == 2.0 * arm.payload.mass
+    assert changed.whole.joints == arm.joints
+    assert len(changed.whole.mode_names) == len(changed.mode_names) + 2
+
+
+def bare_arm():
+    """Without transmissions."""
+    return spatial((None,) * 3)
+
+
+def test_linear_models_take_the_play_as_closed():
+    chain, link, motor = single(replace(GEAR, damping=0.0))
+    A, _ = linear_plant(chain, np.zeros(1))
+    omega = np.sqrt(850.0 * (1 / link + 1 / motor))
+    assert np.abs(np.linalg.eigvals(A)).max() == pytest.approx(omega, rel=1e-6)
+    assert bare_arm().without_play == bare_arm()
+
+
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+def test_an_encoder_reads_the_motor_or_the_link(encoder):
+    arm = single(GEAR, gravity=(0.0, -9.81, 0.0))[0].arm
+    chain = Chain(replace(arm, joints=(replace(arm.joints[0], encoder=encoder),)))
+    assert_allclose(encoder_rows(chain), [[1.0, float(encoder == "link")]])
+    motor, delta = motors_at_rest(chain, np.array([0.3]))
+    assert encoder_rows(chain) @ np.concatenate([motor, delta]) == pytest.approx(0.3, abs=1e-12)
+    assert chain.static_deflection(motor) == pytest.approx(delta, abs=1e-12)
+    assert delta[0] < -0.006

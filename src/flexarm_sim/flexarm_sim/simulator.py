@@ -7,6 +7,7 @@ import numpy as np
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Arm
+from flexarm_dynamics.arm.encoders import encoder_rows, motors_at_rest
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
@@ -67,7 +68,8 @@ class Simulator:
     stamp_ns : int
         Its time [ns]: sequence times the period, from `START_NS`.
     position, velocity, torque, strain, amplitude, rate : ndarray
-        The present sample: joint position (n,) [rad], velocity (n,) [rad/s], torque applied until now (n,)
+        The present sample: joint position (n,) [rad], velocity (n,) [rad/s], of motors or links as the encoders
+        measure them, torque applied until now (n,)
         [N m], strain (gauges,), modal amplitudes derived from the strains and true rates of the observed
         modes (m,).
     """
@@ -79,8 +81,8 @@ class Simulator:
         self.settings = dict(settings)
         arm = _arm(settings["arm"])
         self.arm = arm
-        self.nominal = model.build(arm)
-        plant_arm = _arm(settings["plant_arm"]) if settings["plant_arm"] else arm
+        self.nominal = model.build(arm.known)
+        plant_arm = (_arm(settings["plant_arm"]) if settings["plant_arm"] else arm).whole
         if settings["plant_modes"]:
             plant_arm = plant_arm.with_modes(settings["plant_modes"])
         self._same_names(plant_arm)
@@ -98,6 +100,8 @@ class Simulator:
         self.position, self.velocity = np.zeros(n), np.zeros(n)
         self.torque, self.strain = np.zeros(n), np.zeros(len(arm.gauges))
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        slack = encoder_rows(self.plant_model)[:, n:]
+        self._slack = slack if slack.any() else None
         self._observed = [self.plant_model.mode_names.index(name) for name in arm.observed_modes]
         self.reset()
 
@@ -125,8 +129,15 @@ class Simulator:
         return 1e-9 * (self.stamp_ns - self.START_NS)
 
     def reset(self, position=None):
-        """Put the arm at rest at `position` [rad], by default the initial one; sequence and time start again."""
-        self.plant.reset(self.settings["initial_position"] if position is None else position)
+        """Put the arm at rest at `position` [rad], by default the initial one; sequence and time start again.
+
+        The `position` is what the encoders read.
+        """
+        position = self.settings["initial_position"] if position is None else position
+        if self._slack is None:
+            self.plant.reset(position)
+        else:
+            self.plant.reset(*motors_at_rest(self.plant_model, position))
         self.sensors.reset()
         self.sequence, self.stamp_ns = 0, self.START_NS
         self.torque[:] = 0.0
@@ -156,8 +167,11 @@ class Simulator:
 
     def _measure(self):
         plant = self.plant
-        self.sensors.position(plant.q, self.position)
-        self.velocity[:] = plant.qd
+        position, self.velocity[:] = plant.q, plant.qd
+        if self._slack is not None:
+            position = position + self._slack @ plant.delta
+            self.velocity += self._slack @ plant.delta_d
+        self.sensors.position(position, self.position)
         self.sensors.strain(plant.delta, self.strain)
         if self.strain_map is not None:
             self.strain_map.amplitudes(self.strain, self.amplitude)

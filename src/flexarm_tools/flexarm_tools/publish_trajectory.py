@@ -108,7 +108,7 @@ def profile_of(options, reference, arm=None):
     """
     settings = settings_of(options)
     if arm is None and specs.needs_model(options.profile, settings):
-        arm = model.build(arm_file.load(options.arm))
+        arm = model.build(arm_file.load(options.arm).known)
     return specs.motion(options.profile, settings, arm, list(reference))
 
 
@@ -125,7 +125,7 @@ def prepare(options):
     FlexarmError
         When there is no such motion, or it is beyond the arm's limits.
     """
-    arm = model.build(arm_file.load(options.arm))
+    arm = model.build(arm_file.load(options.arm).known)
     profile = profile_of(options, np.zeros(arm.n_joints), arm)
     trajectory = specs.sampled(profile, arm, points_of(options))
     found = {"profile": options.profile, "duration_s": profile.duration}
@@ -217,7 +217,7 @@ def publish(options, ros_args=None):
 
     from .running.lockstep import trajectory_message
 
-    arm = arm_file.load(options.arm)
+    arm = arm_file.load(options.arm).known
     names = arm.joint_names
     built = model.build(arm) if specs.needs_model(options.profile, settings_of(options)) else None
     if options.profile not in ("line", "arc"):  # whose way depends on where the arm is

@@ -22,7 +22,7 @@ def prepare(model, feedforward, trajectory, start):
 
 def find(model, settings, uncertainty):
     """`default.find` for the model's arm, callable in the design process."""
-    return default.find(model.arm, settings, uncertainty)
+    return default.find(model.arm.whole, settings, uncertainty)
 
 
 def judge(model, trajectory, start, limit):

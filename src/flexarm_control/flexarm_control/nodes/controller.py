@@ -46,7 +46,7 @@ class ControllerNode(ArmNode):
     def build(self):
         parameters, log = self.parameters, self.get_logger()
         self.arm = arm = arm_file.load(parameters["arm"])
-        self.model = model.build(arm)
+        self.model = model.build(arm.known)
         parameters.resolve(sizes(self.model))
         self._close_workers()
         process = parameters["design_process"]
@@ -65,7 +65,7 @@ class ControllerNode(ArmNode):
         self._designs = Designs(self, self.core, designer)
         self._workers = designer, self._designs, self._inbox
         self._reader = StateReader(arm)
-        self._sample = ArmSample(len(arm.joints), len(arm.modes))
+        self._sample = ArmSample(len(arm.joints), self.model.n_modes)
         self._torque = TorqueWriter(arm)
         self.core.controller_id = self._torque.message.controller_id
         self._state = CompositeStateWriter(self.model)

@@ -47,7 +47,7 @@ class ExciteNode(ArmNode):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
         settings = parameters.group("", excitation_run.PARAMETERS)
-        self.core = ExcitationRun(model.build(self.arm), settings)
+        self.core = ExcitationRun(model.build(self.arm.known), settings)
         self._reader, self._sample = StateReader(self.arm), ArmSample(len(self.arm.joints))
         self._torque = TorqueWriter(self.arm)
         self._ticks, self._seen, self._reported_end = 0, False, False

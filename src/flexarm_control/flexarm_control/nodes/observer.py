@@ -43,7 +43,7 @@ class ObserverNode(ArmNode):
     def build(self):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
-        self.model = model.build(self.arm)
+        self.model = model.build(self.arm.known)
         parameters.resolve(sizes(self.model))
         kind = parameters["design.type"]
         self.designed = default.is_wanted(parameters["arm"], parameters.given, kind)
@@ -55,9 +55,9 @@ class ObserverNode(ArmNode):
         parameters.on_change(self._changed)
         arm = self.arm
         self._reader = StateReader(arm)
-        self._sample = ArmSample(len(arm.joints), len(arm.modes), len(arm.gauges))
+        self._sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
-        self._statistics = ObserverStatistics(len(arm.modes))
+        self._statistics = ObserverStatistics(self.model.n_modes)
         self._estimate_pub = self.make_publisher(ArmState, "arm_state_estimate")
         self._state_pub = self.make_publisher(ObserverState, "observer/state")
         self.make_service(Trigger, "~/calibrate_gauges", self._on_calibrate)

@@ -59,7 +59,8 @@ class Card:
 
 def card(design):
     """The `Card` of a design."""
-    arm, sampling, nominal = richer(design.arm), design.sampling, build(design.arm)
+    arm, sampling = richer(design.arm.whole), design.sampling
+    nominal = build(design.arm.known)
     plants, K = {}, design.K
 
     def loops(payload=1.0, stiffness=1.0, gain=1.0, delay=None):
@@ -120,7 +121,7 @@ def card(design):
 def poles(design):
     """Poles of all loops that a design is for: (name, fraction of the decay that is asked, s (k,)) of each [1/s]."""
     found = uncertain_loops(
-        build(design.arm), design.configurations, design.sampling, design.uncertainty
+        build(design.arm.known), design.configurations, design.sampling, design.uncertainty
     )
     return [
         (loop.name, loop.fraction, np.log(eigenvalues(loop, design.K)[1]) / loop.period)

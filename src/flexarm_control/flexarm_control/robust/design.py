@@ -247,7 +247,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         Where the arm rests in no configuration, or has nothing to measure its bending by.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
-    nominal = build(arm)
+    nominal = build(arm.known)
     at = places(nominal, settings)
     omega_1 = lowest(nominal)
     sampling, omega_c = sampling_for(nominal, at, settings)

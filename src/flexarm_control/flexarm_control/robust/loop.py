@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexarm_dynamics.arm.encoders import encoder_rows
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.linear import linear_plant, sampled
 
@@ -79,7 +80,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     B = gain * B
     h, size, p = sampling.period, A.shape[0], n + m
     C = np.zeros((p, size))
-    C[:n, :n] = np.eye(n)
+    C[:n, : n + mp] = encoder_rows(plant)
     if m:
         C[n:, n : n + mp] = measured_amplitudes(nominal, plant)
     keep = np.exp(-h * np.repeat([sampling.joint_corner, sampling.modal_corner], [n, m]))
@@ -100,7 +101,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     rate[:, at_r : at_r + p] = np.diag(keep)
     if np.isinf(sampling.joint_corner):
         rate[:n] = 0.0
-        rate[:n, n + mp : 2 * n + mp] = np.eye(n)
+        rate[:n, n + mp : size] = encoder_rows(plant)
     integral = np.zeros((n, total))  # -w_k
     integral[:, at_w : at_w + n] = np.eye(n)
     integral[:, at_y : at_y + n] = h * np.eye(n)

@@ -117,7 +117,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     list of Loop
     """
     (p0, p1), (k0, k1), (d0, _) = uncertainty.payload, uncertainty.stiffness, uncertainty.damping
-    arm = richer(nominal.arm)
+    arm = richer(nominal.arm.whole)
     plants = {
         f"payload x {p:g}, stiffness x {k:g}": build(scaled(arm, p, k, d0))
         for p, k in ((1.0, 1.0), (p1, k0), (p0, k1))

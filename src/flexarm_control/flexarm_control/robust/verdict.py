@@ -118,7 +118,7 @@ class Judge:
     def __init__(self, controllers, delay=0.0):
         self.loops = [WholeLoop(c, delay) for c in controllers]
         self.delay, self.period = delay, controllers[0].period
-        self.arm = controllers[0].model.arm
+        self.arm = controllers[0].model.arm.whole
         self._models = {}
 
     def stable(self, payload=1.0, stiffness=1.0, gain=1.0, later=0.0, richer=False):

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flexarm_dynamics.arm.encoders import encoder_rows
 from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_dynamics.linear import linear_plant, sampled, state_at_rest, static_torque
 
@@ -279,15 +280,20 @@ class WholeLoop:
         self.controller, self.delay, self._plants = controller, delay, {}
 
     def plant(self, model, key=None):
-        """A, B of an arm at rest, kept under a `key`, with the map from its deflections to the amplitudes."""
+        """A, B of an arm at rest, with the maps from its deflections to the amplitudes and to the encoders' readings.
+
+        Kept under a `key`.
+        """
         if key is None or key not in self._plants:
             c = self.controller
             A, B = linear_plant(model, c.q, not c.separate)
             if model.n_modes == c.model.n_modes:
                 seen = np.eye(model.n_modes)
-            else:
+            elif c.model.n_modes:
                 seen = measured_amplitudes(c.model, model)
-            self._plants[key] = A, B, seen
+            else:
+                seen = np.zeros((0, model.n_modes))
+            self._plants[key] = A, B, seen, encoder_rows(model)
         return self._plants[key]
 
     def matrix(self, plant=None, gain=1.0, delay=None):
@@ -303,7 +309,7 @@ class WholeLoop:
             [s]; that of the loop if not given.
         """
         c, T = self.controller, self.controller.period
-        A, B, seen = self.plant(c.model, "model") if plant is None else plant
+        A, B, seen, turned = self.plant(c.model, "model") if plant is None else plant
         n, mp, size, x = c.model.n_joints, seen.shape[1], len(A), len(c.A)
         delay = self.delay if delay is None else delay
         whole = int(delay / T + 1e-9)
@@ -313,9 +319,9 @@ class WholeLoop:
         total = size + x + n * count
         place = lambda age: slice(size + x + n * (age - 1), size + x + n * age)  # noqa: E731
         # y, from (s, x, torques)
-        rows = [np.eye(size)[:n]]
+        rows = [np.hstack([turned, np.zeros((n, n + mp))])]
         if c.source.velocity:
-            rows.append(np.eye(size)[n + mp : 2 * n + mp])
+            rows.append(np.hstack([np.zeros((n, n + mp)), turned]))
         rows.append(np.hstack([np.zeros((len(seen), n)), seen, np.zeros((len(seen), n + mp))]))
         if c.source.rate:
             rows.append(np.hstack([np.zeros((len(seen), 2 * n + mp)), seen]))

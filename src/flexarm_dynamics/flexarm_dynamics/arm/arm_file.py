@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import ArmFileError
 from .description import (
     DIRECTIONS,
+    ENCODERS,
     MAX_MODES,
     SAFE_ACTIONS,
     SHAPES,
@@ -128,6 +129,7 @@ def _joint(s):
         gear_ratio=s.number("gear_ratio", "none", 1.0, positive=True),
         friction=_friction(s),
         transmission=_transmission(s),
+        encoder=s.text("encoder", "motor", ENCODERS),
         limits=_limits(s),
         safe_action=s.text("safe_action", "damp", SAFE_ACTIONS),
         encoder_counts=s.integer("encoder_counts", 0, low=0, high=2**31),

@@ -13,6 +13,7 @@ import numpy as np
 from ..errors import ModelError
 
 DIRECTIONS = ("y", "z", "twist")
+ENCODERS = ("motor", "link")
 SAFE_ACTIONS = ("brake", "damp", "zero")
 #: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
 MAX_MODES = 20
@@ -82,6 +83,9 @@ class Joint:
     damp_torque: float | None = None  # [N m] largest of damp; None: from limits, gauges and weight
     damp_time: float | None = None  # [s] of its soft start; None: half a period, at most 0.25
     encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
+    encoder: str = (
+        "motor"  # what it measures: the motor's angle, or the link's behind the transmission
+    )
     transmission: Transmission | None = None  # None: the link is fixed to the motor
 
     @property
@@ -200,6 +204,34 @@ class Arm:
     model_options: dict = field(default_factory=dict)  # what that class alone understands, SI
     description: str = ""
     source: str = ""
+    simplifies: "Arm | None" = (
+        None  # the arm of which this one is what a controller knows, see `known`
+    )
+
+    @property
+    def known(self):
+        """The arm as observer and controller know it: its links fixed to the motors.
+
+        No sensor measures the deflection of a transmission, so that it is none of their states.
+        """
+        if all(j.transmission is None for j in self.joints):
+            return self
+        joints = tuple(replace(j, transmission=None) for j in self.joints)
+        return replace(self, joints=joints, simplifies=self)
+
+    @property
+    def whole(self):
+        """The arm itself, transmissions and all, also of one that is `known`."""
+        return self if self.simplifies is None else self.simplifies
+
+    @property
+    def without_play(self):
+        """The same arm with all play closed."""
+        if not any(j.transmission and j.transmission.play for j in self.joints):
+            return self
+        closed = (j.transmission and replace(j.transmission, play=0.0) for j in self.joints)
+        joints = (replace(j, transmission=t) for j, t in zip(self.joints, closed, strict=True))
+        return replace(self, joints=tuple(joints))
 
     @property
     def joint_names(self):
@@ -258,6 +290,8 @@ class Arm:
         Gauges and observed modes stay as they are: what a plant with more modes than its controller knows
         does to the gauges is spill-over.
         """
+        if self.simplifies is not None:
+            return self.simplifies.with_modes(count).known
         if not 1 <= count <= MAX_MODES:
             field, limit = f"modes of {self.name}", f"1 to {MAX_MODES}"
             raise ModelError("is out of range", field=field, value=count, limit=limit)
@@ -297,8 +331,8 @@ def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
     payload : float
         Factor of the payload's mass and inertia; its offset stays [-].
     stiffness : float
-        Factor of every link's EI and GJ. Measured frequencies (`from_frequencies`) go with its root, so that
-        their shapes stay as they are [-].
+        Factor of every link's EI and GJ; transmissions stay. Measured frequencies (`from_frequencies`) go with its
+        root, so that their shapes stay as they are [-].
     damping : float
         Factor of every modal damping ratio [-].
 
@@ -317,6 +351,8 @@ def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
             limit = "above 0, finite" if name == "stiffness" else "not below 0, finite"
             field = f"factor of the {name} of {arm.name}"
             raise ModelError("is out of range", field=field, value=value, limit=limit)
+    if arm.simplifies is not None:
+        return scaled(arm.simplifies, payload, stiffness, damping).known
     body = replace(
         arm.payload,
         mass=payload * arm.payload.mass,

@@ -303,6 +303,13 @@ class Chain(ArmModel):
             out[j, j] = constants[0]
         return out
 
+    def without_play(self):
+        return self if self.arm.without_play is self.arm else self._closed
+
+    @cached_property
+    def _closed(self):
+        return type(self)(self.arm.without_play, self._compiled, self._shapes)
+
     def transmission_rates(self):
         """As `ArmModel.transmission_rates`: of spring or damper with the rest of the arm free, in a straight arm."""
         if not self._transmissions:
@@ -561,7 +568,8 @@ class Chain(ArmModel):
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
 
-        `method` is an explicit one. Of a joint with a transmission the motor's motion is prescribed; the link's follows.
+        `method` is an explicit one. Of a joint with a transmission the motor's motion is prescribed; the link's
+        follows.
         """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1

@@ -264,6 +264,10 @@ class ArmModel(ABC):
         """Natural frequencies of `normal_modes` [rad/s]."""
         return self.normal_modes(q, locked)[0]
 
+    def without_play(self):
+        """The same model with all play closed; itself where there is none."""
+        return self
+
     def transmission_rates(self):
         """How fast the fastest transmission is, of all and of those with play [rad/s]; 0 where there is none."""
         return 0.0, 0.0

@@ -70,7 +70,7 @@ class ClosedLoop:
         delay=0.0,
     ):
         known = arm if isinstance(arm, Arm) else arm_file.load(arm)
-        sizes = {"joints": len(known.joints), "modes": len(known.modes)}
+        sizes = {"joints": len(known.joints), "modes": len(known.known.modes)}
         settings = check_all(SIMULATOR_PARAMETERS, {"arm": known.name, **(simulator or {})}, sizes)
         settings["arm"] = known
         if plant_arm is not None:

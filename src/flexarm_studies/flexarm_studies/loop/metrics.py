@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from flexarm_dynamics import singular_perturbation as sp
+from flexarm_dynamics.arm.encoders import encoder_rows, motors_at_rest
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 
 
@@ -202,7 +203,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
         Numbers, lists with one number per joint, and None for what the record does not reach: ready for JSON.
 
         ``peak_joint_error_rad``, ``rms_joint_error_rad``
-            `joint_error` to the true joint angle, per joint, from the motion's start to the record's end.
+            `joint_error` to the true joint angle, of motor or link as its encoder measures it, per joint, from the
+            motion's start to the record's end.
         ``peak_tip_error_mm``, ``rms_tip_error_mm``
             Of the tip, as above; under gravity also ``…_about_sag_mm``, and ``static_sag_mm`` of the arm at rest
             at the motion's end.
@@ -222,7 +224,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
     """
     if record.time[-1] >= 0.0:  # else the arm was lost before the motion began
         record = _from(record, 0.0)
-    error = joint_error(record.reference, record.plant_position)
+    slack = encoder_rows(plant_model)[:, plant_model.n_joints :]
+    error = joint_error(record.reference, record.plant_position + record.plant_amplitude @ slack.T)
     tip = tip_path(plant_model, record.plant_position, record.plant_amplitude)
     wanted = tip_path(model, record.reference, np.zeros((record.time.size, model.n_modes)))
     found = {
@@ -246,7 +249,8 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
     found["rms_torque_Nm"] = _rms(record.torque, 0).tolist()
     found["saturation_share"] = float(np.mean(record.saturated))
     if len(model.arm.links) == 1 and set(model.arm.links[0].flexible) == {"y"}:
-        deflection = record.plant_amplitude @ _phi_tip(plant_model)
+        phi = _phi_tip(plant_model)  # a transmission's deflection, behind them, bends nothing
+        deflection = record.plant_amplitude[:, : phi.size] @ phi
         found["peak_deflection_mm"] = 1e3 * float(np.abs(deflection).max())
         long_enough = record.time[-1] >= 8.0 - 1e-9
         found["case_study"] = case_study_metrics(record, model) if long_enough else None
@@ -290,11 +294,13 @@ def _sagging_path(model, record):
     amplitude, before = [], None
     for k in knots:
         if before is None or (reference[k] != before).any():
-            before, bent = reference[k], model.static_deflection(reference[k])
+            before, bent = reference[k], motors_at_rest(model, reference[k])[1]
         amplitude.append(bent)
     amplitude = np.array(amplitude).reshape(len(knots), model.n_modes)
     columns = [np.interp(time, time[knots], column) for column in amplitude.T]
-    return tip_path(model, reference, np.array(columns).reshape(model.n_modes, len(time)).T)
+    amplitude = np.array(columns).reshape(model.n_modes, len(time)).T
+    slack = encoder_rows(model)[:, model.n_joints :]
+    return tip_path(model, reference - amplitude @ slack.T, amplitude)
 
 
 def _residual(record, model, tip, end, span):

@@ -285,7 +285,7 @@ def check_driver(options):
     FlexarmError
         When there is no driver, or when the arm is to be pushed while a controller runs.
     """
-    arm_model = model.build(arm_file.load(options.arm))
+    arm_model = model.build(arm_file.load(options.arm).known)
     names = Tolerances.__dataclass_fields__
     tolerances = Tolerances(**{name: getattr(options, name) for name in names})
     driver = Conversation(arm_model.arm, options.namespace)

@@ -365,7 +365,7 @@ class _Reader:
             self.names = {
                 "joint_names": tuple(arm.joint_names),
                 "gauge_names": tuple(arm.gauge_names),
-                "mode_names": tuple(model.build(arm).mode_names),
+                "mode_names": tuple(model.build(arm.known).mode_names),
             }
 
     def take(self, topic, messages):

@@ -29,7 +29,7 @@ class Shape:
     """The shape of an `arm`, from joint angles and modal amplitudes."""
 
     def __init__(self, arm):
-        self.chain = chain = Chain(replace(arm, model="chain"))
+        self.chain = chain = Chain(replace(arm.known, model="chain"))
         self.links, self._axial, self._across = arm.links, [], []
         modes, xi = chain.arm.modes, np.linspace(0.0, 1.0, POINTS)
         for link in arm.links:

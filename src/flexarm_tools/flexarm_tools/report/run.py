@@ -44,7 +44,7 @@ class Run:
         self.contents, self.label, self.notes = contents, label, list(contents.notes)
         self.arm, self.model = contents.arm, None
         if self.arm is not None:
-            self.model = model.build(self.arm)
+            self.model = model.build(self.arm.known)
         self.base = "arm_state" if "arm_state" in contents.tables else "arm_state_estimate"
         table = contents.tables[self.base]
         self.timeline = timeline.arrange(table.stamp, table.session, table.sequence)

@@ -128,14 +128,14 @@ class ShapeNode(ArmNode):
 
     def build(self):
         self.arm = arm_file.load(self.parameters["arm"])
-        arm_model = model.build(self.arm)
+        arm_model = model.build(self.arm.known)
         self._drawer = Drawer(arm_model)
         self._chain = PieceChain(arm_model, self.parameters["pieces"])
         self._trail = Trail(self.parameters["trail"], 0.002 * self._drawer.reach)
         self._markers = Markers(self._drawer.reach, len(self.arm.joints))
         self._joints = JointState(name=list(self._chain.joint_names))
-        self._amplitudes = Amplitudes(self.arm)
-        self._sample = ArmSample(len(self.arm.joints), len(self.arm.modes))
+        self._amplitudes = Amplitudes(arm_model.arm)
+        self._sample = ArmSample(len(self.arm.joints), arm_model.n_modes)
         self._slow = self._fast = None
         self._pictures = 0
         self._states = Latest(self.make_subscription, ArmState, self.parameters["state_topic"])

@@ -167,7 +167,7 @@ class View:
     def _open(self, name):
         from ..shape.drawing import Drawer, Trail
 
-        arm_model = model.build(arm_file.load(name))
+        arm_model = model.build(arm_file.load(name).known)
         self.drawer = Drawer(arm_model)
         self.trail = Trail(TRAIL, 0.002 * self.drawer.reach)
         self.link.watch(arm_model.arm)
