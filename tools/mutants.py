@@ -625,6 +625,29 @@ LIMITS = [
     ),
     *of(
         "flexarm_control",
+        "observers/plausibility",
+        TESTS + "test_reading_checks.py",
+        (
+            "standstill",
+            "a joint that stands: what others' friction may hold",
+            "np.abs(self._inertia) @ unsure",
+            "np.diag(self._inertia) * unsure",
+        ),
+        (
+            "agreement",
+            "a velocity beside its position: torque steps between samples",
+            "        bound += self._between\n",
+            "",
+        ),
+        (
+            "channels",
+            "light joints: in the first configuration alone",
+            "light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())",
+            "light = light or (np.diag(H)[:n] / np.diag(stiff)).max()",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "loop",
         TESTS + "test_arm_controller.py " + TESTS + "test_plausibility.py",
         (

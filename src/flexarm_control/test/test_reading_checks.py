@@ -237,7 +237,7 @@ def test_a_position_that_drifts_beside_its_velocity_is_found_without_modal_rates
     for k in range(400):
         t = PERIOD * k
         value[c.position], value[c.velocity] = 0.3 * t + drift * t, 0.3
-        pairs = agreement.update(value.copy(), PERIOD, 0.0)
+        pairs = agreement.update(value.copy(), PERIOD, 0.0, np.zeros(1))
         evidence.extend([] if pairs is None else pairs.tolist())
     assert set(evidence) == ({0} if found else set())
 
@@ -251,7 +251,7 @@ def test_a_velocity_that_its_source_has_filtered_is_not_wrong():
         true = 0.5 * np.sin(3.0 * t)
         late += (1.0 - np.exp(-PERIOD / 0.004)) * (true - late)
         value[c.position], value[c.velocity] = (1.0 - np.cos(3.0 * t)) / 6.0, late
-        assert agreement.update(value.copy(), PERIOD, 0.0) is None
+        assert agreement.update(value.copy(), PERIOD, 0.0, np.zeros(1)) is None
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -274,6 +274,66 @@ def test_a_joint_that_bent_links_hold_need_not_answer_the_torque(held):
     assert bool(found) != held
 
 
+@pytest.mark.parametrize(("torque", "found"), [((0.0, 0.13), False), ((0.2, 0.0), True)])
+def test_a_joint_that_stands_is_not_asked_to_answer_what_another_joints_friction_may_hold(
+    torque, found
+):
+    # Fractions of the limits; 5 % of each may be friction, and 1.3 times the torque of the second acts on the first.
+    arm = arm_file.load("two_link")
+    model = models.build(arm)
+    checks, answers = Standstill(Channels(model, StrainMap(model))), []
+    size = len(arm.gauges)
+    for k in range(60):
+        reading = np.concatenate(
+            [[0.1, 0.1 + 1e-4 * k], 1e-6 * np.sin(k + np.arange(size)), [np.nan, np.nan]]
+        )
+        answers += checks.update(
+            reading,
+            np.array(torque) * arm.torque_limits,
+            np.zeros(size),
+            PERIOD,
+            np.zeros(model.n_modes),
+        )[0].tolist()
+    assert set(answers) == ({0} if found else set())
+
+
+def test_joint_is_light_if_it_is_so_in_one_configuration():
+    """A joint of small inertia elsewhere does not hide it."""
+
+    class Changing:
+        """R: a hundredth of itself when straight, and with a light joint otherwise."""
+
+        def __init__(self):
+            self.whole = models.build(known_arm())
+
+        def __getattr__(self, name):
+            return getattr(self.whole, name)
+
+        def terms(self, q, qd):
+            terms = self.whole.terms(q, qd)
+            M = terms.M.copy()
+            if q[0] == 0.0:
+                M *= 0.01
+            else:
+                M[0, 0] = M[0, 1:] @ np.linalg.solve(M[1:, 1:], M[1:, 0]) / 0.9
+            return replace(terms, M=M)
+
+    model = Changing()
+    assert Channels(model.whole, None).heavy
+    assert not Channels(model, None).heavy
+
+
+@pytest.mark.parametrize(("step", "found"), [(0.0, True), (0.1, False)])
+def test_steps_of_the_torque_swing_a_light_joint_between_samples_that_see_it_at_rest(step, found):
+    model = models.build(arm_file.load("two_link"))
+    c = Channels(model, StrainMap(model))
+    agreement, value, named = Agreement(c), np.full(c.size, np.nan), False
+    for k in range(400):
+        value[c.position], value[c.velocity] = [0.0, 0.02 * PERIOD * k], 0.0
+        named |= agreement.update(value.copy(), PERIOD, 0.0, step * c.strength) is not None
+    assert named == found
+
+
 @pytest.mark.parametrize(("period", "found"), [(1e-3, True), (12e-3, False)])
 def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(period, found):
     model = models.build(known_arm())
@@ -284,7 +344,7 @@ def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(per
     for k in range(100):
         value = np.full(channels.size, np.nan)
         value[channels.position], value[channels.velocity] = 1.3 * k * period, 1.0
-        named |= agreement.update(value, period, 0.0) is not None
+        named |= agreement.update(value, period, 0.0, np.zeros(1)) is not None
     assert named == found
 
 

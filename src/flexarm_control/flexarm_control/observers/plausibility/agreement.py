@@ -6,11 +6,13 @@ Over a window that began at sample 0, with the trapezoidal rule,
 .. math::
     D = \sum_k \tfrac12(v_k + v_{k-1})\,h_k, \qquad
     |x - x_0 - D| \le s\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
-    + \tfrac12\sum_k|v_k - v_{k-1}|\,h_k + 6\sigma_v\sqrt{t\,h}
+    + \sum_k\left(\tfrac12|v_k - v_{k-1}|\,h_k + \tfrac14 G|\Delta u_k|\,h_k^2\right) + 6\sigma_v\sqrt{t\,h}
 
-with :math:`\sigma`, c and J as in `jumps`, and :math:`\tau` by which a filtered rate may be late. The sum is what the
-rule can miss. Windows of `WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are
-evidence: a sign is wrong, a scale by more than s, one of the two stands still, or the value drifts.
+with :math:`\sigma`, c, J and :math:`G|\Delta u|` as in `jumps`, and :math:`\tau` by which a filtered rate may be late.
+The sum is what the rule can miss: also that a step of the torque moves a light joint and its links to and fro between
+two samples, which begin and end such a swing in the same phase when a mode is as fast as the sampling. Windows of
+`WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are evidence: a sign is wrong, a
+scale by more than s, one of the two stands still, or the value drifts.
 s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings.
 """
 
@@ -55,7 +57,8 @@ class Agreement:
         self._noise = DEVIATIONS * np.sqrt(2.0) * c.noise[values] + self._count
         self._rate_noise = DEVIATIONS * c.noise[rates]
         size = values.size
-        self.changed, self.driven, self._missed = np.zeros((3, len(WINDOWS), size))
+        self._gain = c.gain[values]
+        self.changed, self.driven, self._missed, self._between = np.zeros((4, len(WINDOWS), size))
         self._start, self._first = np.zeros((2, len(WINDOWS), size))
         self.reset()
 
@@ -67,8 +70,19 @@ class Agreement:
         self._age, self._time = np.zeros(len(WINDOWS), int), np.zeros(len(WINDOWS))
         self._run = np.zeros(size, int)
 
-    def update(self, value, dt, jitter):
-        """Take the readings (N,) of a new sample, `dt` [s] after the last, and the stamps' `jitter` [s].
+    def update(self, value, dt, jitter, change):
+        """Take a new sample.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N,)
+            Readings.
+        dt : float
+            Since the last sample [s].
+        jitter : float
+            Of the stamps [s].
+        change : ndarray, shape (n,)
+            Step of the torque in that time [N m].
 
         Returns
         -------
@@ -83,19 +97,21 @@ class Agreement:
         if self._last is None:
             self._last = at
             self._start[:], self._first[:] = at, rate
-            self.driven[:] = self._missed[:] = 0.0
+            self.driven[:] = self._missed[:] = self._between[:] = 0.0
             self._age[:], self._time[:] = 0, 0.0
             self._rate = rate
             return None
         mean = 0.5 * dt * (rate + self._rate)
         self.driven += mean
         self._missed += np.abs(rate - self._rate) * (0.5 * dt)
+        self._between += self._gain @ change * (0.25 * dt * dt)
         np.subtract(at, self._start, out=self.changed)
         self._last, self._rate = at, rate
         bound = np.maximum(np.abs(self.changed), np.abs(self.driven))
         fast = self.channels.fastest * dt > 1.0
         bound *= FAST_SCALE if fast else SCALE
         bound += FAST_MISSED * self._missed if fast else self._missed
+        bound += self._between
         bound += LATE * np.abs(rate - self._first)
         bound += self._noise
         if jitter > 0.0:
@@ -119,12 +135,13 @@ class Agreement:
         if unknown.any():
             self._start[:, unknown], self._first[:, unknown] = at[unknown], rate[unknown]
             self.driven[:, unknown] = self._missed[:, unknown] = 0.0
+            self._between[:, unknown] = 0.0
         for i, length in enumerate(WINDOWS):
             self._age[i] += 1
             if self._age[i] >= length:
                 self._age[i], self._time[i] = 0, 0.0
                 self._start[i], self._first[i] = at, rate
-                self.driven[i] = self._missed[i] = 0.0
+                self.driven[i] = self._missed[i] = self._between[i] = 0.0
 
     def stands(self, j):
         """Whether it is the value of pair j that does not change at all."""

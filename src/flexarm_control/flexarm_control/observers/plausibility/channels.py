@@ -61,7 +61,7 @@ class Channels:
     push : ndarray, shape (N,)
         Change of acceleration by what is not reported; infinite where a joint has no torque limit.
     heavy : bool
-        Whether no joint accelerates more than `LIGHT` times faster than if the links were rigid.
+        Whether no joint accelerates more than `LIGHT` times faster than if the links were rigid, in any configuration.
     strength : ndarray, shape (n,)
         Largest torque of motor or brake [N m].
     """
@@ -113,7 +113,7 @@ class Channels:
         """`gain` and `push`."""
         model, n = self.model, self.n
         joints, bends, rigid = np.zeros((n, n)), np.zeros((self.m, n)), np.zeros((n, n))
-        strains = np.zeros((self.g, n))
+        strains, light = np.zeros((self.g, n)), 0.0
         random = np.random.default_rng(0)
         for k in range(CONFIGURATIONS):
             q = random.uniform(-1.5, 1.5, n) if k else np.zeros(n)
@@ -121,10 +121,12 @@ class Channels:
             H = np.linalg.inv(M)
             np.maximum(joints, np.abs(H[:n, :n]), out=joints)
             np.maximum(bends, np.abs(H[n:, :n]), out=bends)
-            np.maximum(rigid, np.abs(np.linalg.inv(M[:n, :n])), out=rigid)
+            stiff = np.linalg.inv(M[:n, :n])
+            np.maximum(rigid, np.abs(stiff), out=rigid)
+            light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())
             if strain_map is not None:
                 np.maximum(strains, np.abs(strain_map.rows @ H[n:, :n]), out=strains)
-        self.heavy = bool((np.diag(joints) <= LIGHT * np.diag(rigid)).all())
+        self.heavy = bool(light <= LIGHT)
         strength = self.strength
         gain = MARGIN * np.vstack([joints, strains, bends, joints, bends])
         push = np.full(self.size, np.inf)

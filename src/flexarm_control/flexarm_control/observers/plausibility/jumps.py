@@ -242,6 +242,11 @@ class Jumps:
         self.bridged[self._outliers] += 1
 
     @property
+    def torque_change(self):
+        """Step of the torque before the sample that was judged last, (n,); a large one where it is unknown [N m]."""
+        return self._new_change
+
+    @property
     def rms(self):
         """Of the readings' noise so far, as the residuals show it, shape (N,)."""
         return np.sqrt(self._square)

@@ -274,7 +274,7 @@ class Monitor:
         """Remember the first sample."""
         self.jumps.judge(self._value, self._torque, 1.0, 1)
         self.jumps.take(self._value, 1e-9 * stamp_ns)
-        self._agreement.update(self._value, 1.0, 0.0)
+        self._agreement.update(self._value, 1.0, 0.0, self.jumps.torque_change)
 
     def _compare(self, sample, stamp):
         c, dt, jumps = self.channels, self._dt, self.jumps
@@ -282,7 +282,7 @@ class Monitor:
         joints, gauges, speeds, frame = self._standstill.update(
             self._raw, sample.torque, noise, dt, sample.amplitude
         )
-        pairs = self._agreement.update(self._value, dt, jumps.jitter)
+        pairs = self._agreement.update(self._value, dt, jumps.jitter, jumps.torque_change)
         compared, wiring = False, None
         if self._law is not None and self._has_strain:
             strain = self._value[c.strain]

@@ -11,16 +11,19 @@ is a simulated arm that is exactly at rest; therefore stillness alone is no evid
 2. of a gauge whose noise is stated and has been seen: with the probability :math:`p =
    \mathrm{erf}(s/2\sqrt2\sigma)` of the most probable count, s its step, when it lasts N samples with :math:`p^N <
    10^{-14}`. The noise has been seen when the readings' rms in `jumps` is at least half of it.
-3. of a joint, when the torque should have moved it. With :math:`\bar u` the part of the torque beyond friction, the
-   arm's weight, what the bent links do to a joint that stands, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`, and the
-   uncertainty of all three, and the acceleration :math:`M_{11}^{-1}\bar u` of the rigid arm since
-   it has been still: when the integral is more than `TRAVEL` of its encoder's steps, or of its noise.
+3. of a joint, when the torque should have moved it. With :math:`\bar u` the torque less the arm's weight, and what
+   the bent links do to joints that stand, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`, the rigid arm accelerates by
+   :math:`a = M_{11}^{-1}\bar u`. Friction, and what weight, bending and the gauges' noise leave unsure, is up to
+   :math:`\Delta u` of each joint, of those that turn as well, and may take :math:`|M_{11}^{-1}|\Delta u` from it: a
+   joint that carries others feels what they do. What is left of a since the joint has been still is integrated: it
+   should have turned by more than `TRAVEL` of its encoder's steps, or of its noise.
 """
 
 import numpy as np
 from scipy.special import erf
 
 from .channels import UNSTATED_POSITION
+from .jumps import DEVIATIONS
 
 #: Samples that an abrupt stillness lasts until it is noticed; samples before it; and the ratio of changes.
 ABRUPT, BEFORE, TIMES = 6, 8, 6.0
@@ -62,6 +65,7 @@ class Standstill:
         self._friction = 1.5 * coulomb + FRICTION * limits
         self._travel = TRAVEL * np.maximum(c.count, c.noise[c.position])
         self._gravity = any(model.arm.gravity)
+        self._amplitude_noise = DEVIATIONS * c.noise[c.amplitude]
         self._gauges = slice(c.n, c.n + c.g)
         self.reset()
 
@@ -161,17 +165,18 @@ class Standstill:
             self._weight = terms.f1.copy() if self._gravity else np.zeros(size)
             across = np.linalg.solve(terms.M[size:, size:], terms.M[size:, :size]).T
             self._pushed, self._bent = across @ terms.f2 * self._gravity, across @ terms.K2
+            self._noise = np.linalg.norm(self._bent * self._amplitude_noise, axis=1)
         bent = 0.0 * self._weight
         if amplitude is not None and np.isfinite(amplitude).all():
             bent = self._pushed + self._bent @ amplitude
-        net = torque - self._weight + bent
-        unsure = self._friction + WEIGHT * (np.abs(self._weight) + np.abs(bent))
-        net = np.sign(net) * np.maximum(np.abs(net) - unsure, 0.0)
+        unsure = self._friction + WEIGHT * (np.abs(self._weight) + np.abs(bent)) + self._noise
+        wanted = self._inertia @ (torque - self._weight + bent)
+        left = np.maximum(np.abs(wanted) - np.abs(self._inertia) @ unsure, 0.0)
         if not torque.any():
-            net[:] = 0.0  # nothing acts, or brakes do
+            left[:] = 0.0  # nothing acts, or brakes do
         began = still <= 1
         self._speed[began] = self._moved[began] = 0.0
-        self._speed += dt * (self._inertia @ net)
+        self._speed += dt * np.sign(wanted) * left
         self._moved += dt * self._speed
         return np.flatnonzero((still >= ABRUPT) & (np.abs(self._moved) > self._travel))
 
