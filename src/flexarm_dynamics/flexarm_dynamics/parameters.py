@@ -7,6 +7,7 @@ Nothing here knows ROS.
 
 import math
 import numbers
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,8 @@ from .shown import show
 
 _KIND_OF = {float: "float", int: "int", bool: "bool", str: "string"}
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
+#: A number that YAML reads as a string.
+POWER_OF_TEN = re.compile(r"[+-]?\d+(\.\d*)?[eE][+-]?\d+")
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,8 @@ class Parameter:
         return int(self._in_range(where, value))
 
     def _float(self, where, value):
+        if isinstance(value, str) and POWER_OF_TEN.fullmatch(value):
+            value = float(value)
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
             raise _refusal(where, value, "is not a number")
         if not _is_finite(value):
@@ -126,6 +131,9 @@ class Parameter:
         return float(self._in_range(where, value))
 
     def _float_array(self, where, value, sizes):
+        number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        if number or (isinstance(value, str) and POWER_OF_TEN.fullmatch(value)):
+            value = [value]  # one value for all
         value = _listed(where, value, "numbers")
         if value and all(
             isinstance(v, numbers.Integral) and not isinstance(v, bool) and _is_finite(v)

@@ -75,6 +75,12 @@ def test_arrays_of_every_make_become_lists_of_float():
     assert type(COUNT.check(np.int32(4))) is int
 
 
+def test_one_number_stands_for_all_and_a_power_of_ten_that_yaml_leaves_a_string_is_a_number():
+    assert KP.check(6.25, {"joints": 2}) == [6.25, 6.25]
+    assert KP.check("1e1", {"joints": 2}) == KP.check(["1e1"], {"joints": 2}) == [10.0, 10.0]
+    assert ALPHA.check("1e1") == 10.0
+
+
 def test_limits_belong_to_the_range():
     for value in (0.0, 100.0):
         assert ALPHA.check(value) == value
@@ -101,7 +107,7 @@ def test_limits_belong_to_the_range():
         (KP, [True], "kp[0]", "is not a number", None),
         (KP, [10**400], "kp[0]", "is not finite", None),
         (KP, "6.25", "kp", "is not a list of numbers", None),
-        (KP, 6.25, "kp", "is not a list of numbers", None),
+        (KP, True, "kp", "is not a list of numbers", None),
         (KP, ["6.25"], "kp[0]", "is not a number", None),
         (COUNT, 0, "count", "is below its lower limit", 1),
         (COUNT, 11, "count", "is above its upper limit", 10),

@@ -103,7 +103,7 @@ def test_defaults_and_overrides_are_read_by_full_name_and_by_group(make):
     (
         ({"slow__kp": [6]}, "slow.kp", "is a list of integers where floats are needed"),
         ({"slow__kp": [-1.0]}, "slow.kp[0]", "1/s^2 is below its lower limit"),
-        ({"slow__kp": 6.25}, "slow.kp", "is not a list of numbers"),
+        ({"slow__kp": True}, "slow.kp", "is not a list of numbers"),
         ({"fast__alpha": -1.0}, "fast.alpha", "1/s is below its lower limit"),
         ({"fast__alpha": 1e4}, "fast.alpha", "1/s is above its upper limit"),
         ({"fast__alpha": 5}, "fast.alpha", "is an integer where a float is needed"),
@@ -133,6 +133,8 @@ def test_lengths_are_checked_once_the_arm_is_known_and_one_value_is_spread(make)
     assert set_one(node, "slow.kp", [1.0, 2.0, 3.0]).successful
     assert set_one(node, "slow.kp", [4.0]).successful
     assert parameters["slow.kp"] == [4.0] * 3
+    assert set_one(node, "slow.kp", 5.0).successful
+    assert parameters["slow.kp"] == [5.0] * 3
 
 
 # Sets ------------------------------------------------------------------------------------------
