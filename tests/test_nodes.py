@@ -360,7 +360,6 @@ def wait_obeys(arm, kp, K_f):
 REFUSED_SETS = {
     "integers": ({"slow__kp": [6]}, r"write \[6\.0\]"),
     "text": ({"slow__kp": "six"}, "'six' is not a list of numbers"),
-    "scalar": ({"slow__kp": 6.25}, "not a list of numbers"),
     "below": ({"slow__kp": [-1.0]}, "below its lower limit"),
     "above": ({"fast__alpha": 1e4}, "fast.alpha out of range"),
     "length": ({"slow__kp": [1.0, 2.0]}, r"2 values where 1 \(joints\)"),

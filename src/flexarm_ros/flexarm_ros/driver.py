@@ -144,7 +144,7 @@ class Driver(ArmNode):
         parameters = self.parameters
         self.arm = arm_file.load(parameters["arm"])
         parameters.resolve({"joints": len(self.arm.joints), "gauges": len(self.arm.gauges)})
-        self.fault, self.safe = "", True
+        self.fault, self.safe, self._safe_since = "", True, None
         self._published, self._before = 0, 0
         self._first = self._last = self._arrived = self._thread = None
         self._reading = False
@@ -299,7 +299,7 @@ class Driver(ArmNode):
     def actuate(self):
         """Apply the torque that acts now, or take the safe action."""
         torque = self.gate.torque(self.now())
-        self.safe = torque is None
+        self._note_safe(torque is None)
         try:
             if self.safe:
                 self.make_safe()
@@ -307,6 +307,19 @@ class Driver(ArmNode):
                 self.apply(torque)
         except FlexarmError as error:
             self.fault = str(error)
+
+    def _note_safe(self, safe):
+        """Note whether the safe action acts, and log when it ends."""
+        if safe and not self.safe:
+            self._safe_since = self.now()
+        elif self.safe and not safe:
+            if self._safe_since is None:
+                text = "the torque of a controller acts"
+            else:
+                lasted = max(self.now() - self._safe_since, 0.0)
+                text = f"torque acts again, after {lasted:.3g} s of the safe action"
+            self.report(text, info=True)
+        self.safe = safe
 
     def watch(self):
         """Take the safe action when the torque has become too old."""

@@ -338,15 +338,18 @@ class ArmNode(LifecycleNode):
         message = "; ".join(filter(None, (message, *found.values())))
         return max(level, WARN), message, {**values, **shown}
 
-    def report(self, text):
-        """Log a refusal: a new one at once, one that differs only in numbers every ten seconds."""
+    def report(self, text, info=False):
+        """Log a warning, or an information: a new text at once, one that differs only in numbers every ten seconds."""
         kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
         if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:
             if len(self._reported) > 100:  # a message may hold any names
                 self._reported.clear()
             self._reported[kind] = now
-            self.get_logger().warning(text)
+            if info:
+                self.get_logger().info(text)
+            else:
+                self.get_logger().warning(text)
 
 
 def _in_thread(work):

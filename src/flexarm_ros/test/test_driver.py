@@ -105,6 +105,26 @@ def test_a_torque_acts_until_it_is_too_old_and_the_safe_action_follows(arm):
     assert arm.diagnose()[:2] == (WARN, "no fresh torque for 0.05 s: the safe action is applied")
 
 
+def test_the_end_of_a_safe_action_is_logged_with_its_length(arm, monkeypatch):
+    logged = []
+    monkeypatch.setattr(arm, "report", lambda text, info=False: logged.append(text))
+    claim(arm)
+    arm.answer(2.0)
+    arm.time = 0.06
+    arm.watch()
+    arm.time = 0.31
+    arm.reads(3)
+    arm.answer(2.0)  # to a state that names no controller
+    arm.reads(4)
+    arm.answer(2.0)
+    assert arm.actions[-1] == [2.0]
+    acts = [text for text in logged if "acts" in text]
+    assert acts == [
+        "the torque of a controller acts",
+        "torque acts again, after 0.25 s of the safe action",
+    ]
+
+
 def test_two_controllers_are_an_error(arm):
     claim(arm)
     for controller_id in (1, 2, 1):
