@@ -71,8 +71,8 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
     def derivative(s):
         u = torque
         if not coulomb:  # the model's friction taken out, and its viscous part put back
-            qd = s[half : half + n]
-            u = u + model.friction(qd) - viscous * qd
+            delta, qd, delta_d = s[n:half], s[half : half + n], s[half + n :]
+            u = u + model.friction(qd, delta, delta_d) - viscous * qd
         return model.derivative(s, u)
 
     A = jacobian(derivative, state, step)

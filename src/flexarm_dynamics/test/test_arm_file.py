@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import Arm, Transmission
+from flexarm_dynamics.arm.description import Arm, Friction, Transmission
 from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 from flexarm_dynamics.errors import ArmFileError, ModelError
 from flexarm_dynamics.models import model
@@ -37,7 +37,7 @@ joints:
     motor_mass: 1.5
     rotor_inertia: 1.0e-4
     gear_ratio: 100.0
-    friction: {viscous: 0.1, coulomb: 0.2, smoothing: 0.05}
+    friction: {viscous: 0.1, coulomb: 0.2, smoothing: 0.05, breakaway: 0.3, stribeck: 0.2, load: 0.1}
     limits: {position: [-2.0, 1.0], velocity: 3.0, torque: 12.0}
     safe_action: brake
     brake_torque: 20.0
@@ -138,7 +138,7 @@ def test_every_field_is_read():
     assert joint.inertia == pytest.approx(0.5 + 1e-4 * 100.0**2)
     assert joint.motor_mass == 1.5
     assert (joint.friction.viscous, joint.friction.coulomb) == (0.1, 0.2)
-    assert joint.friction.smoothing == 0.05
+    assert joint.friction == Friction(0.1, 0.2, 0.05, 0.3, 0.2, 0.1)
     assert joint.limits.position == (-2.0, 1.0)
     assert (joint.limits.velocity, joint.limits.torque) == (3.0, 12.0)
     assert (joint.safe_action, joint.brake_torque, joint.damp_coefficient) == ("brake", 20.0, 0.7)
@@ -366,7 +366,7 @@ COUNTS_AND_FLAGS = ("foreshortening", "finite_slope", "modes", "bits", "encoder_
 ANY_SIGN = ("position", "surface_distance", "gain", "bias")
 ABOVE_ZERO = (
     "gear_ratio", "smoothing", "velocity", "torque", "length", "mass_per_length", "EI_y", "EI_z", "GJ",
-    "size_y", "size_z", "density", "youngs_modulus", "full_scale", "stiffness",
+    "size_y", "size_z", "density", "youngs_modulus", "full_scale", "stiffness", "stribeck",
 )  # fmt: skip
 #: Path of every number in `FULL`.
 NUMBERS = [
@@ -525,6 +525,8 @@ def test_a_field_given_twice_is_refused(text, start):
         (("joints", 0, "safe_action"), "stop", "'stop' is not one of the choices (brake, damp, zero)"),
         (("joints", 0, "encoder_counts"), 1.5, "1.5 is not an integer"),
         (("joints", 0, "transmission", "play"), 0.7, "0.7 rad is too large (at most 0.2 rad); the whole way"),
+        (("joints", 0, "friction", "breakaway"), 0.1, "0.1 N m is below the Coulomb friction (at least 0.2 N m)"),
+        (("joints", 0, "friction", "load"), 1.5, "1.5 of the transmitted torque is too much (at most 0.9)"),
         (("joints", 0, "encoder"), "load", "'load' is not one of the choices (motor, link)"),
         (("joints", 0, "rotor_inertia"), 0.0, "must be greater than 0 kg m^2; with a transmission"),
         (("observed_modes", 0), "shoulder_transmission", "is not a mode of this arm"),
@@ -588,6 +590,11 @@ def test_a_value_without_meaning_is_refused(path, value, words):
 def test_names_must_differ(things, index, taken):
     message = refused(changed((things, index, "name"), taken))
     assert message == f"{things}[{index}].name: {taken!r} is the name of {things}[0], too"
+
+
+def test_friction_of_the_transmitted_torque_needs_a_transmission():
+    message = refused(without(("joints", 0, "transmission")))
+    assert message.startswith("joints[0].friction.load: 0.1 needs a transmission; give the joint a")
 
 
 def test_joints_and_links_come_in_pairs():

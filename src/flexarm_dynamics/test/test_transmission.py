@@ -338,8 +338,8 @@ def test_flexible_links_behind_play_are_at_rest_in_their_static_deflection():
 
 def test_arms_without_transmissions_run_code_without_them():
     bare, geared = Chain(spatial((None,) * 3)), Chain(spatial(GEARS))
-    assert not bare.kernel.SPRINGS and geared.kernel.SPRINGS
-    assert not bare.complex_kernel.SPRINGS
+    assert not bare.kernel.JOINT_PARTS and geared.kernel.JOINT_PARTS
+    assert not bare.complex_kernel.JOINT_PARTS
 
 
 # --- what controllers know ---------------------------------------------------------------------

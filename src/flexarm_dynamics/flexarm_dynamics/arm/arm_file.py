@@ -35,6 +35,8 @@ from .entries import Section, kind_of, read_yaml, value_error
 MAX_BITS = 32
 #: Largest play of a transmission [rad].
 MAX_PLAY = 0.2
+#: Largest part of the transmitted torque that is friction: beyond, a gear locks itself [-].
+MAX_LOAD_FRICTION = 0.9
 #: Largest full scale of a gauge [-].
 MAX_STRAIN = 0.1
 
@@ -47,8 +49,20 @@ def _friction(joint):
         viscous=s.number("viscous", "viscous", 0.0, low=0.0),
         coulomb=s.number("coulomb", "torque", 0.0, low=0.0),
         smoothing=s.number("smoothing", "none", 0.01, positive=True),
+        breakaway=s.number("breakaway", "torque", 0.0, low=0.0),
+        stribeck=s.number("stribeck", "none", Friction.stribeck, positive=True),
+        load=s.number("load", "none", 0.0, low=0.0),
     )
     s.done()
+    if 0.0 < out.breakaway < out.coulomb:
+        problem, limit = "N m is below the Coulomb friction", f"at least {out.coulomb:g} N m"
+        raise s.error("breakaway", problem, value=out.breakaway, limit=limit)
+    if out.load > MAX_LOAD_FRICTION:
+        problem, limit = "of the transmitted torque is too much", f"at most {MAX_LOAD_FRICTION:g}"
+        raise s.error("load", problem, value=out.load, limit=limit)
+    if out.load and not joint.has("transmission"):
+        hint = "give the joint a transmission, whose torque it is a part of"
+        raise s.error("load", "needs a transmission", value=out.load, hint=hint)
     return out
 
 

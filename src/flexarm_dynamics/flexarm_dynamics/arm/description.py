@@ -22,11 +22,26 @@ SHAPES = ("clamped_free", "loaded", "from_frequencies")
 
 @dataclass(frozen=True)
 class Friction:
-    """Joint friction ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
+    r"""Joint friction, on the motor's side of a transmission.
 
-    viscous: float = 0.0  # [N m s/rad]
-    coulomb: float = 0.0  # [N m]
-    smoothing: float = 0.01  # [rad/s] speed at which Coulomb friction reaches 76 %
+    .. math:: f_v\dot q + \bigl(f_c + (f_b - f_c)e^{-(\dot q/v_s)^2} + c\,|\tau|\bigr)\tanh(\dot q/v_0)
+
+    with the torque tau that the transmission transmits. Breakaway below Coulomb's level counts for nothing.
+    """
+
+    viscous: float = 0.0  # [N m s/rad] f_v
+    coulomb: float = 0.0  # [N m] f_c
+    smoothing: float = 0.01  # [rad/s] v_0: speed at which Coulomb friction reaches 76 %
+    breakaway: float = 0.0  # [N m] f_b: level at rest
+    stribeck: float = 0.1  # [rad/s] v_s: speed at which 37 % of its excess over Coulomb's is left
+    load: float = (
+        0.0  # [-] c: part of the transmitted torque that is friction; only with a transmission
+    )
+
+    @property
+    def excess(self):
+        """Of the breakaway level over Coulomb's [N m]."""
+        return max(self.breakaway - self.coulomb, 0.0)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,9 @@ from collections import namedtuple
 
 import numpy as np
 
-#: Whether joints have transmissions: compiled apart for arms that have none, which then cost nothing more.
-SPRINGS = True
+#: Whether joints have transmissions or friction beyond Coulomb's: compiled apart for arms without, which then cost
+#: nothing more.
+JOINT_PARTS = True
 #: Deflection beyond the play, in parts of half of it, at which a transmission has half of its damping.
 ENGAGEMENT = 0.1
 TWIST, Y, Z = 0, 1, 2
@@ -54,6 +55,8 @@ DATA = {
     # place in delta of the deflection of each joint's transmission; -1: it has none
     "spring": ("N",),
     "transmission": ("N", 4),  # stiffness, damping, half the play, damping per transmitted torque
+    # friction beyond Coulomb's: breakaway level's excess, Stribeck speed, part of the transmitted torque, smoothing
+    "slip": ("N", 4),
     "length": ("N",),
     "mass": ("N",),  # beam, and the motor at its base
     "moment": ("N",),  # int x dm
@@ -624,7 +627,7 @@ def prepare(d, w, q, delta, qd, delta_d):
             w.frame[0, k, m] = d.turn[0, k, m]
     for i in range(N):
         angle, rate = q[i], qd[i]
-        if SPRINGS:
+        if JOINT_PARTS:
             if d.spring[i] >= 0:
                 angle += delta[d.spring[i]]
                 rate += delta_d[d.spring[i]]
@@ -680,7 +683,7 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
     N = d.links
     start(w, gravity)
     turning = qdd[0]
-    if SPRINGS and d.spring[0] >= 0:
+    if JOINT_PARTS and d.spring[0] >= 0:
         turning += delta_dd[d.spring[0]]
     for k in range(3):
         w.al[0, k] = d.axis[0, k] * turning
@@ -699,9 +702,9 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
             # Spin of the rotor as seen from the base: its rate needs the carrier's acceleration.
             w.u[n] = d.rotor[n] * (dot(d.axis[n], w.al[n]) + d.gear[n] * qdd[n])
             turning, rate = qdd[n], qd[n]
-            if SPRINGS:
+            if JOINT_PARTS:
                 rate = w.rate[n]
-            if SPRINGS and d.spring[n] >= 0:
+            if JOINT_PARTS and d.spring[n] >= 0:
                 turning += delta_dd[d.spring[n]]
             for k in range(3):
                 w.al[n, k] += w.t[2, k] * rate + d.axis[n, k] * turning
@@ -738,7 +741,7 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
                 zf[k] += w.p[i, j, k] * x
             modal[first + j] = acc
         torque[i] = dot(d.axis[i], zn) + d.gear[i] * w.u[i]
-        if SPRINGS and d.spring[i] >= 0:
+        if JOINT_PARTS and d.spring[i] >= 0:
             modal[d.spring[i]] = dot(d.axis[i], zn)
         add_rotor(d, w, i, qd[i], zn)
 
@@ -871,7 +874,7 @@ def eliminate_modes(d, w, i, force, extra):
 def eliminate_joint(d, w, i, qd, force, modal_force, extra, driven, qdd):
     """Eliminate joint i from row i; what is left is the inertia that its carrier feels, in link i's coordinates."""
     a, t, rate = d.axis[i], w.t, qd
-    if SPRINGS:
+    if JOINT_PARTS:
         rate = w.rate[i]
     X, Y, Z, zn, zf = w.X[i], w.Y[i], w.Z[i], w.zn[i], w.zf[i]
     bias = t[0]
@@ -886,7 +889,7 @@ def eliminate_joint(d, w, i, qd, force, modal_force, extra, driven, qdd):
     for k in range(3):
         zf[k] += rate * (Y[0, k] * bias[0] + Y[1, k] * bias[1] + Y[2, k] * bias[2])
         t[1, k] = rate * dot(X[k], bias)
-    if SPRINGS and d.spring[i] >= 0:
+    if JOINT_PARTS and d.spring[i] >= 0:
         D, u = eliminate_spring(d, w, i, force, u - force, modal_force[d.spring[i]], extra)
     for k in range(3):
         zn[k] += t[1, k] + spin * bias[k]
@@ -977,9 +980,9 @@ def forward_dynamics(
         if not driven[i]:
             qdd[i] = w.D[i] * (w.u[i] - dot(w.Ua[i], al) - dot(w.Uf[i], a0))
         turning, rate = qdd[i], qd[i]
-        if SPRINGS:
+        if JOINT_PARTS:
             rate = w.rate[i]
-        if SPRINGS and d.spring[i] >= 0:
+        if JOINT_PARTS and d.spring[i] >= 0:
             acc = w.S[i, 1] - w.S[i, 2] * qdd[i] - dot(w.Sa[i], al) - dot(w.Sf[i], a0)
             delta_dd[d.spring[i]] = w.S[i, 0] * acc
             turning += delta_dd[d.spring[i]]
@@ -1021,11 +1024,31 @@ def spring_torque(c, x, rate):
     return c[0] * s + spring_damping(c, s) * rate
 
 
+def slip_level(d, i, delta, delta_d, rate):
+    """Level of joint i's friction beyond Coulomb's, its motor turning with this rate."""
+    c, level = d.slip[i], 0.0
+    if c[0] != 0.0:
+        x = rate / c[1]
+        level += c[0] * np.exp(-x * x)
+    if c[2] != 0.0:
+        row = d.spring[i]
+        level += c[2] * abs(spring_torque(d.transmission[i], delta[row], delta_d[row]))
+    return level
+
+
+def take_off_slip(d, delta, delta_d, qd, driven, torque):
+    """Take the joints' friction beyond Coulomb's off the net torque, in place."""
+    for i in range(d.links):
+        c = d.slip[i]
+        if not driven[i] and (c[0] != 0.0 or c[2] != 0.0):
+            torque[i] -= slip_level(d, i, delta, delta_d, qd[i]) * np.tanh(qd[i] / c[3])
+
+
 def modal_force(d, w, delta, delta_d, force):
     """Elastic and damping force of all modes and transmissions, after `prepare`."""
     for i in range(d.links):
         row = d.spring[i]
-        if SPRINGS and row >= 0:
+        if JOINT_PARTS and row >= 0:
             force[row] = -spring_torque(d.transmission[i], delta[row], delta_d[row])
         for j in range(d.count[i]):
             acc = -w.elastic[i, j]
@@ -1035,7 +1058,10 @@ def modal_force(d, w, delta, delta_d, force):
 
 
 def derivative(state, torque, data, out):
-    """Time derivative of the state (q, delta, qd, delta_d) under net joint torque; `data` as `Chain` packs it."""
+    """Time derivative of the state (q, delta, qd, delta_d) into `out`, under net joint torque; that may be overwritten.
+
+    `data` is as `Chain` packs it.
+    """
     constants, work, joint_extra, modal_extra, driven, force = data
     d, w = constants[0], work[0]
     n, m = torque.size, force.size
@@ -1048,6 +1074,8 @@ def derivative(state, torque, data, out):
     qd, delta_d = state[n + m : 2 * n + m], state[2 * n + m :]
     prepare(d, w, q, delta, qd, delta_d)
     modal_force(d, w, delta, delta_d, force)
+    if JOINT_PARTS:
+        take_off_slip(d, delta, delta_d, qd, driven, torque)
     forward_dynamics(
         d, w, qd, torque, force, joint_extra, modal_extra, driven,
         out[n + m : 2 * n + m], out[2 * n + m :],
@@ -1120,7 +1148,7 @@ def potential_energy(data, work, q, delta, zero, modal_zero):
                 c = 1.0 - sz * sz
                 ky2 = (by + sy * sz * bz / c) ** 2 * c / (c - sy * sy)
                 energy += 0.5 * (d.node_ei[i, g, 0] * ky2 + d.node_ei[i, g, 1] * bz * bz / c)
-        if SPRINGS and d.spring[i] >= 0:
+        if JOINT_PARTS and d.spring[i] >= 0:
             s = dead_zone(delta[d.spring[i]], d.transmission[i, 2])
             energy += 0.5 * d.transmission[i, 0] * s * s
     apply(R[N], d.payload_moment, w.t[0])
@@ -1189,7 +1217,7 @@ def point(data, work, index, q, delta, zero, modal_zero, offset, place, jacobian
     for i in range(index + 1):
         apply(R[i], d.axis[i], t[1])
         put_column(jacobian, i, t[1], place, p[i], t)
-        if SPRINGS and d.spring[i] >= 0:
+        if JOINT_PARTS and d.spring[i] >= 0:
             put_column(jacobian, n + d.spring[i], t[1], place, p[i], t)
         for j in range(d.count[i]):
             column = n + d.first[i] + j
@@ -1266,9 +1294,11 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
             net_torque(torque, change, fraction, friction, point, net)  # noqa: F821 - of kernels.integrators
             prepare(d, w, q, delta, qd, delta_d)
             modal_force(d, w, delta, delta_d, force)
+            if JOINT_PARTS:
+                take_off_slip(d, delta, delta_d, qd, driven, net)
             for i in range(n):
                 s = d.spring[i]
-                if SPRINGS and s >= 0:
+                if JOINT_PARTS and s >= 0:
                     stiff, damp = spring_terms(d.transmission[i], state, n + s, step)
                     if stage == 0:
                         joint_extra[i, 1] = g * damp + g * g * stiff
@@ -1282,6 +1312,10 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                         # The secant, not the tangent: a joint that slips now may stick within the step.
                         x = max(abs(qd[i]) / friction[i, 2], 1e-6)
                         slip += friction[i, 1] / friction[i, 2] * np.tanh(x) / x
+                    if JOINT_PARTS and d.slip[i, 3] != 0.0:
+                        x = max(abs(qd[i]) / d.slip[i, 3], 1e-6)
+                        level = slip_level(d, i, delta, delta_d, qd[i])
+                        slip += level / d.slip[i, 3] * np.tanh(x) / x
                     joint_extra[i, 0] = g * slip
                 else:
                     net[i] += 2.0 * joint_extra[i, 0] * k1[size + i]

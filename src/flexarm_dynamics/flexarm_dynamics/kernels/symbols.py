@@ -168,6 +168,14 @@ class Symbol:
         """The cosine, as numpy asks it of an object."""
         return self.graph.symbol("np.cos", self)
 
+    def exp(self):
+        """The exponential, as numpy asks it of an object."""
+        return self.graph.symbol("np.exp", self)
+
+    def tanh(self):
+        """The hyperbolic tangent, as numpy asks it of an object."""
+        return self.graph.symbol("np.tanh", self)
+
     def __abs__(self):
         return self.graph.symbol("abs", self)
 

@@ -231,6 +231,7 @@ def assemble(arm, shapes, loads):
         "gear": np.array([j.gear_ratio for j in arm.joints]),
         "rotor": np.array([j.rotor_inertia for j in arm.joints]),
         "spring": _springs(arm.joints, sum(len(m) for m in modes)),
+        "slip": np.array([_slip_constants(j) for j in arm.joints]),
         "transmission": np.array([_spring_constants(j.transmission) for j in arm.joints]),
         "length": np.array([link.length for link in arm.links]),
         "mass": z(N), "moment": z(N), "inertia": z((N, 3, 3)), "s": z((N, K)), "e": z((N, K)),
@@ -285,6 +286,11 @@ def _springs(joints, bending):
     """Place of each joint's transmission in delta, after the links' modes; -1: it has none."""
     has = np.array([j.transmission is not None for j in joints])
     return np.where(has, bending + np.cumsum(has) - 1, -1).astype(np.int64)
+
+
+def _slip_constants(joint):
+    f = joint.friction
+    return f.excess, f.stribeck, 0.0 if joint.transmission is None else f.load, f.smoothing
 
 
 def _spring_constants(t):

@@ -39,9 +39,9 @@ from .assembly import (
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
-#: For arms without transmissions.
-STIFF_SOURCES = (
-    CHAIN_SOURCES[0].replace("SPRINGS = True", "SPRINGS = False"),
+#: For arms without transmissions, and with Coulomb's friction at most.
+PLAIN_SOURCES = (
+    CHAIN_SOURCES[0].replace("JOINT_PARTS = True", "JOINT_PARTS = False"),
     CHAIN_SOURCES[1],
 )
 
@@ -80,7 +80,12 @@ class Chain(ArmModel):
 
     @property
     def _sources(self):
-        return CHAIN_SOURCES if self._transmissions else STIFF_SOURCES
+        return CHAIN_SOURCES if self._transmissions or self._slips else PLAIN_SOURCES
+
+    @cached_property
+    def _slips(self):
+        """Joints with friction beyond Coulomb's."""
+        return [i for i, c in enumerate(self.data.slip) if c[0] or c[2]]
 
     @cached_property
     def kernel(self):
@@ -185,7 +190,7 @@ class Chain(ArmModel):
         """
         accelerations = np.concatenate([self._joint(qdd, "qdd"), self._modal(delta_dd, "delta_dd")])
         out = self.forces(q, qd, delta, delta_d) + self.mass_matrix(q, delta) @ accelerations
-        out[: self.n_joints] += self.friction(self._joint(qd, "qd"))
+        out[: self.n_joints] += self.friction(self._joint(qd, "qd"), delta, delta_d)
         return out
 
     def linearisation(self, q, qd, delta=None, delta_d=None):
@@ -251,7 +256,7 @@ class Chain(ArmModel):
             K, C = self.linearisation(q, qd)
             delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
             f = self.forces(q, qd, delta, delta_d) - K @ delta - C @ delta_d
-        f[:n] += self.friction(qd)
+        f[:n] += self.friction(qd, delta, delta_d)
         return Terms(
             M=self.mass_matrix(q, delta), f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:]
         )
@@ -283,7 +288,7 @@ class Chain(ArmModel):
         state = np.asarray(state, float)
         check_shape(state, (2 * (n + m),), "state")
         out = np.empty_like(state)
-        net = np.asarray(torque, float) - self.friction(state[n + m : 2 * n + m])
+        net = np.asarray(torque, float) - super().friction(state[n + m : 2 * n + m])
         self.kernel.derivative(state, net, (self._data, self._work, *self._none), out)
         return out
 
@@ -292,6 +297,14 @@ class Chain(ArmModel):
         """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
         n, K = self.data.links, self.data.s.shape[1]
         return np.zeros((n, 2)), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
+
+    def friction(self, qd, delta=None, delta_d=None):
+        out = super().friction(qd)
+        delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
+        for i in self._slips:
+            level = plain.slip_level(self.data, i, delta, delta_d, qd[i])
+            out[i] += level * np.tanh(qd[i] / self.data.slip[i, 3])
+        return out
 
     def stiffness_matrix(self):
         m = self.n_modes

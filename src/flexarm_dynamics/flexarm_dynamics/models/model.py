@@ -121,7 +121,10 @@ class ArmModel(ABC):
         """`beam.ModeShapes` of a link in a direction."""
 
     def friction_table(self):
-        """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing speed; shape (n, 3)."""
+        """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing speed; shape (n, 3).
+
+        Stribeck's part, and that of the transmitted torque, are in the equations of motion.
+        """
         frictions = [joint.friction for joint in self.arm.joints]
         return np.array([[f.viscous, f.coulomb, f.smoothing] for f in frictions])
 
@@ -187,8 +190,11 @@ class ArmModel(ABC):
         problem = "takes no other payload than its arm file's"
         raise ModelError(problem, field=f"model {self.arm.model}")
 
-    def friction(self, qd):
-        """Friction torque of the joints, shape (n,) [N m]: ``viscous*qd + coulomb*tanh(qd/smoothing)``."""
+    def friction(self, qd, delta=None, delta_d=None):
+        """Friction torque of the joints, shape (n,) [N m], see `Friction`.
+
+        Without the deflections `delta` and `delta_d`, without the part that grows with the transmitted torque.
+        """
         viscous, coulomb, smoothing = self.friction_table().T
         return viscous * qd + coulomb * np.tanh(qd / smoothing)
 

@@ -91,6 +91,9 @@ class OneLinkEquations(ArmModel):
         if self.joint.transmission is not None:
             field, hint = f"transmission of {self.joint.name}", "use model chain"
             raise ModelError("is not in this model", field=field, hint=hint)
+        if self.joint.friction.excess:
+            field, hint = f"friction.breakaway of {self.joint.name}", "use model chain"
+            raise ModelError("is not in this model", field=field, hint=hint)
         self.flexibility = self.link.flexible["y"]
         if shapes is None:
             shapes = shapes_of(self.link, "y", self.flexibility, outboard(arm)[0])

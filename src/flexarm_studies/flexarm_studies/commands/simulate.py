@@ -255,7 +255,12 @@ def prescribed_torque(chain, state, acceleration):
     M = chain.mass_matrix(q, delta)
     forces = chain.forces(q, qd, delta, delta_d)
     modal = np.linalg.solve(M[n:, n:], -forces[n:] - M[n:, :n] @ acceleration)
-    return M[:n, :n] @ acceleration + M[:n, n:] @ modal + forces[:n] + chain.friction(qd)
+    return (
+        M[:n, :n] @ acceleration
+        + M[:n, n:] @ modal
+        + forces[:n]
+        + chain.friction(qd, delta, delta_d)
+    )
 
 
 def column_names(chain):
