@@ -321,6 +321,18 @@ LAWS = [
         "robust",
         TESTS + "test_robust.py",
         (
+            "uncertain",
+            "a joint that sticks: as much decay as of one that turns",
+            "UNLIKELY, STICKING = 0.5, 0.05",
+            "UNLIKELY, STICKING = 0.5, 0.4",
+        ),
+        (
+            "search",
+            "start of a search: modes beyond the low pass as well",
+            "square <= corner**2",
+            "square <= np.inf",
+        ),
+        (
             "loop",
             "the integral",
             "integral[:, at_y : at_y + n] = h",

@@ -14,9 +14,10 @@ from flexarm_control.low_pass import LowPass
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Slowest, Wanted, eigenvalues, gradient
-from flexarm_control.robust.design import Settings, design, units
+from flexarm_control.robust.design import FASTEST, NOISIEST, Settings, design, units, what_limits
 from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
+from flexarm_control.robust.search import start
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
     Uncertainty,
@@ -199,6 +200,42 @@ def test_the_paper_s_arm_has_a_quarter_of_its_bending_frequency_in_the_worst_cas
     for loop, (name, pole, _) in zip(loops, designed.slowest, strict=True):
         s = np.log(eigenvalues(loop, designed.K)[1]) / loop.period
         assert loop.name == name and np.abs(s - pole).min() < 1e-6 * abs(pole)
+
+
+def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(designed):
+    """What sticks creeps, however the gains are: that does not hold the other loops back."""
+    arm = designed.arm
+    rough = tuple(replace(j, friction=replace(j.friction, coulomb=0.5)) for j in arm.joints)
+    found = design(replace(arm, joints=rough), QUICK)
+    slowest = max(v for name, _, v in found.slowest if "sticking" not in name)
+    assert found.holds and -slowest > 0.85 * designed.decay
+
+
+@pytest.mark.parametrize(
+    ("name", "pole", "change", "words"),
+    [
+        ("sticking, at configuration 1", -0.1 + 0.1j, {}, "friction: a joint that sticks creeps"),
+        ("stated", -1.0 + 300.0j, {}, "delay: the torque for this mode of 47.7 Hz is"),
+        ("stated", -1.0 + 60.0j, {"slope": 0.1}, "reach: torque hardly moves this mode of 9.55 Hz"),
+        ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99)}, "noise: "),
+        ("stated", -9.0 + 6.0j, {"decay": FASTEST}, "nothing: "),
+        ("stated", -1.0 + 60.0j, {}, "several loops at once: "),
+    ],
+)
+def test_the_card_says_why_the_slowest_pole_is_no_faster(designed, name, pole, change, words):
+    noise = tuple(NOISIEST * f for f in change.pop("noise", (0.1, 0.1)))
+    one = {"decay": 0.1, "slope": 3.0, "noise": noise, "slowest": ((name, pole, -0.1),)} | change
+    assert what_limits(replace(designed, **one)).startswith(words)
+
+
+@pytest.mark.parametrize(("corner", "links"), [(1.0, "rigid"), (np.inf, "bending")])
+def test_joints_start_as_stiff_as_the_modes_that_pass_the_low_pass_allow(two_link, corner, links):
+    q, late, n = np.array([0.3, 0.5]), 1e3, two_link.n_joints
+    M = two_link.terms(q, np.zeros(n)).M
+    H = np.linalg.inv(M[:n, :n]) if links == "rigid" else np.linalg.inv(M)[:n, :n]
+    scale = units(two_link, [q], 10.0)
+    K = start(two_link, [q], scale, 0.5, late, corner)
+    assert_allclose(np.diag(K[:, n : 2 * n]), 1.0 / (3.0 * np.diag(H) * late), rtol=1e-9)
 
 
 def test_a_design_is_the_same_each_time():

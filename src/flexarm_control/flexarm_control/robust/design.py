@@ -37,13 +37,16 @@ from .uncertain import (
 #: Corner of the filtered derivatives over omega_c.
 FILTER = 2.0
 #: Corners of the torque's low pass that are tried, over omega_1; infinite: none.
-LOW_PASS = (np.inf, 20.0, 8.0)
+LOW_PASS = (np.inf, 20.0, 8.0, 4.0)
 #: A low pass costs margins of gain and phase, and is taken where it makes the decay larger by more than this factor.
 SLUGGISH = 1.25
 #: The controller's own check has neither filters nor delay, which the design has.
 UNCHECKED = -1000.0
 #: Beside a period a torque is under way for so long between processes [s].
 TRANSPORT = 1e-3
+#: A pole is hardly in reach of the torque where one unit of all gains changes its value by less than this [-], and fast
+#: for the loop where the torque's delay turns it by more than this [rad].
+HARDLY, FAST = 1.0, 0.5
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 
@@ -106,6 +109,8 @@ class Design:
         Frequencies of modes that no gain moves, at the first configuration [rad/s].
     noise : tuple of float
         Of each joint: rms torque of the sensors' noise over the torque limit [-].
+    slope : float
+        By how much one unit of all gains changes the value of the slowest pole [-].
     """
 
     arm: object
@@ -121,6 +126,7 @@ class Design:
     left: tuple = ()
     evaluations: int = 0
     noise: tuple = field(default=())
+    slope: float = np.inf
 
     @property
     def holds(self):
@@ -190,10 +196,35 @@ def in_the_way(found):
     )
 
 
+def what_limits(found):
+    """Why the slowest pole of a design that holds is no faster, in words."""
+    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    hertz, lag = abs(pole) / (2.0 * np.pi), _lag(found, pole)
+    if "sticking" in name and abs(pole) < found.omega_1:
+        return "friction: a joint that sticks creeps to its place, and only the integral moves it"
+    if lag > FAST:
+        return (
+            f"delay: the torque for this mode of {hertz:.3g} Hz is {np.degrees(lag):.0f} degrees late; a higher rate"
+            " or a shorter delay helps"
+        )
+    if found.slope < HARDLY:
+        return f"reach: torque hardly moves this mode of {hertz:.3g} Hz"
+    if max(found.noise, default=0.0) > 0.9 * max(found.settings.speed, 0.05) * NOISIEST:
+        return "noise: faster joints would pass more of it on to the torque"
+    if found.decay > 0.95 * max(found.settings.speed, 0.05) * FASTEST:
+        return "nothing: a higher speed asks more"
+    return "several loops at once: what makes one of them faster makes another one slower"
+
+
+def _lag(found, pole):
+    """By how much the delay turns the torque for a mode [rad]."""
+    return abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period)
+
+
 def what_helps(found):
     """What to try, for the slowest pole of a design that does not hold."""
     _, pole, _ = max(found.slowest, key=lambda row: row[2])
-    if abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period) > 0.5:
+    if _lag(found, pole) > FAST:
         return (
             "sample faster or shorten the delay: this pole is too fast for the loop; a rotor_inertia in the arm file"
             " slows it"
@@ -261,7 +292,8 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         noise = Noise(slowest, nominal, samples, speed * NOISIEST, omega_1)
         late = sampling.delay + 0.5 * sampling.period
         late += 1.0 / sampling.joint_corner + POLES / samples.torque_corner
-        starts = [start(nominal, at, scale, a, late) for a in STARTS]
+        corner = samples.torque_corner
+        starts = [start(nominal, at, scale, a, late, corner) for a in STARTS]
         starts += [] if gains is None else [gains]
         search = Search(slowest, noise, speed * FASTEST, 1.0 if np.isinf(factor) else SLUGGISH)
         searches.append((search, [slowest.scaled(K) for K in starts]))
@@ -269,10 +301,11 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     search = searches[chosen][0]
     slowest, noise = search.slowest, search.noise
     sampling = replace(sampling, torque_corner=LOW_PASS[chosen] * omega_1)
-    rows, left = [], []
+    rows, left, slopes = [], [], []
     for one in slowest.values(x):
-        v, _, _, s, unmoved = slowest.worst([one])
+        v, slope, _, s, unmoved = slowest.worst([one])
         rows.append((one[0].name, complex(s), float(v)))
+        slopes.append(float(np.linalg.norm(slope)))
         left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
     K = slowest.gains(x)
     return Design(
@@ -289,6 +322,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         tuple(sorted(set(left))),
         round(sum(search.evaluations for search, _ in searches)),
         tuple(noise.shares(K).tolist()),
+        slopes[int(np.argmax([row[2] for row in rows]))],
     )
 
 

@@ -2,6 +2,7 @@
 """The search for the gains whose slowest pole is the fastest."""
 
 import numpy as np
+from scipy.linalg import eigh
 
 from .nonsmooth import minimise
 
@@ -13,8 +14,8 @@ SMALL_GAINS = 1e-6
 WIDTHS = (0.3, 0.1, 0.03, 0.01)
 #: Evaluations of one descent, until the loops are chosen anew.
 DESCENT = 60
-#: Evaluations of all loops for each start, and for each of the best ones; and so many best ones there are.
-FIRST, LATER, KEPT = 80, 320, 2
+#: Evaluations of all loops for each start, then for the best start of each search, then for the best of all.
+FIRST, MIDDLE, LAST = 80, 120, 320
 #: Loops with more states get fewer evaluations.
 SIZE = 80
 #: A width goes on for as long as it gains this fraction.
@@ -111,7 +112,10 @@ def _worst(each, chosen):
 
 
 def race(searches, effort=1.0, progress=None):
-    """The best of several searches, each with its starts: the best after a short one go on.
+    """The best of several searches, each with its starts.
+
+    After a short run of each start the best one of each search goes on, then the best of all: stable gains that are
+    hardly any look better at first than firm ones that are not stable yet.
 
     Parameters
     ----------
@@ -128,7 +132,7 @@ def race(searches, effort=1.0, progress=None):
         Number of the search, and its scaled gains.
     """
     entries = [(k, x) for k, (_, starts) in enumerate(searches) for x in starts]
-    whole = FIRST * len(entries) + LATER * KEPT
+    whole = FIRST * len(entries) + MIDDLE * len(searches) + LAST
     done, tried = 0, []
 
     def run(k, x, budget, widths):
@@ -143,20 +147,27 @@ def race(searches, effort=1.0, progress=None):
             progress(done / whole, -tried[0][0])
         return tried[0][0] < -search.enough
 
-    if not any(run(k, x, FIRST, WIDTHS[:2]) for k, x in entries):
-        for _, k, x in list(tried[:KEPT]):
-            if run(k, x, LATER, WIDTHS):
-                break
+    def best_of(k):
+        return next(x for _, one, x in tried if one == k)
+
+    if not any(run(k, x, FIRST, WIDTHS[:2]) for k, x in entries) and not any(
+        run(k, best_of(k), MIDDLE, WIDTHS) for k in range(len(searches))
+    ):
+        run(*tried[0][1:], LAST, WIDTHS)
     if progress is not None and done < whole:
         progress(1.0, -tried[0][0])
     return tried[0][1:]
 
 
-def start(model, at, scale, a, late):
-    """Gains of joints alone with a natural frequency of a omega_1, as far as a torque that is `late` [s] allows.
+def start(model, at, scale, a, late, corner=np.inf):
+    r"""Gains of joints alone with a natural frequency of a omega_1, as far as a torque that is `late` [s] allows.
 
-    What a torque moves at first is not the arm but the inertia that is left when the links bend, 1 / H_ii with H the
-    inverse of the mass matrix: K_qd H_ii late is kept below a third.
+    What a torque moves at first is not the arm but the inertia that is left when the links bend, 1 / H_ii with
+
+    .. math:: H_{ii} = \sum_{\omega_k\le\omega_c}\phi_{ik}^2
+
+    over the modes :math:`\phi_k`, of mass 1, that a low pass of the `corner` lets pass; without one H is the inverse of
+    the mass matrix. K_qd H_ii late is kept below a third.
 
     Parameters
     ----------
@@ -169,13 +180,15 @@ def start(model, at, scale, a, late):
         [-]
     late : float
         [s]
+    corner : float
+        Of the torque's low pass [rad/s]; infinite: none.
 
     Returns
     -------
     ndarray, shape (n, 3n + 2m)
     """
     K, n = np.zeros_like(scale), scale.shape[0]
-    H = np.max([np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n] for q in at], axis=0)
+    H = np.max([_mobility(model, q, corner) for q in at], axis=0)
     for i in range(n):
         damping = scale[i, n + i] * 2.0 * a
         fraction = min(1.0, 1.0 / (3.0 * H[i] * late) / damping)
@@ -183,3 +196,12 @@ def start(model, at, scale, a, late):
         K[i, i] = fraction * scale[i, i] * a**2 * 2.0
         K[i, 2 * n + i] = fraction * scale[i, 2 * n + i] * 0.3 * a**3
     return K
+
+
+def _mobility(model, q, corner):
+    """Joint acceleration per torque, as far as the modes up to a `corner` [rad/s] make it, (n,) [1/(kg m^2)]."""
+    n, terms = model.n_joints, model.terms(q, np.zeros(model.n_joints))
+    stiffness = np.zeros_like(terms.M)
+    stiffness[n:, n:] = terms.K2
+    square, modes = eigh(stiffness, terms.M)
+    return (modes[:n, square <= corner**2] ** 2).sum(axis=1)

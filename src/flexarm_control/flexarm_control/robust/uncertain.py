@@ -14,8 +14,9 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks.
-UNLIKELY, STICKING = 0.5, 0.4
+#: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks: that one creeps,
+#: as slowly as its friction is large beside its stiffness.
+UNLIKELY, STICKING = 0.5, 0.05
 #: Damping ratio that every mode is taken to have at least [-].
 MIN_DAMPING = 1e-4
 

@@ -153,6 +153,8 @@ def design(options):
 
 def _result(found, bears):
     """What is printed as JSON."""
+    from flexarm_control.robust.design import what_limits
+
     return {
         "parameters": found.parameters(),
         "decay": found.decay,
@@ -160,6 +162,7 @@ def _result(found, bears):
         "slowest": [
             {"loop": name, "pole": [s.real, s.imag], "value": v} for name, s, v in found.slowest
         ],
+        "limited_by": what_limits(found),
         "left_rad_s": list(found.left),
         "noise": list(found.noise),
         "gain": list(bears.gain),
@@ -246,6 +249,8 @@ def _factors(option, text):
 
 def card_lines(found, bears):
     """What a design was found to do, in words."""
+    from flexarm_control.robust.design import what_limits
+
     name, pole, _ = max(found.slowest, key=lambda row: row[2])
     hertz = found.omega_1 / (2.0 * np.pi)
     lines = [
@@ -253,6 +258,7 @@ def card_lines(found, bears):
         f" {len(found.configurations)} configurations, {found.settings.rate:g} Hz, delay"
         f" {1e3 * found.settings.delay:.3g} ms",
         f"  worst decay         {-pole.real:.3g} 1/s ({found.decay:.2f} of what is asked): {name}",
+        f"  limited by          {what_limits(found)}",
         f"  expected settling   {bears.settling:.3g} s after a push at the tip, to 2 %, with the file's numbers;"
         f" slowest pole of all loops: {bears.slowest:.3g} s",
         f"  tip stiffness       {_number(bears.tip_stiffness)} N/m when the integral has acted, the links alone bend;"
