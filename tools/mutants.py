@@ -600,6 +600,27 @@ LAWS = [
             TESTS + "test_kalman.py",
         ),
         (
+            "motion_kalman",
+            "motion_kalman: the joints' acceleration does not move the links",
+            "force = M[n:, :n] @ a + modal_forces(",
+            "force = 0.0 * M[n:, :n] @ a + modal_forces(",
+            TESTS + "test_motion_kalman.py",
+        ),
+        (
+            "motion_kalman",
+            "motion_kalman: no bias is measured",
+            "self._C[n:, self._bias] = np.eye(g)",
+            "self._C[n:, self._bias] = 0.0",
+            TESTS + "test_motion_kalman.py",
+        ),
+        (
+            "motion_kalman",
+            "motion_kalman: the shared noise is white",
+            "step.Phi[last, last] = self._companion",
+            "step.Phi[last, last] = 0.0",
+            TESTS + "test_motion_kalman.py",
+        ),
+        (
             "gauge_health",
             "a gauge that is silent",
             "self.health[~np.isfinite(strain)] = MISSING",

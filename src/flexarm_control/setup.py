@@ -55,6 +55,7 @@ setup(
             "filtered_derivative = flexarm_control.observers.filtered_derivative:FilteredDerivative",
             "luenberger = flexarm_control.observers.luenberger:Luenberger",
             "kalman = flexarm_control.observers.kalman:Kalman",
+            "motion_kalman = flexarm_control.observers.motion_kalman:MotionKalman",
             "extended_kalman = flexarm_control.observers.extended_kalman:ExtendedKalman",
         ],
     },

@@ -76,7 +76,7 @@ def test_an_arm_with_a_mode_that_it_does_not_observe_is_refused():
 def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
     core = observed(arm_r, name)
     for k in range(20):
-        core.step(sample(k, rate=[1.0, k]))
+        core.step(sample(k, rate=[1.0, k], strain=[1e-6 * k, 0.0]))
         once, known = state(core), core.observer.converged
         for _ in range(3):
             # what it carries does not matter: it is known
@@ -85,7 +85,7 @@ def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
         assert_array_equal(state(core), once)
     fresh = observed(arm_r, name)
     for k in range(20):
-        fresh.step(sample(k, rate=[1.0, k]))
+        fresh.step(sample(k, rate=[1.0, k], strain=[1e-6 * k, 0.0]))
     assert_array_equal(state(core), state(fresh))
 
 

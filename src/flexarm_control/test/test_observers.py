@@ -22,6 +22,7 @@ def sample(amplitude, rate=None, torque=0.0, position=0.0, velocity=0.0):
         torque=np.array([torque]),
         position=np.array([position]),
         velocity=np.array([velocity]),
+        strain=1e-3 * np.array(amplitude, float),
     )
 
 

@@ -44,7 +44,7 @@ class Parameter:
         The values that a string may take.
     length : str or int, optional
         Length of an array: a number, or a name looked up in the sizes given to `check`
-        (`joints`, `modes`, `z`, `gain`). An array of one element is spread to that length.
+        (`joints`, `modes`, `gauges`, `z`, `gain`). An array of one element is spread to that length.
     read_only : bool
         Whether the value is fixed once the node has started.
     """
@@ -218,10 +218,10 @@ def _is_finite(value):
 def sizes(model):
     """Lengths of array parameters by the names that declarations use.
 
-    ``joints``, ``modes``, ``z`` for z_f, and ``gain`` for all numbers of K_f.
+    ``joints``, ``modes``, ``gauges``, ``z`` for z_f, and ``gain`` for all numbers of K_f.
     """
     n, m = model.n_joints, model.n_modes
-    return {"joints": n, "modes": m, "z": 2 * m, "gain": 2 * n * m}
+    return {"joints": n, "modes": m, "gauges": len(model.arm.gauges), "z": 2 * m, "gain": 2 * n * m}
 
 
 def check_all(declared, values, sizes=None, prefix=""):

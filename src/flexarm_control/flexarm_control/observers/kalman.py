@@ -92,6 +92,15 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
+        self._assume()
+        self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
+        self._forget_gain()
+        self._beyond = 0.0
+        self._prepare()
+
+    def _assume(self):
+        """R, the density of the forces, and the bound of the innovations, from the parameters."""
+        model, m = self.model, self._p - self._n
         strain_map = StrainMap(model) if model.arm.gauges else None
         self._covariance_without = lru_cache(
             partial(measurement_covariance, model, self.parameters, strain_map)
@@ -99,12 +108,12 @@ class Kalman(Observer):
         self.measurement_covariance = self._covariance_without(())
         noise = [*self.parameters["torque_noise"], *[self.parameters["modal_force_noise"]] * m]
         self.density = np.square(np.array(noise, float))
-        self._bound = float(chi2.ppf(self.QUANTILE, self._p))
+        self._bound = self._bound_of(self._p)
         self._measured = np.zeros(self._p)
-        self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
-        self._forget_gain()
-        self._beyond = 0.0
-        self._prepare()
+
+    def _bound_of(self, count):
+        """The bound of an innovation squared of so many measurements."""
+        return float(chi2.ppf(self.QUANTILE, max(count, 1)))
 
     def _prepare(self):
         self.motion = Motion(self.model, self.density)
@@ -143,17 +152,21 @@ class Kalman(Observer):
         if self._elapsed < 0.0:
             self._start(sample)
             return
-        need_torque(sample.torque, f"observer.type {self.NAME}", "use filtered_derivative")
+        need_torque(sample.torque, f"observer.type {self.NAME}", "use motion_kalman")
+        self._advance(sample.torque, dt)
+
+    def _advance(self, torque, dt):
+        """Predict over dt [s] and correct by `_measured`."""
         before = np.diagonal(self.covariance)[self._p : 2 * self._p].copy()
-        x, step = self._predict(sample.torque, dt)
+        x, step = self._predict(torque, dt)
         # Nothing is assigned before everything is computed: a failure changes nothing.
-        innovation = measured - x[: self._p]
+        innovation = self._measured - self._output(x)
         if step is not self._step or not self._steady:
             self._recursion(step)
+        self._innovations(innovation)
         weighted = dpotrs(self._root, innovation, lower=1)[0]
         self.state[:] = x + innovation @ self._gain_transposed
         self.innovation_squared = float(innovation @ weighted)
-        self.innovation[:] = innovation[self._n :]
         self._judge()
         self._publish()
         self._elapsed += dt
@@ -177,13 +190,21 @@ class Kalman(Observer):
         step = self.motion.step_for(dt, self.state[: self._n])
         return self.motion.advance(self.state, torque, dt, step), step
 
+    def _innovations(self, innovation):
+        """Publish the innovation of a sample (measurements,)."""
+        self.innovation[:] = innovation[self._n :]
+
+    def _output(self, x):
+        """C x: what is measured of a state (N,), or of the columns of a matrix (N, k)."""
+        return x[: self._p]
+
     def _recursion(self, step):
         """Covariance after a step and a measurement, and the gain."""
-        p, R = self._p, self.measurement_covariance
+        R = self.measurement_covariance
         P = step.Phi @ self.covariance @ step.Phi.T
         P += step.Q
-        seen = P[:p]
-        root, failed = dpotrf(seen[:, :p] + R, lower=1)
+        seen = self._output(P)
+        root, failed = dpotrf(self._output(seen.T) + R, lower=1)
         if failed:
             raise MessageError(
                 "is not positive definite",
@@ -192,7 +213,7 @@ class Kalman(Observer):
             )
         gain = dpotrs(root, seen, lower=1)[0]  # K^T
         P = P - gain.T @ seen
-        P -= (P[:, :p] - gain.T @ R) @ gain
+        P -= (self._output(P.T).T - gain.T @ R) @ gain
         P = 0.5 * (P + P.T)
         variance, last = np.diagonal(P), np.diagonal(self.covariance)
         same = np.all(np.abs(variance - last) <= self.STEADY * variance)
@@ -225,7 +246,7 @@ def measurement_covariance(model, parameters, strain_map, lost):
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))
     for i, joint in enumerate(model.arm.joints):
-        out[i, i] = _position_noise(joint, parameters["position_noise"]) ** 2
+        out[i, i] = position_uncertainty(joint, parameters["position_noise"]) ** 2
     if not m:
         return out
     if not model.arm.gauges:
@@ -239,8 +260,8 @@ def measurement_covariance(model, parameters, strain_map, lost):
     return out
 
 
-def _position_noise(joint, stated):
-    """Rms error of a joint's position [rad]."""
+def position_uncertainty(joint, stated):
+    """Rms error of a joint's position [rad]: the `stated` one if above 0, else that of the `joint`'s encoder."""
     if stated > 0.0:
         return stated
     if joint.encoder_counts > 0:
