@@ -104,6 +104,34 @@ def linear_plant(model, q, coulomb=True):
     return A, B
 
 
+def softened(model, q, A, place, transmission, fraction):
+    """A of `linear_plant` with only a fraction of a transmission's stiffness and damping.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q : ndarray, shape (n,)
+        [rad]
+    A : ndarray, shape (2 (n + m), 2 (n + m))
+    place : int
+        Of the transmission's deflection in (q, delta).
+    transmission : Transmission
+    fraction : float
+        What is left [-].
+
+    Returns
+    -------
+    ndarray, shape (2 (n + m), 2 (n + m))
+    """
+    half = A.shape[0] // 2
+    delta = state_at_rest(model.without_play(), q)[model.n_joints : half]
+    push = np.linalg.inv(model.mass_matrix(np.asarray(q, float), delta))[:, place]
+    out = A.copy()
+    out[half:, place] += (1.0 - fraction) * transmission.stiffness * push
+    out[half:, half + place] += (1.0 - fraction) * transmission.damping * push
+    return out
+
+
 def state_at_rest(model, q):
     """State (q, delta, qd, delta_d) of the arm at rest, bent by its weight, shape (2 (n + m),)."""
     n, m = model.n_joints, model.n_modes

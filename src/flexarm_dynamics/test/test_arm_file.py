@@ -35,6 +35,7 @@ joints:
     origin: {xyz: [0.1, 0.2, 0.3], rpy: [0.0, 0.1, 0.0]}
     hub_inertia: 0.5
     motor_mass: 1.5
+    housing_inertia: [1.0e-3, 2.0e-3, 3.0e-3, 0.0, 0.0, 1.0e-4]
     rotor_inertia: 1.0e-4
     gear_ratio: 100.0
     friction: {viscous: 0.1, coulomb: 0.2, smoothing: 0.05, breakaway: 0.3, stribeck: 0.2, load: 0.1}
@@ -137,6 +138,7 @@ def test_every_field_is_read():
     assert joint.origin_rpy == (0.0, 0.1, 0.0)
     assert joint.inertia == pytest.approx(0.5 + 1e-4 * 100.0**2)
     assert joint.motor_mass == 1.5
+    assert joint.housing_inertia == ((1e-3, 0.0, 0.0), (0.0, 2e-3, 1e-4), (0.0, 1e-4, 3e-3))
     assert (joint.friction.viscous, joint.friction.coulomb) == (0.1, 0.2)
     assert joint.friction == Friction(0.1, 0.2, 0.05, 0.3, 0.2, 0.1)
     assert joint.limits.position == (-2.0, 1.0)
@@ -550,6 +552,7 @@ def test_a_field_given_twice_is_refused(text, start):
         (("links", 1, "EI_y"), 1.0, "beside a section; give either a section or the stiffnesses"),
         (("links", 1, "mass_per_length"), 1.0, "give either a section or the stiffnesses"),
         (("payload", "inertia"), -1.0, "not positive semi-definite"),
+        (("joints", 0, "housing_inertia"), -1.0, "not positive semi-definite"),
         (("payload", "inertia"), [1.0, 1.0, 1.0], "a list of 6 numbers is wanted, not 3 values"),
         (("payload", "inertia"), [1, 1, 1, 2, 0, 0], "not positive semi-definite"),
         (("gauges", 0, "link"), "uper", "'uper' is not one of the choices (upper, fore); did you mean 'upper'?"),

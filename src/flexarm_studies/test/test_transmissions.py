@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.limit_cycle import describing_function
 from flexarm_control.robust.uncertain import Uncertainty, uncertain_loops
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models.model import build
@@ -43,8 +44,8 @@ GAINS = {
 }
 
 
-def geared(data, encoder, play=0.012, stiffness=850.0):
-    data["model"], data["gravity"] = "chain", [0.0, -9.81, 0.0]
+def geared(data, encoder, play=0.012, stiffness=850.0, weight=9.81):
+    data["model"], data["gravity"] = "chain", [0.0, -weight, 0.0]
     gear = {"stiffness": stiffness, "damping": 3.0, "play": play}
     data["joints"][0] |= {
         "rotor_inertia": 1e-4,
@@ -96,3 +97,95 @@ def test_what_a_loop_bears_is_judged_on_the_arm_with_its_transmission(changed_ar
     assert_allclose(turned[0], [1.0, 0.0, 0.0, float(encoder == "link")])
     known = judge.loops[0].matrix()
     assert judge.loops[0].matrix(plant=judge.loops[0].plant(plant)).shape[0] == len(known) + 2
+
+
+# --- limit cycles ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("amplitude, fraction", [(0.5, 0.0), (1.0, 0.0), (1e6, 1.0)])
+def test_a_dead_zone_passes_nothing_within_it_and_all_far_beyond(amplitude, fraction):
+    assert describing_function(amplitude, 1.0) == pytest.approx(fraction, abs=1e-5)
+
+
+@pytest.mark.parametrize("amplitude", [1.01, 1.7, 5.0])
+def test_the_describing_function_is_the_first_harmonic(amplitude):
+    angle = 2.0 * np.pi * (np.arange(20_000) + 0.5) / 20_000
+    x = amplitude * np.sin(angle)
+    force = x - np.clip(x, -1.0, 1.0)
+    assert describing_function(amplitude, 1.0) == pytest.approx(
+        2.0 * np.mean(force * np.sin(angle)) / amplitude, abs=1e-6
+    )
+
+
+def motion_of(changed_arm, encoder, **changed):
+    """A scenario of the arm in a horizontal plane, and its judge."""
+    path = changed_arm("one_link", partial(geared, encoder=encoder, weight=0.0, **changed))
+    values = CONTROL | GAINS[encoder] | {"observer.plausibility": False}
+    motion = {"trajectory": "quintic:to=0.4,duration=1", "window": 7.0, "delay": 0.002}
+    scenario = Scenario(path, values, **motion)
+    return scenario, judge_of(loop_of(scenario), [np.array([0.4])], 0.002)
+
+
+def test_a_loop_oscillates_in_its_play_as_its_harmonic_balance_says(changed_arm):
+    scenario, judge = motion_of(changed_arm, "link")
+    assert judge.stable()  # with closed play
+    (cycle,) = judge.bears().limit_cycles
+    record, *_ = run_loop(scenario)
+    late = record.time > 4.0
+    deflection, times = record.plant_amplitude[late, -1], record.time[late]
+    rises = np.flatnonzero((deflection[:-1] < 0.0) & (deflection[1:] >= 0.0))
+    frequency = (len(rises) - 1) / (times[rises[-1]] - times[rises[0]])
+    assert cycle.frequency == pytest.approx(frequency, rel=0.03)
+    assert cycle.amplitude == pytest.approx(0.5 * np.ptp(deflection), rel=0.1)
+    assert cycle.joint == "joint1" and cycle.load == pytest.approx(0.0, abs=1e-9)
+    assert "likely to oscillate at 6.8" in cycle.text
+
+
+def test_a_loop_about_the_motor_s_angle_does_not_oscillate(changed_arm):
+    scenario, judge = motion_of(changed_arm, "motor")
+    assert judge.bears().limit_cycles == ()
+    record, *_ = run_loop(scenario)
+    assert np.ptp(record.plant_amplitude[record.time > 7.0, -1]) < 0.012
+
+
+def test_without_play_there_is_no_limit_cycle(changed_arm):
+    assert motion_of(changed_arm, "link", play=0.0)[1].bears().limit_cycles == ()
+
+
+def test_simulate_warns_of_a_likely_limit_cycle(changed_arm, flexarm, result):
+    path = changed_arm("one_link", partial(geared, encoder="link"))
+    words = [
+        "simulate",
+        path,
+        "--trajectory",
+        "quintic:to=0.1,duration=0.2",
+        "--delay",
+        "0.002",
+        "--set",
+    ]
+    words += [
+        f"{name}={flat(value)}" for name, value in (CONTROL | GAINS["link"]).items()
+    ]  # fmt: skip
+    _, out, _ = flexarm(*words)
+    assert "warning: play of joint1: the loop is likely to oscillate at 6.8" in out
+    assert "the load of 2.33 N m keeps the flanks together" in out
+    (cycle,) = result(*words)["bears"]["limit_cycles"]
+    assert cycle["joint"] == "joint1"
+
+
+def flat(value):
+    """As typed."""
+    if isinstance(value, list):
+        return "[" + ",".join(map(str, value)) + "]"
+    return str(value)
+
+
+def test_show_has_the_transmission_and_warns_of_its_play(changed_arm, flexarm, result):
+    path = changed_arm("one_link", partial(geared, encoder="link"))
+    _, out, _ = flexarm("show", path)
+    assert (
+        "transmission of joint1: 850 N m/rad, 3 N m s/rad, play 12 mrad, 0 s/rad; encoder at" in out
+    )
+    assert "warning: joint1 has play" in out
+    (joint,) = result("show", path)["joints"]
+    assert joint["transmission"]["play"] == 0.012

@@ -14,6 +14,7 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models.model import build
 
 from .card import FARTHEST, LATEST, limit
+from .limit_cycle import limit_cycles
 from .uncertain import Uncertainty, richer
 from .whole import WholeLoop
 
@@ -68,15 +69,19 @@ class Bears:
         Longest, from a measurement to its torque; None: none was found [s].
     reason : str
         Why it is not known; empty if it is.
+    limit_cycles : tuple of LimitCycle
+        That play makes likely, though the loop is stable with closed play.
     """
 
     payload: tuple = (None, None)
     delay: float | None = None
     reason: str = ""
+    limit_cycles: tuple = ()
 
     def as_dict(self):
         """Ready for JSON."""
-        return asdict(self) | {"payload": list(self.payload)}
+        values = asdict(self)
+        return values | {name: list(values[name]) for name in ("payload", "limit_cycles")}
 
 
 @dataclass(frozen=True)
@@ -136,6 +141,20 @@ class Judge:
         except (FlexarmError, np.linalg.LinAlgError):  # it does not rest there
             return False
 
+    def limit_cycles(self):
+        """What `limit_cycle.limit_cycles` finds in the loops: the largest of each joint."""
+        plant, found = build(self.arm), {}
+        for loop in self.loops:
+            whole, c = loop.plant(plant), loop.controller
+
+            def poles(A, loop=loop, whole=whole):
+                return np.linalg.eigvals(loop.matrix(plant=(A, *whole[1:])))
+
+            for cycle in limit_cycles(plant, c.q, whole[0], poles, self.period):
+                if cycle.joint not in found or cycle.amplitude > found[cycle.joint].amplitude:
+                    found[cycle.joint] = cycle
+        return list(found.values())
+
     def bears(self, bisections=FINE):
         """`Bears` of the loops, in so many `bisections`."""
         if not self.stable():
@@ -150,7 +169,7 @@ class Judge:
             lambda k: self.stable(later=(k - first) * T), first, first + LATEST, bisections
         )
         finite = [None if np.isinf(v) else float(v) for v in (high, late * T)]
-        return Bears((float(low), finite[0]), finite[1])
+        return Bears((float(low), finite[0]), finite[1], limit_cycles=tuple(self.limit_cycles()))
 
     def verdict(self):
         """The `Verdict`."""

@@ -139,6 +139,7 @@ def _joint(s):
         origin_rpy=origin["rpy"],
         hub_inertia=s.number("hub_inertia", "inertia", 0.0, low=0.0),
         motor_mass=s.number("motor_mass", "mass", 0.0, low=0.0),
+        housing_inertia=_tensor(s, "housing_inertia"),
         rotor_inertia=s.number("rotor_inertia", "inertia", 0.0, low=0.0),
         gear_ratio=s.number("gear_ratio", "none", 1.0, positive=True),
         friction=_friction(s),
@@ -248,21 +249,25 @@ def _link(s):
     return Link(name, length, per_length, stiffness, flexible, polar)
 
 
-def _payload(s):
-    mass = s.number("mass", "mass", 0.0, low=0.0)
+def _tensor(s, key):
+    """An inertia as rows: from one number for every axis, or xx, yy, zz, xy, xz, yz; zero where it is not given."""
     inertia = np.zeros((3, 3))
-    if s.has("inertia"):
-        given = s.raw("inertia")
-        if isinstance(given, list):
-            v = s.vector("inertia", 6, "inertia")  # xx, yy, zz, xy, xz, yz
+    if s.has(key):
+        if isinstance(s.raw(key), list):
+            v = s.vector(key, 6, "inertia")
             inertia = np.array([[v[0], v[3], v[4]], [v[3], v[1], v[5]], [v[4], v[5], v[2]]])
         else:
-            inertia = s.number("inertia", "inertia") * np.eye(3)
+            inertia = s.number(key, "inertia") * np.eye(3)
     if np.linalg.eigvalsh(inertia).min() < -1e-12 * np.abs(inertia).max():
-        raise s.error("inertia", "not positive semi-definite")
+        raise s.error(key, "not positive semi-definite")
+    return tuple(map(tuple, inertia.tolist()))
+
+
+def _payload(s):
+    mass, inertia = s.number("mass", "mass", 0.0, low=0.0), _tensor(s, "inertia")
     offset = s.vector("offset", 3, "length", (0.0,) * 3)
     s.done()
-    return Payload(mass, tuple(map(tuple, inertia.tolist())), offset)
+    return Payload(mass, inertia, offset)
 
 
 def _gauge(s, links):

@@ -88,6 +88,9 @@ class Joint:
     origin_rpy: tuple = (0.0, 0.0, 0.0)  # [rad] roll, pitch, yaw, as in URDF
     hub_inertia: float = 0.0  # [kg m^2] about the axis, turns with the link
     motor_mass: float = 0.0  # [kg] at the joint, hangs on the previous link
+    housing_inertia: tuple = (
+        (0.0,) * 3,
+    ) * 3  # [kg m^2] of the motor about the joint, before its turn
     rotor_inertia: float = 0.0  # [kg m^2] motor side
     gear_ratio: float = 1.0  # [-] motor turns per joint turn
     friction: Friction = Friction()
@@ -102,6 +105,11 @@ class Joint:
         "motor"  # what it measures: the motor's angle, or the link's behind the transmission
     )
     transmission: Transmission | None = None  # None: the link is fixed to the motor
+
+    @property
+    def housed(self):
+        """Whether its motor's housing has an inertia."""
+        return any(map(any, self.housing_inertia))
 
     @property
     def inertia(self):

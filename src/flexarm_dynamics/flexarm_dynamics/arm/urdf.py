@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ModelError
-from ..models.model import about_axis
+from ..models.model import about_axis, rotation
 from .sections import Sections
 
 #: Axis of the small joint for each direction, in the order of the turns Rz Ry Rx.
@@ -193,9 +193,10 @@ class _Writer:
             self._fixed(f"{tip}_joint", link.name, tip, (link.length, 0.0, 0.0))
         after = self.arm.joints[i + 1 : i + 2]
         end = self._link(tip)
-        if after and after[0].motor_mass:
-            at = after[0].origin_xyz
-            self._inertial(end, after[0].motor_mass, np.zeros((3, 3)), at)
+        if after and (after[0].motor_mass or after[0].housed):
+            at, turn = after[0].origin_xyz, rotation(after[0].origin_rpy)
+            inertia = turn @ np.asarray(after[0].housing_inertia) @ turn.T
+            self._inertial(end, after[0].motor_mass, inertia, at)
         return tip
 
     def _pieces(self, link, junctions, tip):

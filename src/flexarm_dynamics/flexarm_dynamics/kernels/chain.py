@@ -31,8 +31,8 @@ from collections import namedtuple
 
 import numpy as np
 
-#: Whether joints have transmissions or friction beyond Coulomb's: compiled apart for arms without, which then cost
-#: nothing more.
+#: Whether joints have transmissions, housings or friction beyond Coulomb's: compiled apart for arms without, which then
+#: cost nothing more.
 JOINT_PARTS = True
 #: Deflection beyond the play, in parts of half of it, at which a transmission has half of its damping.
 ENGAGEMENT = 0.1
@@ -57,6 +57,8 @@ DATA = {
     "transmission": ("N", 4),  # stiffness, damping, half the play, damping per transmitted torque
     # friction beyond Coulomb's: breakaway level's excess, Stribeck speed, part of the transmitted torque, smoothing
     "slip": ("N", 4),
+    "housed": ("N",),  # whether the joint's motor has a housing that turns
+    "housing": ("N", 3, 3),  # its inertia about the joint, before the joint's turn
     "length": ("N",),
     "mass": ("N",),  # beam, and the motor at its base
     "moment": ("N",),  # int x dm
@@ -87,6 +89,8 @@ DATA = {
 WORK = {
     "frame": ("N+1", 3, 3),  # link to previous link's coordinates
     "rate": ("N",),  # at which each link turns about its joint
+    "housing": ("N", 3, 3),  # inertia of the joint's housing, link coordinates
+    "al_carrier": ("N+1", 3),  # angular acceleration of what carries the joint, link coordinates
     "omega": ("N+1", 3),  # angular velocity of each link's frame, in its coordinates
     # angular velocity of what carries the joint, link coordinates; N: of the tip, link N - 1's
     "carrier": ("N+1", 3),
@@ -617,6 +621,25 @@ def turn_joint(d, w, i, q, qd):
             w.frame[i, k, m] = w.tm[1, k, m]
 
 
+def turn_housing(d, w, i):
+    """Inertia of joint i's housing in link coordinates, after `turn_joint`, whose turn is in tm[0]."""
+    product(d.housing[i], w.tm[0], w.tm[2])
+    for j in range(3):
+        for k in range(3):
+            acc = 0.0
+            for m in range(3):
+                acc += w.tm[0, m, j] * w.tm[2, m, k]
+            w.housing[i, j, k] = acc
+
+
+def add_housing_spin(w, i, zn):
+    """Add the gyroscopic moment of joint i's housing, which its carrier feels, to zn."""
+    apply(w.housing[i], w.carrier[i], w.t[5])
+    cross(w.carrier[i], w.t[5], w.t[7])
+    for k in range(3):
+        zn[k] += w.t[7, k]
+
+
 def prepare(d, w, q, delta, qd, delta_d):
     """Kinematics and inertia of all links at one state: what both recursions start from."""
     N = d.links
@@ -633,6 +656,8 @@ def prepare(d, w, q, delta, qd, delta_d):
                 rate += delta_d[d.spring[i]]
             w.rate[i] = rate
         turn_joint(d, w, i, angle, rate)
+        if JOINT_PARTS and d.housed[i]:
+            turn_housing(d, w, i)
         if d.level == FIRST_ORDER or d.count[i] == 0:
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
@@ -704,6 +729,8 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
             turning, rate = qdd[n], qd[n]
             if JOINT_PARTS:
                 rate = w.rate[n]
+                for k in range(3):
+                    w.al_carrier[n, k] = w.al[n, k]
             if JOINT_PARTS and d.spring[n] >= 0:
                 turning += delta_dd[d.spring[n]]
             for k in range(3):
@@ -744,6 +771,11 @@ def inverse_dynamics(d, w, qd, qdd, delta_dd, gravity, torque, modal):
         if JOINT_PARTS and d.spring[i] >= 0:
             modal[d.spring[i]] = dot(d.axis[i], zn)
         add_rotor(d, w, i, qd[i], zn)
+        if JOINT_PARTS and d.housed[i]:
+            apply(w.housing[i], w.al_carrier[i], w.t[5])
+            for k in range(3):
+                zn[k] += w.t[5, k]
+            add_housing_spin(w, i, zn)
 
 
 def add_rotor(d, w, i, qd, zn):
@@ -896,6 +928,11 @@ def eliminate_joint(d, w, i, qd, force, modal_force, extra, driven, qdd):
         Ua[k] += d.gear[i] * d.rotor[i] * a[k]
         for m in range(3):
             X[k, m] += d.rotor[i] * a[k] * a[m]
+    if JOINT_PARTS and d.housed[i]:
+        for k in range(3):
+            for m in range(3):
+                X[k, m] += w.housing[i, k, m]
+        add_housing_spin(w, i, zn)
     if driven:
         for k in range(3):
             zn[k] += Ua[k] * qdd
@@ -1180,6 +1217,10 @@ def momentum(data, work, q, delta, qd, delta_d, out):
             spin = d.rotor[i] * (dot(d.axis[i], w.carrier[i]) + d.gear[i] * qd[i])
             for k in range(3):
                 L[k] += spin * d.axis[i, k]
+            if JOINT_PARTS and d.housed[i]:
+                apply(w.housing[i], w.carrier[i], t[2])
+                for k in range(3):
+                    L[k] += t[2, k]
         else:
             cross(om, d.payload_moment, P)
             cross(d.payload_moment, v[i], L)

@@ -139,6 +139,7 @@ def outboard(arm):
         rotor = Load(0.0, np.zeros(3), joint.rotor_inertia * np.outer(joint.axis, joint.axis))
         beyond = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0]))
         whole = beyond + _straight(link, joint) + rotor
+        whole += Load(0.0, np.zeros(3), np.asarray(joint.housing_inertia))
         whole = whole.moved(rotation(joint.origin_rpy), np.asarray(joint.origin_xyz))
         loads.insert(0, replace(whole, averaged=True))
     return loads
@@ -231,6 +232,8 @@ def assemble(arm, shapes, loads):
         "gear": np.array([j.gear_ratio for j in arm.joints]),
         "rotor": np.array([j.rotor_inertia for j in arm.joints]),
         "spring": _springs(arm.joints, sum(len(m) for m in modes)),
+        "housed": np.array([i > 0 and j.housed for i, j in enumerate(arm.joints)], np.int64),
+        "housing": np.array([j.housing_inertia for j in arm.joints], float),
         "slip": np.array([_slip_constants(j) for j in arm.joints]),
         "transmission": np.array([_spring_constants(j.transmission) for j in arm.joints]),
         "length": np.array([link.length for link in arm.links]),

@@ -12,9 +12,9 @@ Lagrangian is left out at the arm's `level`:
   arcsin y'.
 
 The hub's inertia turns with its link; a rotor behind a gear of ratio N spins at ``a . w_carrier + N qd``; the
-motor's mass sits at the joint and hangs on the previous link. The paper's control model (assumptions a) and
-b): no deflections in the mass matrix, no products of deflections) is what `Chain.terms` gives without
-deflections.
+motor's mass sits at the joint and hangs on the previous link, as does its housing. The paper's control model
+(assumptions a) and b): no deflections in the mass matrix, no products of deflections) is what `Chain.terms`
+gives without deflections.
 """
 
 from functools import cached_property
@@ -39,7 +39,7 @@ from .assembly import (
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
 CHAIN_SOURCES = (load.source(plain), load.source(integrators))
-#: For arms without transmissions, and with Coulomb's friction at most.
+#: For arms without transmissions and housings, and with Coulomb's friction at most.
 PLAIN_SOURCES = (
     CHAIN_SOURCES[0].replace("JOINT_PARTS = True", "JOINT_PARTS = False"),
     CHAIN_SOURCES[1],
@@ -80,7 +80,8 @@ class Chain(ArmModel):
 
     @property
     def _sources(self):
-        return CHAIN_SOURCES if self._transmissions or self._slips else PLAIN_SOURCES
+        parts = self._transmissions or self._slips or self.data.housed.any()
+        return CHAIN_SOURCES if parts else PLAIN_SOURCES
 
     @cached_property
     def _slips(self):

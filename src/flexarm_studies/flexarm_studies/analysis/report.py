@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The text of an analysis, for a terminal."""
 
+from flexarm_control.robust.limit_cycle import LimitCycle
 from flexarm_control.robust.verdict import Bears
 
 from ..loop.judged import words
@@ -60,6 +61,8 @@ def _poles(poles):
 def _verdict(v):
     yield f"  {v['text']}"
     yield _row("the loop bears", words(Bears(**v["bears"])))
+    for cycle in v["bears"]["limit_cycles"]:
+        yield f"  {LimitCycle(**cycle).text}"
 
 
 def _scales(s):

@@ -5,6 +5,7 @@ import argparse
 import shlex
 import sys
 import time
+from dataclasses import asdict
 
 import numpy as np
 
@@ -142,13 +143,27 @@ def design(options):
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
     lines = card_lines(found, bears)
+    cycles = _limit_cycles(found, arm, settings.delay)
+    lines += [f"warning: {cycle.text}" for cycle in cycles]
     lines += ["", f"written to {out}" if out else text]
     if figure is not None:
         from .design_figure import draw
 
         lines += [f"figure {draw(found, bears, figure)}"]
-    show(options, _finite(_result(found, bears)), lines, allow_nan=False)
+    result = _result(found, bears) | {"limit_cycles": [asdict(cycle) for cycle in cycles]}
+    show(options, _finite(result), lines, allow_nan=False)
     return 0
+
+
+def _limit_cycles(found, arm, delay):
+    """What play makes of the designed loop."""
+    from ..loop import scenario as scenarios
+    from ..loop.judged import judge_of
+
+    if arm.without_play is arm:
+        return []
+    loop = scenarios.loop_of(scenarios.Scenario(arm, found.parameters(), trajectory=""))
+    return judge_of(loop, found.configurations, delay).limit_cycles()
 
 
 def _result(found, bears):

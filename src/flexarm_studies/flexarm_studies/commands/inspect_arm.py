@@ -2,6 +2,7 @@
 """``flexarm frequencies`` and ``flexarm show``: natural frequencies and properties of an arm file's arm."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 
@@ -115,6 +116,8 @@ def describe(arm_model, q):
             "reflected_rotor_inertia": j.rotor_inertia * j.gear_ratio**2,
             "motor_mass": j.motor_mass,
             "inertia_of_the_straight_arm": M[i, i],
+            "transmission": None if j.transmission is None else asdict(j.transmission),
+            "encoder": j.encoder,
             "safe_action": j.safe_action,
             "torque_limit": j.limits.torque if np.isfinite(j.limits.torque) else None,
         }
@@ -188,9 +191,9 @@ def warnings(arm_model, q, result):
             result["strain_map_condition"] = StrainMap(arm_model).condition
         except ModelError as error:
             found.append(str(error))
-    elif arm.modes:
+    elif arm.known.modes:
         found.append("no gauges: no modal amplitudes without them")
-    missing = set(arm.mode_names) - set(arm.observed_modes)
+    missing = set(arm.known.mode_names) - set(arm.observed_modes)
     if missing and arm.gauges:
         found.append(
             f"modes that are not observed leak into the gauges: {', '.join(sorted(missing))}"
@@ -201,6 +204,12 @@ def warnings(arm_model, q, result):
             f"{len(fast)} of the free modes are above {USUAL_RATE / 4.0:g} Hz, up to {fast[-1]:.4g} Hz: too fast"
             f" to be damped at {USUAL_RATE:g} samples per second"
         )
+    for joint in arm.joints:
+        if joint.transmission is not None and joint.transmission.play:
+            found.append(
+                f"{joint.name} has play: flexarm analyze, simulate and design warn where a loop is likely to oscillate"
+                " in it"
+            )
     for link in arm.links:
         for direction, f in link.flexible.items():
             if not f.damping:
@@ -226,6 +235,12 @@ def text(d):
             f"{j['inertia_of_the_straight_arm']:12.4g}{limit:>10}  {j['safe_action']}"
         )
     yield f"(all: inertia of the straight arm about the joint at q = {d['q']})"
+    for j in d["joints"]:
+        if (t := j["transmission"]) is not None:
+            yield (
+                f"transmission of {j['name']}: {t['stiffness']:.4g} N m/rad, {t['damping']:.4g} N m s/rad, play"
+                f" {1e3 * t['play']:.4g} mrad, {t['load_damping']:.4g} s/rad; encoder at the {j['encoder']}"
+            )
     yield ""
     yield f"{'link':18}{'length':>10}{'mass':>10}  flexible"
     yield f"{'':18}{'m':>10}{'kg':>10}"

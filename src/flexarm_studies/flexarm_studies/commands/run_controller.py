@@ -188,6 +188,7 @@ def report(scenario, loop, metrics, bears):
         lines.append("{:16}{:12.4g}{:12.4g}{:13.4g}{:12.4g}".format(name, *row))
     lines += ["", *(f"{text:44}{value}" for text, value in _of_the_tip(scenario, m))]
     lines.append(f"{'the loop bears, at rest where it ended':44}{judged.words(bears)}")
+    lines += [f"warning: {cycle.text}" for cycle in bears.limit_cycles]
     for i, each in enumerate(m.get("passes", ())):
         peak = max(each["peak_joint_error_rad"])
         lines.append(
