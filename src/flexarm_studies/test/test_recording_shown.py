@@ -55,10 +55,24 @@ def test_noise_is_taken_where_nothing_moves_and_is_split_into_common_and_own(fou
     assert noise["from_s"] == 0.0 and 9.5 < noise["to_s"] < 10.7
     np.testing.assert_allclose(noise["rms"], np.hypot(2e-6, 0.5e-6), rtol=0.06)
     assert noise["correlation"][0][1] == pytest.approx(4.0 / 4.25, abs=0.01)
+    np.testing.assert_allclose(noise["shared_rms"], 2e-6, rtol=0.06)
+    np.testing.assert_allclose(noise["own_rms"], 0.5e-6 / np.sqrt(2.0), rtol=0.06)
+    assert np.abs(noise["shared_memory"]).max() < 0.1  # it is white
     # What is left of one bridge once the other has been taken off by regression.
     np.testing.assert_allclose(
         noise["rms_corrected"], 0.5e-6 * np.sqrt(1.0 + 4.0 / 4.25), rtol=0.06
     )
+
+
+def test_the_memory_of_shared_noise_is_found():
+    draw, source = np.random.default_rng(1), np.zeros(3000)
+    for k in range(4, 3000):
+        source[k] = 0.3 * source[k - 1] - 0.5 * source[k - 4] + draw.standard_normal()
+    strain = 1e-6 * (source[:, None] * [1.0, 2.0] + 0.1 * draw.standard_normal((3000, 2)))
+    still = np.zeros((3000, 1))
+    made = rest.noise(recording.Recording(0.01, still, still, strain), slice(0, 3000))
+    np.testing.assert_allclose(made.memory, [0.3, 0.0, 0.0, -0.5], atol=0.05)
+    assert made.shared[1] == pytest.approx(2.0 * made.shared[0], rel=0.02)
 
 
 def test_every_ring_down_is_found_with_its_frequency_and_damping(found):

@@ -11,6 +11,8 @@ CORNER, OF_RATE = 10.0, 0.2
 SLOW = 0.05
 #: ... or below so many steps of its encoder per second.
 STEPS = 10.0
+#: Order of the autoregression of the noise that gauges share.
+MEMORY = 4
 #: A shorter stretch is none of rest [s].
 MIN_REST = 0.6
 
@@ -65,13 +67,20 @@ class Noise:
     correlation : ndarray, shape (g, g)
         Between the gauges [-].
     corrected : ndarray, shape (g,)
-        Rms of each gauge less what the others tell of it by linear regression [-].
+        Rms of each gauge less what the others explain of it by linear regression [-].
+    shared, own : ndarray, shape (g,)
+        Rms of what the first principal component of all gauges makes of each, and of the rest [-].
+    memory : ndarray, shape (4,)
+        Autoregression of that component, newest sample first [-].
     """
 
     part: slice
     rms: np.ndarray
     correlation: np.ndarray
     corrected: np.ndarray
+    shared: np.ndarray
+    own: np.ndarray
+    memory: np.ndarray
 
 
 def noise(recording, part):
@@ -81,7 +90,8 @@ def noise(recording, part):
     line = np.column_stack([np.ones(time.size), time])
     known = np.isfinite(values).all(axis=0)
     rest = values[:, known] - line @ np.linalg.lstsq(line, values[:, known], rcond=None)[0]
-    rms, corrected, correlation = np.full(g, np.nan), np.full(g, np.nan), np.full((g, g), np.nan)
+    rms, corrected, shared, own = np.full((4, g), np.nan)
+    correlation, memory = np.full((g, g), np.nan), np.full(MEMORY, np.nan)
     rms[known] = rest.std(axis=0)
     live = known.copy()
     live[known] = rms[known] > 0.0
@@ -91,4 +101,16 @@ def noise(recording, part):
         # Of a covariance C the part of one that the others do not tell has the variance 1 / (C^-1)_ii.
         inverse = np.linalg.pinv(np.atleast_2d(np.cov(rest.T, bias=True)), hermitian=True)
         corrected[live] = 1.0 / np.sqrt(np.diag(inverse))
-    return Noise(part, rms, correlation, corrected)
+        shared[live], own[live], memory = _shared(rest)
+    return Noise(part, rms, correlation, corrected, shared, own, memory)
+
+
+def _shared(rest):
+    """Rms of the first principal component in each gauge's noise (s, g), of what is left, and its autoregression."""
+    size = rest.std(axis=0)
+    source = (rest / size) @ np.linalg.svd(rest / size, full_matrices=False)[2][0]
+    source /= source.std()
+    load = rest.T @ source / len(source)
+    past = np.column_stack([source[MEMORY - 1 - k : len(source) - 1 - k] for k in range(MEMORY)])
+    memory = np.linalg.lstsq(past, source[MEMORY:], rcond=None)[0]
+    return np.abs(load), (rest - np.outer(source, load)).std(axis=0), memory

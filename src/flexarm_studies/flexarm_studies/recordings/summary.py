@@ -126,6 +126,9 @@ def _noise(recording, found):
         "rms": _known(found.rms),
         "correlation": [_known(row) for row in found.correlation],
         "rms_corrected": _known(found.corrected),
+        "shared_rms": _known(found.shared),
+        "own_rms": _known(found.own),
+        "shared_memory": _known(found.memory),
     }
 
 

@@ -91,6 +91,11 @@ def _noise(noise):
         numbers = "  ".join("  -  " if v is None else f"{v:5.2f}" for v in row)
         alone = "" if corrected is None else f"({1e6 * corrected:.2f} by itself)"
         yield f"  {name:16} {1e6 * rms:6.2f} {alone:18} {numbers}"
+    if len(noise["gauges"]) > 1 and None not in noise["shared_rms"]:
+        for what, factor in (("shared_rms", 1e6), ("own_rms", 1e6), ("shared_memory", 1.0)):
+            unit = "" if factor == 1.0 else " [microstrain]"
+            values = " ".join(f"{factor * v:.2f}" for v in noise[what])
+            yield f"  {what.replace('_', ' ')}{unit}: {values}"
 
 
 def _drift(rows):
