@@ -32,7 +32,8 @@ class FakeNode:
         call(*args)
 
     def get_logger(self):
-        return SimpleNamespace(error=self.log.append, warning=self.log.append)
+        add = self.log.append
+        return SimpleNamespace(error=add, warning=add, info=lambda text: None)
 
     def set_parameters_atomically(self, old):
         self.now |= {p.name: p.value for p in old}

@@ -71,7 +71,7 @@ def made_up_model(couplings, damping):
     )  # fmt: skip
     return SimpleNamespace(
         n_joints=n, n_modes=2, mode_names=("slender_mode", "stiff_mode"), terms=lambda q, qd: terms,
-        arm=SimpleNamespace(position_limits=np.array([[-1.0, 1.0]] * n)),
+        arm=SimpleNamespace(position_limits=np.array([[-1.0, 1.0]] * n), gauges=()),
     )  # fmt: skip
 
 

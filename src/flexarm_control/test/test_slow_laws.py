@@ -159,7 +159,7 @@ def test_linear_model_following_is_17_by_hand_for_two_joints():
     M, modal, zero = np.eye(3), np.zeros((1, 1)), np.zeros((2, 1))
     M[:2, :2] = [[2, 1], [1, 4]]
     terms = Terms(M, np.zeros(2), np.zeros(1), zero, modal, zero, np.eye(1))
-    arm = SimpleNamespace(n_joints=2, n_modes=1)
+    arm = SimpleNamespace(n_joints=2, n_modes=1, arm=SimpleNamespace(gauges=()))
     law = law_of("linear_model_following", arm, kp=[4.0, 9.0], kv=[2.0, 3.0])
     ref = reference([0.5, -0.25], [0.125, 0.5], [1.0, -2.0])
     torque = law.torque(np.array([0.25, 0.0]), np.array([0.0, 0.25]), ref, terms)

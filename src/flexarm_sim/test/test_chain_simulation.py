@@ -176,7 +176,10 @@ def spatial(level="first order", friction=False):
     slip = Friction(0.1, 0.2, 0.5) if friction else Friction()
     axes = ((0.0, 0.0, 1.0), (0.6, 0.8, 0.0), (0.0, -1.0, 0.0))
     joints = tuple(
-        Joint(f"joint{i + 1}", axis, (0.1, 0.0, 0.05), tuple(rng.uniform(-1, 1, 3)), 0.05, 0.3, 1e-4, 10.0, slip)
+        Joint(
+            f"joint{i + 1}", axis, (0.1, 0.0, 0.05), tuple(rng.uniform(-1, 1, 3)),
+            hub_inertia=0.05, motor_mass=0.3, rotor_inertia=1e-4, gear_ratio=10.0, friction=slip,
+        )
         for i, axis in enumerate(axes)
     )  # fmt: skip
     stiffness = {"y": 5.0, "z": 7.0, "twist": 3.0}

@@ -68,7 +68,7 @@ def test_a_substep_stays_below_half_a_radian_of_the_highest_mode(arm_r):
 
 def test_a_rigid_or_slow_arm_takes_one_substep(arm_r):
     assert substeps(arm_r, 1e-3) == 1
-    assert substeps(SimpleNamespace(n_modes=0), 1.0) == 1
+    assert substeps(SimpleNamespace(n_modes=0, transmission_rates=lambda: (0.0, 0.0)), 1.0) == 1
 
 
 def test_a_mode_too_fast_to_simulate_is_refused_saying_what_to_change():
