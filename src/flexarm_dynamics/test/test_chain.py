@@ -1199,3 +1199,15 @@ def test_a_load_too_heavy_for_loaded_modes_is_refused():
         one_beam("first order", {"y": Flexibility(1, "loaded")}, payload=heavy)
     assert error.value.value[0] == pytest.approx(2e10) and error.value.limit == "at most 1e+10"
     one_beam("first order", {"y": Flexibility(1)}, payload=heavy)
+
+
+@pytest.mark.parametrize(
+    "joints", [{"gear_ratio": 2, "rotor_inertia": 1}, {"origin_xyz": (1, 0, 0)}, {}]
+)
+def test_arms_of_whole_numbers_share_the_compiled_code_of_others(joints):
+    def kind(number):
+        joint = Joint("joint1", tuple(map(number, (0, 0, 1))), hub_inertia=number(1), **joints)
+        link = Link("link1", number(1), number(1), {"y": number(6)}, {"y": Flexibility(1)})
+        return Chain(Arm("beam", (joint,), (link,), Payload(number(1))))._data[0].dtype
+
+    assert kind(int) == kind(float)

@@ -13,6 +13,9 @@ from .model import damping_matrix, rotation
 
 _KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST}
 
+#: Fields of the kernels' data that are whole numbers.
+INTEGERS = ("links", "level", "nodes", "count", "first", "direction", "spring", "housed")
+
 
 def _shape(spec, sizes):
     return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
@@ -27,11 +30,11 @@ def _capacity(value, steps):
 
 
 def roomy(data):
-    """Sizes that many arms share, so that one compilation serves them all."""
+    """Sizes that many arms share, so that one compilation serves them all; room costs no time."""
     return _sizes(
-        _capacity(data.links, (8, 16, 32)),
-        _capacity(data.s.shape[1], (4, 8, 16, 60)),
-        _capacity(data.nodes, (28, 44, 92)),
+        _capacity(data.links, (8, 32)),
+        _capacity(data.s.shape[1], (16, 60)),
+        _capacity(data.nodes, (92,)),
     )
 
 
@@ -243,6 +246,8 @@ def assemble(arm, shapes, loads):
         "node_slope": z((N, G, K)), "node_bend": z((N, G, K)), "node_ei": z((N, G, 2)),
         "cumulate": z((N, G + 1, G)), "bishop": z((N, K, K)),
     }  # fmt: skip
+    # An axis (0, 0, 1) of integers is another type, and would be another compilation.
+    a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
         L, rho = link.length, link.mass_per_length
         body = _straight(link, joint)
@@ -274,9 +279,9 @@ def assemble(arm, shapes, loads):
     body = _payload(arm)
     data = kernel.Data(
         **a,
-        payload_mass=np.array([body.mass]),
-        payload_moment=body.moment,
-        payload_inertia=body.inertia,
+        payload_mass=np.array([body.mass], float),
+        payload_moment=np.asarray(body.moment, float),
+        payload_inertia=np.asarray(body.inertia, float),
         gravity=np.asarray(arm.gravity, float),
     )
     if level != kernel.FIRST_ORDER:
