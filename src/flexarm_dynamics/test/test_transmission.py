@@ -23,7 +23,11 @@ from flexarm_dynamics.linear import linear_plant
 from flexarm_dynamics.models.chain import Chain
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import rotation
-from flexarm_dynamics.singular_perturbation import slow_subsystem
+from flexarm_dynamics.singular_perturbation import (
+    fast_subsystem,
+    quasi_steady_state,
+    slow_subsystem,
+)
 
 GEAR = Transmission(850.0, 3.0, 0.012, 0.7)
 
@@ -201,6 +205,20 @@ def test_one_joint_has_the_frequencies_of_two_inertias_on_a_spring():
     chain, link, motor = single(replace(GEAR, play=0.0))
     assert chain.frequencies()[0] == pytest.approx(np.sqrt(850.0 * (1 / link + 1 / motor)))
     assert chain.frequencies(locked=True)[0] == pytest.approx(np.sqrt(850.0 / link))
+
+
+def test_a_transmission_is_the_fast_coordinate_of_spongs_split():
+    """One rigid link behind a spring: k gamma_bar turns the link, both turn as one, and swing on the spring."""
+    gear = replace(GEAR, play=0.0, load_damping=0.0)
+    chain, link, motor = single(gear)
+    t, torque = chain.terms(np.zeros(1), np.zeros(1)), np.array([3.0])
+    transmitted = torque * link / (link + motor)
+    assert_allclose(-gear.stiffness * quasi_steady_state(t, torque), transmitted, rtol=1e-12)
+    assert_allclose(slow_subsystem(t)[1], 1.0 / (link + motor), rtol=1e-12)
+    A2, B2 = fast_subsystem(t)
+    both = 1.0 / link + 1.0 / motor
+    assert_allclose(A2, [[0.0, 1.0], [-gear.stiffness * both, -gear.damping * both]], rtol=1e-12)
+    assert_allclose(B2, [[0.0], [-1.0 / motor]], rtol=1e-12)
 
 
 # --- play --------------------------------------------------------------------------------------
