@@ -65,10 +65,19 @@ ONE_LINK = "flexarm_dynamics/test/test_one_link.py -k kernel"
 STEPPER = "flexarm_dynamics/test/test_one_link.py -k stepper"
 ORDER = "flexarm_sim/test/test_chain_simulation.py::test_order_of_the_integrators"
 
+ROUNDED = "flexarm_dynamics/test/test_transmission.py -k rounded"
+
 KERNELS = of(
     "flexarm_dynamics",
     "kernels",
     FORCES,
+    (
+        "chain",
+        "rounded play: only one flank is rounded",
+        "    return x - 0.5 * (np.sqrt(a * a + w2) - np.sqrt(b * b + w2))",
+        "    return x - 0.5 * (np.sqrt(a * a + w2) - abs(b))",
+        ROUNDED,
+    ),
     (
         "chain",
         "centripetal force of a link: sign of 2 w x c'",

@@ -168,11 +168,15 @@ def test_power_goes_in_by_the_motors_and_out_by_dampers():
     assert power == pytest.approx(torque @ qd - lost, rel=1e-6)
 
 
-def test_derivatives_of_the_forces_include_the_transmissions():
-    chain = Chain(spatial(GEARS))
-    state, n, m = swinging(chain, deflection=0.05), 3, chain.n_modes
+ROUNDED = replace(GEAR, rounding=0.002, play_damping=0.4)
+
+
+@pytest.mark.parametrize("gears, beyond", [(GEARS, 0.006), ((ROUNDED, None, ROUNDED), 0.0)])
+def test_derivatives_of_the_forces_include_the_transmissions(gears, beyond):
+    chain = Chain(spatial(gears))
+    state, n, m = swinging(chain, deflection=0.05 if beyond else 0.006), 3, chain.n_modes
     q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
-    assert (np.abs(delta[-2:]) > 0.006).all()
+    assert (np.abs(delta[-2:]) > beyond).all()
     K, C = chain.linearisation(q, qd, delta, delta_d)
     for j in range(m):
         e = 1e-6 * np.eye(m)[j]
@@ -184,6 +188,35 @@ def test_derivatives_of_the_forces_include_the_transmissions():
         ) / 2e-6
         assert_allclose(K[:, j], dK, rtol=1e-6, atol=1e-6 * np.abs(dK).max())
         assert_allclose(C[:, j], dC, rtol=1e-6, atol=1e-6 * np.abs(dC).max())
+
+
+def test_rounded_flanks_transmit_the_gradient_of_their_energy_and_approach_sharp_ones():
+    c, x = np.array([850.0, 0.0, 0.006, 0.0, 0.002, 0.0]), np.linspace(-0.02, 0.02, 41)
+    for at in x:
+        ends = [kernel.dead_zone_energy(at + h, 0.006, 0.002) for h in (-1e-6, 1e-6)]
+        torque = 850.0 * (ends[1] - ends[0]) / 2e-6
+        assert kernel.spring_torque(c, at, 0.0) == pytest.approx(torque, rel=1e-6, abs=1e-6)
+    assert kernel.spring_torque(c, 0.006, 0.0) == pytest.approx(850.0 * 0.000917237, rel=1e-5)
+    sharp = [kernel.dead_zone(at, 0.006, 0.0) for at in x]
+    assert_allclose([kernel.dead_zone(at, 0.006, 1e-7) for at in x], sharp, atol=1e-7)
+    assert kernel.spring_torque(np.array([850.0, 3.0, 0.006, 0.0, 0.0, 0.4]), 0.0, 2.0) == 0.8
+
+
+def test_a_rounded_transmission_has_one_motion_in_loops_and_in_straight_line_code():
+    chain = Chain(spatial((ROUNDED, None, ROUNDED)))
+    assert chain.straight_line is not None
+    states = [swinging(chain, deflection=0.006) for _ in range(2)]
+    for state, straight in zip(states, (True, False), strict=True):
+        chain.stepper(METHODS["rk4"], straight)(state, np.ones(3), 1e-4, 50)
+    assert_allclose(*states, rtol=1e-9, atol=1e-12)
+
+
+def test_a_link_rests_where_rounded_flanks_bear_its_weight():
+    for q in (0.3, 1.5, np.pi / 2 + 1e-3):
+        chain, _, _ = single(ROUNDED, gravity=(0.0, -9.81, 0.0))
+        delta = chain.static_deflection(np.array([q]))
+        force = chain.forces(np.array([q]), np.zeros(1), delta, np.zeros(1))[1]
+        assert force == pytest.approx(0.0, abs=1e-8)
 
 
 def test_a_stiff_transmission_is_a_rigid_joint():
@@ -304,7 +337,7 @@ def test_a_prescribed_motor_moves_as_prescribed_and_its_link_follows_behind_the_
 
     def rate(t, y):
         qdd = 2.0 - 3.0 * t / T
-        tau = kernel.spring_torque((850.0, 1.0, 0.006, 0.0), y[1], y[3])
+        tau = kernel.spring_torque((850.0, 1.0, 0.006, 0.0, 0.0, 0.0), y[1], y[3])
         return [y[2], y[3], qdd, (-9.81 * moment * np.cos(y[0] + y[1]) - tau) / link - qdd]
 
     exact = solve_ivp(rate, (0, T), start, "DOP853", rtol=1e-11, atol=1e-13, max_step=1e-4).y[:, -1]

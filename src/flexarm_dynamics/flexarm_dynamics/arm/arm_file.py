@@ -75,6 +75,8 @@ def _transmission(joint):
         damping=s.number("damping", "viscous", 0.0, low=0.0),
         play=s.number("play", "angle", 0.0, low=0.0),
         load_damping=s.number("load_damping", "time", 0.0, low=0.0),
+        rounding=s.number("rounding", "angle", 0.0, low=0.0),
+        play_damping=s.number("play_damping", "viscous", 0.0, low=0.0),
     )
     s.done()
     if out.play > MAX_PLAY:
@@ -82,6 +84,9 @@ def _transmission(joint):
         raise s.error(
             "play", "rad is too large", value=out.play, limit=f"at most {MAX_PLAY} rad", hint=hint
         )
+    if out.rounding > MAX_PLAY or (out.rounding > 0.0 and out.play == 0.0):
+        limit = f"at most {MAX_PLAY} rad, and 0 without play"
+        raise s.error("rounding", "rad is out of range", value=out.rounding, limit=limit)
     if not joint.number("rotor_inertia", "inertia", 0.0) > 0.0:
         hint = "with a transmission the motor turns by itself: give the inertia of its rotor"
         raise joint.error("rotor_inertia", "must be greater than 0 kg m^2", hint=hint)

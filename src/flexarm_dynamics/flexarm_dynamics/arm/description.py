@@ -52,18 +52,22 @@ class Transmission:
     :math:`\gamma`, the link's angle less the motor's, is one of the modal coordinates. From link to motor goes
 
     .. math::
-        \tau = k\,s + (e\,d + c\,|k\,s|)\,\dot\gamma, \qquad
-        s = \gamma - \mathrm{clip}(\gamma, -\tfrac b2, \tfrac b2), \qquad
-        e = \frac{s^2}{s^2 + (b/20)^2} \ (1 \text{ without play}).
+        \tau = k\,s + (e\,d + (1 - e)\,d_0 + c\,|k\,s|)\,\dot\gamma, \qquad
+        s = \gamma - \tfrac12\sqrt{(\gamma + \tfrac b2)^2 + w^2} + \tfrac12\sqrt{(\gamma - \tfrac b2)^2 + w^2}, \qquad
+        e = \frac{s^2}{s^2 + (b/20 + w)^2} \ (1 \text{ without play}).
 
-    Within the play nothing is transmitted. The damper d takes hold gradually as the flanks are pressed, so that the
-    torque has no jump; c is damping that grows with the transmitted torque (Hunt & Crossley 1975).
+    With sharp corners, w = 0, s is what the deflection exceeds the play by, and within it nothing but the damping
+    d_0 of its grease is transmitted. The flanks of a real gear meet gradually: w is half the way over which they do.
+    The damper d takes hold gradually as the flanks are pressed, so that the torque has no jump; c is damping that
+    grows with the transmitted torque (Hunt & Crossley 1975).
     """
 
     stiffness: float  # [N m/rad] k
     damping: float = 0.0  # [N m s/rad] d
     play: float = 0.0  # [rad] b: the whole way that the link moves freely while the motor is held
     load_damping: float = 0.0  # [s/rad] c
+    rounding: float = 0.0  # [rad] w
+    play_damping: float = 0.0  # [N m s/rad] d_0
 
 
 @dataclass(frozen=True)

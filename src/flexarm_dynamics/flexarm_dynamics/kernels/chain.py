@@ -54,7 +54,8 @@ DATA = {
     "rotor": ("N",),  # rotor inertia, motor side
     # place in delta of the deflection of each joint's transmission; -1: it has none
     "spring": ("N",),
-    "transmission": ("N", 4),  # stiffness, damping, half the play, damping per transmitted torque
+    # stiffness, damping, half the play, damping per transmitted torque, rounding, damping within the play
+    "transmission": ("N", 6),
     # friction beyond Coulomb's: breakaway level's excess, Stribeck speed, part of the transmitted torque, smoothing
     "slip": ("N", 4),
     "housed": ("N",),  # whether the joint's motor has a housing that turns
@@ -1038,26 +1039,50 @@ def forward_dynamics(
             apply_transposed(w.frame[n], w.t[2], w.a0[n])
 
 
-def dead_zone(x, half):
-    """What a deflection x has left beyond a play of +-half."""
-    return x - 0.5 * (abs(x + half) - abs(x - half))
+def dead_zone(x, half, rounding):
+    """What a deflection x has left beyond a play of +-half, with corners rounded over a width."""
+    if rounding == 0.0:
+        return x - 0.5 * (abs(x + half) - abs(x - half))
+    w2, a, b = rounding * rounding, x + half, x - half
+    return x - 0.5 * (np.sqrt(a * a + w2) - np.sqrt(b * b + w2))
+
+
+def dead_zone_slope(x, half, rounding):
+    """Derivative of `dead_zone`."""
+    if rounding == 0.0:
+        return 1.0 if abs(x) >= half else 0.0
+    a, b = x + half, x - half
+    return 1.0 - 0.5 * (a / np.hypot(a, rounding) - b / np.hypot(b, rounding))
+
+
+def dead_zone_energy(x, half, rounding):
+    """Integral of `dead_zone` from the middle of the play to x."""
+    if rounding == 0.0:
+        s = dead_zone(x, half, rounding)
+        return 0.5 * s * s
+    w2, a, b = rounding * rounding, x + half, x - half
+    left = a * np.sqrt(a * a + w2) + w2 * np.arcsinh(a / rounding)
+    right = b * np.sqrt(b * b + w2) + w2 * np.arcsinh(b / rounding)
+    middle = half * np.sqrt(half * half + w2) + w2 * np.arcsinh(half / rounding)
+    return 0.5 * x * x - 0.25 * (left - right) + 0.5 * middle
 
 
 def spring_damping(c, s):
     """Damping of a transmission with the constants c, whose spring is deflected by s.
 
-    Within the play it is zero; it rises with s^2/(s^2 + w^2), w a tenth of half the play, so that the torque has no
-    jump where the flanks meet.
+    Within the play it is c[5]. It goes over to c[1] with s^2/(s^2 + w^2), w a tenth of half the play and the
+    rounding, so that the torque has no jump where the flanks meet.
     """
     value = c[1]
-    if c[2] != 0.0 and c[1] != 0.0:
-        value = c[1] * (s * s / (s * s + ENGAGEMENT * ENGAGEMENT * c[2] * c[2]))
+    if c[2] != 0.0 and c[1] != c[5]:
+        width = ENGAGEMENT * c[2] + c[4]
+        value = c[5] + (c[1] - c[5]) * (s * s / (s * s + width * width))
     return value + c[3] * c[0] * abs(s)
 
 
 def spring_torque(c, x, rate):
     """Torque that a transmission with the constants c transmits from link to motor, deflected by x."""
-    s = dead_zone(x, c[2])
+    s = dead_zone(x, c[2], c[4])
     return c[0] * s + spring_damping(c, s) * rate
 
 
@@ -1186,8 +1211,8 @@ def potential_energy(data, work, q, delta, zero, modal_zero):
                 ky2 = (by + sy * sz * bz / c) ** 2 * c / (c - sy * sy)
                 energy += 0.5 * (d.node_ei[i, g, 0] * ky2 + d.node_ei[i, g, 1] * bz * bz / c)
         if JOINT_PARTS and d.spring[i] >= 0:
-            s = dead_zone(delta[d.spring[i]], d.transmission[i, 2])
-            energy += 0.5 * d.transmission[i, 0] * s * s
+            c = d.transmission[i]
+            energy += c[0] * dead_zone_energy(delta[d.spring[i]], c[2], c[4])
     apply(R[N], d.payload_moment, w.t[0])
     return energy - d.payload_mass[0] * dot(d.gravity, p[N]) - dot(d.gravity, w.t[0])
 
@@ -1282,8 +1307,8 @@ def put_column(jacobian, column, axis, place, origin, t):
 def spring_terms(c, state, row, step):
     """Stiffness and damping of a transmission that `implicit_step` takes implicitly: where it is or gets in contact."""
     x, rate = state[row], state[state.size // 2 + row]
-    touches = abs(x) >= c[2] or abs(x + step * rate) >= c[2]
-    return c[0] if touches else 0.0, spring_damping(c, dead_zone(x, c[2]))
+    touches = c[4] > 0.0 or abs(x) >= c[2] or abs(x + step * rate) >= c[2]
+    return c[0] if touches else 0.0, spring_damping(c, dead_zone(x, c[2], c[4]))
 
 
 def implicit_step(state, torque, change, step, substeps, stages, net, extra, friction, data):

@@ -302,7 +302,9 @@ def _slip_constants(joint):
 
 
 def _spring_constants(t):
-    return (0.0,) * 4 if t is None else (t.stiffness, t.damping, 0.5 * t.play, t.load_damping)
+    if t is None:
+        return (0.0,) * 6
+    return t.stiffness, t.damping, 0.5 * t.play, t.load_damping, t.rounding, t.play_damping
 
 
 def _fill_mode(a, i, j, link, shape, number, direction, points):

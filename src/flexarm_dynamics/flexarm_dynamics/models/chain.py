@@ -184,6 +184,17 @@ class Chain(ArmModel):
         d = self.data
         return [(d.spring[i], d.transmission[i]) for i in np.flatnonzero(d.spring >= 0)]
 
+    def transmitted_torque(self, delta, delta_d):
+        """Torque from each link to its motor through the transmission, (k, n) [N m]; NaN for joints without one.
+
+        Of amplitudes and rates, both (k, m).
+        """
+        out = np.full((len(delta), self.n_joints), np.nan)
+        for i in np.flatnonzero(self.data.spring >= 0):
+            j, constants = self.data.spring[i], self.data.transmission[i]
+            out[:, i] = plain.spring_torque(constants, delta[:, j], delta_d[:, j])
+        return out
+
     def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
         """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
 
@@ -224,22 +235,21 @@ class Chain(ArmModel):
 
     def _close_play(self, K, C):
         """Add stiffness and damping of the transmissions in contact to derivatives of the forces."""
-        for j, (stiffness, damping, _, _) in self._transmissions:
+        for j, (stiffness, damping, *_) in self._transmissions:
             K[self.n_joints + j, j] += stiffness
             C[self.n_joints + j, j] += damping
 
     def _add_transmissions(self, K, C, delta, delta_d):
         """Add derivatives of the transmissions' torque, play and all."""
         for j, c in self._transmissions:
-            stiffness, damping, half, load = c
-            s, row = plain.dead_zone(delta[j], half), self.n_joints + j
+            stiffness, damping, half, load, rounding, within = c
+            s, row = plain.dead_zone(delta[j], half, rounding), self.n_joints + j
             C[row, j] += plain.spring_damping(c, s)
-            if abs(delta[j]) < half:
-                continue
-            width2 = (plain.ENGAGEMENT * half) ** 2
+            slope = plain.dead_zone_slope(delta[j], half, rounding)
+            width2 = (plain.ENGAGEMENT * half + rounding) ** 2
             rise = 2.0 * s * width2 / (s * s + width2) ** 2 if half else 0.0
-            K[row, j] += stiffness
-            K[row, j] += (damping * rise + load * stiffness * np.sign(s)) * delta_d[j]
+            rate = (damping - within) * rise + load * stiffness * np.sign(s)
+            K[row, j] += slope * (stiffness + rate * delta_d[j])
 
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
@@ -330,9 +340,9 @@ class Chain(ArmModel):
             return 0.0, 0.0
         H = np.linalg.inv(self.mass_matrix(np.zeros(self.n_joints)))
         rates = []
-        for j, (stiffness, damping, half, _) in self._transmissions:
+        for j, (stiffness, damping, half, _, _, within) in self._transmissions:
             h = H[self.n_joints + j, self.n_joints + j]
-            rates.append((np.sqrt(stiffness * h), 0.5 * damping * h, half > 0.0))
+            rates.append((np.sqrt(stiffness * h), 0.5 * max(damping, within) * h, half > 0.0))
         fastest = max(max(omega, damped) for omega, damped, _ in rates)
         return fastest, max((omega for omega, _, play in rates if play), default=0.0)
 
@@ -341,6 +351,17 @@ class Chain(ArmModel):
 
         A link that no load turns rests in the middle of its play; one that hangs in it, where it hangs.
         """
+        sharp = self._on_flanks(q)
+        rounded = [(j, c) for j, c in self._transmissions if c[4] > 0.0]
+
+        def soften(delta, force, K2):
+            for j, c in rounded:
+                K2[j, j] -= c[0] * (1.0 - plain.dead_zone_slope(delta[j], c[2], c[4]))
+
+        return self._rest(q, soften, sharp) if rounded else sharp
+
+    def _on_flanks(self, q):
+        """`static_deflection` with the play's corners sharp."""
         play = [(j, c) for j, c in self._transmissions if c[2] > 0.0]
         if not play or not any(self.arm.gravity):
             return super().static_deflection(q)

@@ -288,10 +288,10 @@ class ArmModel(ABC):
         """
         return self._rest(q)
 
-    def _rest(self, q, replace_forces=None):
+    def _rest(self, q, replace_forces=None, start=None):
         """`static_deflection`; ``replace_forces(delta, force, K2)`` may change forces and their derivative in place."""
         n, m = self.n_joints, self.n_modes
-        delta, rest = np.zeros(m), np.zeros(n)
+        delta, rest = np.zeros(m) if start is None else start, np.zeros(n)
         if not m or not any(self.arm.gravity):
             return delta
         for _ in range(50):
