@@ -94,6 +94,16 @@ class LockstepRun(Session):
         without = (CompositeState.INACTIVE, CompositeState.FAULT)
         return self.controller_state().supervisor_state not in without
 
+    def takes_trajectories(self):
+        """Whether the controller sends torque, or names what its first torque waits for.
+
+        Right after `~/recover` it does neither: it refuses trajectories until the next state has come.
+        """
+        state = self.controller_state()
+        return self.ready() or (
+            state.supervisor_state == CompositeState.INACTIVE and bool(state.rejected_reason)
+        )
+
     def accepted(self):
         """Number of the last accepted trajectory."""
         return self.controller_state().accepted_trajectory_id
@@ -126,6 +136,7 @@ class LockstepRun(Session):
         """
         self.wait_for("the nodes (simulator, observer, controller)", self.recorder.complete)
         self.wait_for("the simulator's pause", self.paused_at)
+        self.wait_for("the controller to take trajectories", self.takes_trajectories)
         self.offer(message)
         begin = self.paused_at()
         end = TRAJECTORY_START_NS + round(duration * 1e9)
