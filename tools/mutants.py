@@ -682,6 +682,12 @@ LIMITS = [
             "",
         ),
         (
+            "amplitudes",
+            "amplitudes beside strains: as much as they are",
+            "+ SHARE * self._large",
+            "+ 2.5 * self._large",
+        ),
+        (
             "channels",
             "light joints: in the first configuration alone",
             "light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flexarm_control.observers.plausibility.agreement import Agreement
+from flexarm_control.observers.plausibility.amplitudes import SourceAmplitudes
 from flexarm_control.observers.plausibility.channels import Channels
 from flexarm_control.observers.plausibility.jumps import Jumps
 from flexarm_control.observers.plausibility.low_pass import LowPass
@@ -365,3 +366,59 @@ def test_lost_samples_in_which_a_mode_turns_far_are_no_jump_of_the_strains():
             assert found == (None, None)
         jumps.take(value, k * period)
         last = k
+
+
+# --------------------------------------------------------------------------- modal amplitudes
+
+
+def contradictions(change, seconds=3.0, begin=1.0, bias=0.0, **motion):
+    """When amplitudes that are changed from `begin` on are found to contradict the strains; None: never [s]."""
+    c = channels()
+    map_ = StrainMap(c.model)
+    check, value = SourceAmplitudes(c, map_), np.zeros(c.size)
+    _, strain = readings(known_arm(), seconds, **motion)
+    for k, e in enumerate(strain):
+        amplitude = map_.inverse @ e
+        value[c.strain] = e + bias
+        value[c.amplitude] = amplitude if PERIOD * k < begin else change(amplitude)
+        if check.update(value, PERIOD):
+            return PERIOD * k - begin
+    return None
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0])
+@pytest.mark.parametrize("bias", [0.0, 3e-5])
+def test_amplitudes_that_the_sources_own_strains_contradict_are_found(factor, bias):
+    """Whatever constant bias the raw strains have: amplitudes come from calibrated ones."""
+    found = contradictions(lambda a: factor * a, amplitude=1.0, bias=bias)
+    assert found is not None and 0.0 < found < 0.6
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
+def test_amplitudes_of_another_model_of_the_links_do_not_contradict_the_strains(factor):
+    assert contradictions(lambda a: factor * a, amplitude=1.0, begin=0.0) is None
+
+
+@pytest.mark.parametrize("swing", [0.0, 2e-3])
+def test_amplitudes_that_their_source_has_filtered_are_not_wrong(swing):
+    late = np.zeros(2)
+
+    def filtered(a):
+        late[:] += (1.0 - np.exp(-PERIOD / 0.004)) * (a - late)
+        return late.copy()
+
+    assert contradictions(filtered, begin=0.0, amplitude=1.0, swing=swing) is None
+
+
+def test_a_check_without_amplitudes_begins_anew_when_they_come():
+    """What came before says nothing of the zeros."""
+    c = channels()
+    check, value = SourceAmplitudes(c, StrainMap(c.model)), np.zeros(c.size)
+    value[c.strain] = 1e-4
+    assert not any(check.update(value, PERIOD) for _ in range(500))
+    value[c.amplitude] = np.nan
+    assert not check.update(value, PERIOD)
+    value[c.amplitude] = 5.0 * StrainMap(c.model).inverse @ value[c.strain]
+    assert not any(check.update(value, PERIOD) for _ in range(500))
+    value[c.amplitude] = np.zeros(c.m)
+    assert any(check.update(value, PERIOD) for _ in range(500))

@@ -13,6 +13,7 @@ a gauge whose zero drifts                     STOP, without that gauge, or with 
 strains and a joint that contradict           STOP
 modal amplitudes that jump                    STOP, from the strains; DISTRUSTED without them
 modal rates that do not fit                   STOP; they are not used
+amplitudes and strains that contradict        DISTRUSTED: which of the two is wrong does not show
 more than `jumps.FREQUENT` outliers           STOP
 ============================================  =======================================================
 """
@@ -23,6 +24,7 @@ from flexarm_dynamics.parameters import parameter
 
 from ...loop.samples import ArmSample
 from .agreement import Agreement
+from .amplitudes import SourceAmplitudes
 from .channels import Channels
 from .doubts import Doubts
 from .jumps import BRIDGED, LEARNT, Jumps
@@ -75,6 +77,7 @@ class Monitor:
         self.doubts, self.jumps = Doubts(), Jumps(c)
         self._agreement, self._standstill = Agreement(c), Standstill(c)
         self._law = StrainLaw(c, strain_map, payload) if c.g and c.m else None
+        self._amplitudes = SourceAmplitudes(c, strain_map) if c.g and c.m else None
         self._value, self._raw = np.zeros(c.size), np.zeros(2 * c.n + c.g)
         self._strain, self._amplitude, self._rates = np.zeros(c.g), np.zeros(c.m), np.zeros(c.m)
         self.stamp_ns = 0
@@ -88,6 +91,7 @@ class Monitor:
         self._standstill.reset()
         if self._law is not None:
             self._law.reset()
+            self._amplitudes.reset()
         self._long_period, self._off_rate, self._samples = 0.0, 0, 0
         self._has_strain = False
         if self._gauges is not None:
@@ -293,6 +297,8 @@ class Monitor:
         self._watch_rate(stamp)
         if self._samples < LEARNT:
             return
+        if self._amplitudes is not None:
+            self._compare_amplitudes(stamp)
         still = self._standstill.still
         if frame:
             self._frozen(stamp)
@@ -316,6 +322,20 @@ class Monitor:
             self._without(members, text, stamp)
         elif compared:
             self._drifting(stamp)
+
+    def _compare_amplitudes(self, stamp):
+        """Amplitudes that the source's own strains contradict."""
+        c, check = self.channels, self._amplitudes
+        if self._gauges is not None and self._gauges.doubted.any():
+            check.reset()
+        elif check.update(self._value, self._dt):
+            modes = [c.model.mode_names[i] for i in range(c.m)]
+            of = modes[0] if c.m == 1 else f"{', '.join(modes[:-1])} and {modes[-1]}"
+            text = (
+                f"modal_amplitude of {of} and the strains contradict each other: by"
+                f" {1e6 * check.difference:.3g} microstrain, {1e6 * check.bound:.2g} are possible"
+            )
+            self.doubts.add("modal_amplitude or strain", ArmSample.DISTRUSTED, text, stamp)
 
     def _drifting(self, stamp):
         """What follows from strains that the motion does not explain."""
@@ -358,6 +378,7 @@ class Monitor:
         """The gauges have another bias now: their zeros are learnt anew."""
         if self._law is not None:
             self._law.reset()
+            self._amplitudes.reset()
 
     def _frozen(self, stamp_ns):
         text = "the frame is frozen: joint positions and strains stand still together"

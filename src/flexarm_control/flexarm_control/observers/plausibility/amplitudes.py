@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Compares modal amplitudes with strains, where an arm's driver sends both.
+
+The amplitudes stand for the strains :math:`R\delta` on the gauges, with the rows R of the strain map, and the strains
+for :math:`R W\varepsilon` with its inverse W, which leaves what no amplitudes make. Both go through one `low_pass`:
+:math:`s = F[R W\varepsilon]`, :math:`d = F[R\delta] - s`. With the means :math:`s_0`, :math:`d_0` over the first
+`LEARNT` seconds, in which gauges without calibration have their bias,
+
+.. math:: |d - d_0| \le Z\varepsilon_{max} + S\,\widehat{|s - s_0|} + \tau\,\widehat{|\dot s|}
+
+for 0.6 % of full scale (Z), half of the strain (S = `SHARE`: another model's shapes or a gauge's gain make less, a
+wrong sign or a factor of two more), and the delay :math:`\tau` (`LATE`) of a source that filters. The hat is the
+largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` samples in a row beyond the bound are
+evidence. Which of the two is wrong does not show.
+"""
+
+import numpy as np
+
+from .agreement import LATE
+from .low_pass import LowPass
+from .strain_law import corner_of
+from .zero_drift import LEARNT, ZERO
+
+#: Part of the strain by which the two may differ [-].
+SHARE = 0.5
+#: Time constant in which a large strain is forgotten [s].
+KEPT = 0.2
+#: Samples in a row beyond the bound.
+PERSISTENT = 4
+
+
+class SourceAmplitudes:
+    """Judges the modal amplitudes of an arm's driver by its strains.
+
+    Parameters
+    ----------
+    channels : Channels
+    strain_map : StrainMap
+
+    Attributes
+    ----------
+    difference, bound : float
+        Largest of the last sample over the gauges, and what it may be [strain].
+    """
+
+    def __init__(self, channels, strain_map):
+        c = self._channels = channels
+        self._rows, self._project = strain_map.rows, strain_map.rows @ strain_map.inverse
+        self._floor = ZERO * max(g.full_scale for g in c.model.arm.gauges)
+        self._low = LowPass(2 * c.g, corner_of(c.model))
+        self._now = np.zeros(2 * c.g)
+        self.reset()
+
+    def reset(self):
+        """Forget the past, the zeros included."""
+        self._age, self._count, self._beyond = 0.0, 0, 0
+        self._zero = np.zeros(2 * self._channels.g)
+        self._large = self._fast = 0.0
+        self.difference, self.bound = 0.0, self._floor
+
+    def update(self, value, dt):
+        """Take the readings of a new sample.
+
+        Parameters
+        ----------
+        value : ndarray, shape (N,)
+            As `Channels.read` has them. Without amplitudes or strains, or with a gauge at an end of its range, the past
+            is forgotten.
+        dt : float
+            Since the last sample [s].
+
+        Returns
+        -------
+        bool
+            Whether amplitudes and strains contradict each other.
+        """
+        c, g, now = self._channels, self._channels.g, self._now
+        strain = value[c.strain]
+        np.dot(self._project, strain, out=now[:g])
+        np.dot(self._rows, value[c.amplitude], out=now[g:])
+        if not np.isfinite(now).all() or c.at_end(strain).any():
+            self.reset()
+            return False
+        now[g:] -= now[:g]
+        if self._count == 0:
+            self._low.start(now)
+        else:
+            self._low.update(now, dt)
+        signal = self._low.signal
+        self._count += 1
+        self._age += dt
+        if self._age <= LEARNT:
+            self._zero += (signal - self._zero) / self._count
+        keep = np.exp(-dt / KEPT)
+        left = np.abs(signal - self._zero)
+        self._large = max(keep * self._large, float(left[:g].max()))
+        self._fast = max(keep * self._fast, float(np.abs(self._low.first[:g]).max()))
+        self.difference = float(left[g:].max())
+        self.bound = self._floor + SHARE * self._large + LATE * self._fast
+        self._beyond = self._beyond + 1 if self.difference > self.bound else 0
+        return self._beyond >= PERSISTENT
