@@ -20,7 +20,8 @@ class Quantity:
     name : str
         Its path in the arm file, as ``joints[0].friction.viscous``.
     kind : str
-        One of EI, damping, hub_inertia, viscous, coulomb, payload_mass, payload_inertia, gain, bias.
+        One of EI, damping, hub_inertia, motor_mass, viscous, coulomb, payload_mass, payload_inertia, gain, bias,
+        position, transmission_stiffness and so on, and those of `strain_quantities`.
     where : tuple
         Index of the link, joint or gauge, then direction and mode.
     unit : str
@@ -61,36 +62,36 @@ def quantities(arm, recording):
     for i in range(len(arm.joints)):
         at, tau = f"joints[{i}]", max(float(torque[i]), 1e-6)
         found += [
-            _of(arm, f"{at}.hub_inertia", "hub_inertia", (i,), "kg m^2", "inertia", 1e-3),
-            _of(
+            quantity(arm, f"{at}.hub_inertia", "hub_inertia", (i,), "kg m^2", "inertia", 1e-3),
+            quantity(
                 arm, f"{at}.friction.viscous", "viscous", (i,), "N m s/rad", "viscous",
                 0.02 * tau / float(speed[i]),
             ),
-            _of(arm, f"{at}.friction.coulomb", "coulomb", (i,), "N m", "torque", 0.02 * tau),
+            quantity(arm, f"{at}.friction.coulomb", "coulomb", (i,), "N m", "torque", 0.02 * tau),
         ]  # fmt: skip
     for i, link in enumerate(arm.links):
         for direction, flexibility in link.flexible.items():
             at = f"links[{i}]"
             name = f"{at}.{KEY[direction]}"
-            found.append(_of(arm, name, "EI", (i, direction), "N m^2", "stiffness", 1e-6))
+            found.append(quantity(arm, name, "EI", (i, direction), "N m^2", "stiffness", 1e-6))
             for k in range(flexibility.modes):
                 name = f"{at}.flexible.{direction}.damping[{k}]"
-                found.append(_of(arm, name, "damping", (i, direction, k), "-", "none", 2e-3))
+                found.append(quantity(arm, name, "damping", (i, direction, k), "-", "none", 2e-3))
     least = 0.02 * sum(link.mass for link in arm.links)
-    found.append(_of(arm, "payload.mass", "payload_mass", (), "kg", "mass", least))
+    found.append(quantity(arm, "payload.mass", "payload_mass", (), "kg", "mass", least))
     if np.any(arm.payload.inertia):
         name = "payload.inertia"
-        found.append(_of(arm, name, "payload_inertia", (), "kg m^2", "inertia", 1e-9))
+        found.append(quantity(arm, name, "payload_inertia", (), "kg m^2", "inertia", 1e-9))
     for i, gauge in enumerate(arm.gauges):
         if np.isfinite(recording.strain[:, i]).any():
             gain, bias = f"gauges[{i}].gain", f"gauges[{i}].bias"
             low = 0.0 if gauge.gain > 0.0 else -np.inf
-            found.append(_of(arm, gain, "gain", (i,), "-", "none", 1e-3, low))
-            found.append(_of(arm, bias, "bias", (i,), "strain", "none", 1e-5, -np.inf))
+            found.append(quantity(arm, gain, "gain", (i,), "-", "none", 1e-3, low))
+            found.append(quantity(arm, bias, "bias", (i,), "strain", "none", 1e-5, -np.inf))
     return found
 
 
-def _of(arm, name, kind, where, unit, dimension, least, low=0.0):
+def quantity(arm, name, kind, where, unit, dimension, least, low=0.0):
     """A quantity whose scale is its value in the file, at least `least`."""
     made = Quantity(name, kind, where, unit, dimension, least, low)
     return replace(made, scale=max(abs(made.get(arm)), least))
@@ -118,6 +119,10 @@ def changed(arm, found, values):
 
 
 # Each kind's place in an `Arm` ------------------------------------------------------------------
+
+
+def _transmission(arm, i, **fields):
+    return _joint(arm, i, transmission=replace(arm.joints[i].transmission, **fields))
 
 
 def _at(items, i, item):
@@ -181,6 +186,7 @@ def _gauge(arm, i, **fields):
 
 _GET = {
     "hub_inertia": lambda arm, i: arm.joints[i].hub_inertia,
+    "motor_mass": lambda arm, i: arm.joints[i].motor_mass,
     "viscous": lambda arm, i: arm.joints[i].friction.viscous,
     "coulomb": lambda arm, i: arm.joints[i].friction.coulomb,
     "EI": lambda arm, i, d: arm.links[i].stiffness[d],
@@ -189,9 +195,11 @@ _GET = {
     "payload_inertia": _payload_scale,
     "gain": lambda arm, i: arm.gauges[i].gain,
     "bias": lambda arm, i: arm.gauges[i].bias,
+    "position": lambda arm, i: arm.gauges[i].position,
 }
 _PUT = {
     "hub_inertia": lambda arm, v, i: _joint(arm, i, hub_inertia=v),
+    "motor_mass": lambda arm, v, i: _joint(arm, i, motor_mass=v),
     "viscous": lambda arm, v, i: _friction(arm, i, viscous=v),
     "coulomb": lambda arm, v, i: _friction(arm, i, coulomb=v),
     "EI": _put_stiffness,
@@ -200,4 +208,10 @@ _PUT = {
     "payload_inertia": _put_payload_inertia,
     "gain": lambda arm, v, i: _gauge(arm, i, gain=v),
     "bias": lambda arm, v, i: _gauge(arm, i, bias=v),
+    "position": lambda arm, v, i: _gauge(arm, i, position=v),
 }
+for _part in ("stiffness", "damping", "play", "load_damping", "rounding", "play_damping"):
+    _GET[f"transmission_{_part}"] = lambda arm, i, part=_part: getattr(
+        arm.joints[i].transmission, part
+    )
+    _PUT[f"transmission_{_part}"] = lambda arm, v, i, part=_part: _transmission(arm, i, **{part: v})

@@ -35,6 +35,20 @@ def motion_of(recording, corner=CORNER):
     FlexarmError
         For a corner that is not above 0.
     """
+    position = np.ascontiguousarray(low_passed(recording, corner))
+    return Motion(recording.start + recording.time, position, "the recording")
+
+
+def low_passed(recording, corner=CORNER):
+    """The measured joint angles without what is above a `corner` [Hz], without phase, shape (s, n) [rad].
+
+    A Butterworth filter of order two, passed forwards and backwards. `recording` is a `Recording`.
+
+    Raises
+    ------
+    FlexarmError
+        For a corner that is not above 0.
+    """
     from scipy.signal import butter, sosfiltfilt
 
     if not corner > 0.0:
@@ -43,4 +57,4 @@ def motion_of(recording, corner=CORNER):
     if corner < PASSES_ALL / recording.period:
         passes = butter(2, corner, fs=1.0 / recording.period, output="sos")
         position = sosfiltfilt(passes, position, axis=0)
-    return Motion(recording.start + recording.time, np.ascontiguousarray(position), "the recording")
+    return position

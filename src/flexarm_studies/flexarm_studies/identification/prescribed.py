@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Predicts strains without torque: the joints' motors move as they were measured, the links follow.
+
+With the joint motion prescribed, the rows of the links and transmissions are all that is left of (2),
+
+.. math::
+    M_{22}(q, \delta)\,\ddot\delta + M_{21}(q, \delta)\,\ddot q + f_2 + K_2\delta + C_2\dot\delta = 0, \qquad
+    \hat\varepsilon_c(t) = g_c R_c\,\delta(t - \tau_c) + b_c + d_c\,(t - t_m),
+
+so that no torque, motor inertia or friction counts. The measured angles pass a low pass without phase and become a
+cubic spline: its acceleration is linear between samples, as the compiled stepper takes it, and position, velocity and
+acceleration are of one motion. The links start at rest under gravity.
+
+Gauge c reads with gain g, bias b, drift d about the middle t_m of the recording, and late by tau (early if negative);
+between samples :math:`\delta` is the Hermite cubic of amplitudes and rates.
+"""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models import fixed_step, model
+from flexarm_dynamics.models.chain import Chain
+
+from ..recordings.motion import CORNER, low_passed
+
+#: Explicit method of order four: with the highest mode's phase below `PHASE` a step, a strain is off by less than a
+#: tenth of a microstrain on arms like TUDOR (tested).
+METHOD, PHASE = "rk4", 0.5
+#: Modes of arms that the fit tries may be this much faster than the file's [-].
+MARGIN = 1.5
+
+
+class MotionPredictor:
+    """Predicts the strains of a `recording` whose joint motion is prescribed.
+
+    Parameters
+    ----------
+    arm : Arm
+        Of the structure of all arms whose strains will be predicted.
+    recording : Recording
+    corner : float
+        Of the low pass of the joint angles [Hz].
+
+    Attributes
+    ----------
+    position, velocity, acceleration : ndarray, shape (s, n)
+        The smoothed motion at the samples [rad], [rad/s], [rad/s^2].
+    substeps : int
+        Steps of integration per sample.
+
+    Raises
+    ------
+    FlexarmError
+        For an arm of another model than `chain`.
+    """
+
+    def __init__(self, arm, recording, corner=CORNER):
+        self.recording, self.period = recording, recording.period
+        built = _chain(arm)
+        self.n, self.m = built.n_joints, built.n_modes
+        spline = CubicSpline(recording.time, low_passed(recording, corner), bc_type="natural")
+        motion = (np.ascontiguousarray(spline(recording.time, k)) for k in range(3))
+        self.position, self.velocity, self.acceleration = motion
+        self.middle = 0.5 * float(recording.time[-1])
+        fastest = MARGIN * float(np.max(driven_frequencies(built, self.position[0]), initial=0.0))
+        self.substeps = max(1, int(np.ceil(fastest * self.period / PHASE)))
+
+    def states(self, arm, offset=None, samples=None):
+        """Amplitudes and rates of the modes at so many `samples`, or all.
+
+        Parameters
+        ----------
+        arm : Arm
+        offset : ndarray, shape (n,), optional
+            Added to the measured angles [rad].
+        samples : int, optional
+
+        Returns
+        -------
+        delta, rate : ndarray, shape (s, m)
+            NaN where the model diverges, or the arm can have none.
+        built : Chain or None
+        """
+        count = len(self.position) if samples is None else samples
+        n, m = self.n, self.m
+        states = np.full((count, 2 * (n + m)), np.nan)
+        try:
+            built = _chain(arm)
+            position = self.position if offset is None else self.position + offset
+            states[0, :n], states[0, n + m : 2 * n + m] = position[0], self.velocity[0]
+            states[0, n : n + m], states[0, 2 * n + m :] = built.static_deflection(position[0]), 0.0
+        except (FlexarmError, np.linalg.LinAlgError):
+            return states[:, n : n + m], states[:, 2 * n + m :], None
+        stepper = built.driven_stepper(fixed_step.METHODS[METHOD])
+        drive = self.acceleration[:count]
+        with np.errstate(all="ignore"):
+            step = self.period / self.substeps
+            stepper.trajectory(states, drive[:-1], drive[1:], step, self.substeps)
+        return states[:, n : n + m], states[:, 2 * n + m :], built
+
+    def strains(self, arm, delta, rate, built, delay=None, drift=None):
+        """What the gauges read, shape (s, g) [-].
+
+        Parameters
+        ----------
+        arm : Arm
+            Whose gauges read.
+        delta, rate, built
+            Of `states`.
+        delay : ndarray, shape (g,), optional
+            By which the channels are late [s].
+        drift : ndarray, shape (g,), optional
+            Of the readings [1/s].
+        """
+        gauges = arm.gauges
+        out = np.full((len(delta), len(gauges)), np.nan)
+        if built is None:
+            return out
+        rows = np.array([g.gain for g in gauges])[:, None] * gauge_rows(built, gauges)
+        late = np.zeros(len(gauges)) if delay is None else np.asarray(delay, float)
+        for c in range(len(gauges)):
+            read, slope = delta @ rows[c], rate @ rows[c]
+            out[:, c] = read if late[c] == 0.0 else shifted(read, slope, late[c], self.period)
+        out += [g.bias for g in gauges]
+        if drift is not None:
+            out += np.outer(self.recording.time[: len(delta)] - self.middle, drift)
+        return out
+
+
+def shifted(values, slopes, delay, period):
+    """A series (s,) late by `delay` [s], from values and derivatives at the samples by cubics; its ends held.
+
+    The `slopes` are per second, the `period` is between samples [s].
+    """
+    at = np.clip(np.arange(len(values)) - delay / period, 0.0, len(values) - 1.0)
+    k = np.minimum(at.astype(int), len(values) - 2)
+    x = at - k
+    a, b, da, db = values[k], values[k + 1], period * slopes[k], period * slopes[k + 1]
+    return (
+        a * (1.0 + 2.0 * x) * (1.0 - x) ** 2 + da * x * (1.0 - x) ** 2
+        + b * (3.0 - 2.0 * x) * x**2 + db * (x - 1.0) * x**2
+    )  # fmt: skip
+
+
+def driven_frequencies(built, position, delta=None):
+    """Angular frequencies of links and transmissions while the motors are held, ascending [rad/s]; play closed.
+
+    Parameters
+    ----------
+    built : Chain
+    position : ndarray, shape (n,)
+        [rad]
+    delta : ndarray, shape (m,), optional
+        Where the arm's stiffness is taken; straight if not given.
+    """
+    from scipy.linalg import eigh
+
+    n = built.n_joints
+    if not built.n_modes:
+        return np.zeros(0)
+    M = built.mass_matrix(np.asarray(position, float), delta)[n:, n:]
+    return np.sqrt(np.maximum(eigh(built.stiffness_matrix(), M, eigvals_only=True), 0.0))
+
+
+def _chain(arm):
+    built = model.build(arm)
+    if not isinstance(built, Chain):
+        raise FlexarmError(
+            "can't have its motion prescribed", field=f"model of {arm.name}", value=arm.model, limit="chain",
+            hint="write `model: chain` in the arm file",
+        )  # fmt: skip
+    return built
