@@ -10,7 +10,7 @@ from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.arm.encoders import encoder_rows, motors_at_rest
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 from flexarm_dynamics.parameters import parameter
 
 from . import integrators
@@ -26,6 +26,10 @@ PARAMETERS = (
     ),
     parameter("plant_modes", 0, "-", 0, 20, read_only=True).described(
         "Modes per flexible direction of the simulated arm; 0: as in its file."
+    ),
+    parameter("level", levels.AUTO, choices=levels.LEVELS, read_only=True).described(
+        "Kinematics of bending of the simulated arm: first_order; stiffening (links keep their length); finite_slope"
+        " (curvature and tips' angles are exact as well); auto: that of its file."
     ),
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0, read_only=True).described(
         "Control rate: samples per second of simulated time."
@@ -89,7 +93,7 @@ class Simulator:
         # The gauges are in the order of the controller's arm file.
         gauges = {g.name: g for g in plant_arm.gauges}
         plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
-        self.plant_model = model.build(plant_arm)
+        self.plant_model = model.build(levels.simulated(plant_arm, settings["level"]))
         self.period_ns = round(1e9 / settings["rate"])
         self.plant = Plant(self.plant_model, 1e-9 * self.period_ns, settings["integrator"])
         self.sensors = Sensors(

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ArmFileError, ModelError, ParameterError
+from flexarm_dynamics.models import levels
 from flexarm_dynamics.parameters import check_all
 from flexarm_sim.simulator import PARAMETERS, Simulator
 
@@ -221,3 +222,10 @@ def test_a_state_that_is_not_finite_is_a_model_error_and_a_reset_recovers_it():
         sim.advance(np.array([np.nan]))
     sim.reset()
     assert_array_equal(samples(sim, 3), before)
+
+
+@pytest.mark.parametrize("level", levels.LEVELS[1:])
+def test_the_simulated_arm_alone_is_at_the_level_asked_for(level):
+    sim = simulator("two_link", level=level)
+    assert levels.level_of(sim.plant_model.arm) == level
+    assert levels.level_of(sim.nominal.arm) == "first_order"  # the control model stays the paper's

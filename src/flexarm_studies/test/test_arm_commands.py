@@ -68,6 +68,9 @@ def two_link(tmp_path):
         ((), 7.6e-3, 4e-3),
         (("--foreshortening",), 1e-3, 1e-4),
         (("--finite-slope", "--modes", "3"), 5e-5, 2e-5),
+        (("--level", "first_order"), 7.6e-3, 4e-3),
+        (("--level", "stiffening"), 1e-3, 1e-4),
+        (("--level", "finite_slope", "--modes", "3"), 5e-5, 2e-5),
     ],
 )
 def test_a_simulated_table_is_that_of_independent_codes(

@@ -54,6 +54,8 @@ REFUSED = {
     },
     "simulate": {
         "R --foreshortening": "model: 'paper_appendix' of R supports neither foreshortening",
+        "R --level stiffening": "model: 'paper_appendix' of R supports neither foreshortening",
+        "two_link --level first_order --finite-slope": "--level: 'first_order' contradicts --finite-slope",
         "R --payload-scale 2": "--payload-scale: is possible only with --trajectory",
         "R --noise": "--noise: is possible only with --trajectory",
         "R --set slow.kp=1": "--set: is possible only with --trajectory",

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError, ModelError
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.models import levels
 
 
 def add_arm_arguments(parser, as_json="print JSON"):
@@ -23,14 +24,16 @@ def add_model_arguments(parser):
         "--modes", type=int, metavar="N", help="modes per flexible direction of every link"
     )
     parser.add_argument(
-        "--foreshortening",
-        action="store_true",
-        help="links keep their length: needed when they spin fast",
+        "--level",
+        choices=levels.LEVELS,
+        help="kinematics of bending; stiffening: links keep their length, as they do when they spin; finite_slope: also"
+        " exact curvature and tips' angles (auto)",
     )
     parser.add_argument(
-        "--finite-slope",
-        action="store_true",
-        help="exact curvature and angle of the tip for large deflections; includes --foreshortening",
+        "--foreshortening", action="store_true", help="the same as --level stiffening"
+    )
+    parser.add_argument(
+        "--finite-slope", action="store_true", help="the same as --level finite_slope"
     )
 
 
@@ -55,13 +58,25 @@ def load_arm(options):
     arm = arm_file.load(options.arm)
     if options.modes is not None:
         arm = arm.with_modes(options.modes)
-    if options.foreshortening or options.finite_slope:
-        if arm.model != "chain":
-            problem = f"of {arm.name} supports neither foreshortening nor finite slope"
-            raise ModelError(problem, field="model", value=arm.model, limit="chain")
-        finite_slope = arm.finite_slope or options.finite_slope
-        arm = replace(arm, foreshortening=True, finite_slope=finite_slope)
+    level = level_of(options)
+    if level != levels.AUTO:
+        arm = levels.at_level(arm, level)
     return arm
+
+
+def level_of(options):
+    """The level that ``--level`` asks for, or one of the flags in its place; `auto` if none does."""
+    by_flag = {"--foreshortening": levels.STIFFENING, "--finite-slope": levels.FINITE_SLOPE}
+    given = [(k, v) for k, v in by_flag.items() if getattr(options, k[2:].replace("-", "_"))]
+    if not given:
+        return options.level or levels.AUTO
+    flag, level = given[-1]  # --finite-slope includes --foreshortening
+    if options.level not in (None, level):
+        hint = f"leave out {flag}, or --level"
+        raise FlexarmError(
+            f"contradicts {flag}", field="--level", value=options.level, limit=level, hint=hint
+        )
+    return level
 
 
 def chain_of(arm_model):

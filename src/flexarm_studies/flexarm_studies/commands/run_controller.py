@@ -112,6 +112,8 @@ def scenario_of(options):
         ).tolist()
     if options.method is not None:
         parameters["integrator"] = options.method
+    if options.level is not None:
+        parameters["level"] = options.level
     given = {k: getattr(options, k) for k in FIELDS if getattr(options, k) is not None}
     if "tolerance" in given:
         given["tolerance"] *= 1e-3  # [mm]
