@@ -39,6 +39,7 @@ JAZZY = {"builtin_interfaces", "diagnostic_msgs", "launch", "launch_ros", "rcl_i
 JAZZY |= {
     "geometry_msgs",
     "lifecycle_msgs",
+    "rosgraph_msgs",
     "sensor_msgs",
     "std_msgs",
     "std_srvs",

@@ -2,11 +2,13 @@
 """What ROS users count on: namespaces apart, incompatible QoS is reported, use_sim_time without a /clock."""
 
 import time
+from itertools import pairwise
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from harness import Arm, Bench
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 from flexarm_msgs.msg import ArmState, JointTorque
 
@@ -26,6 +28,8 @@ def arms(tmp_path_factory):
         for side in "ab":
             for name in LINE:
                 own = {"pause_at": 0.1, "state_timeout": 60.0, **OVERRIDE}
+                if name == "simulator":
+                    own["clock_rate"] = 0.0
                 key = f"{side}_{name}"
                 bench.start(name, {**common, **own}, key=key, remaps=[f"__ns:=/{side}"])
         pair = Arm(bench, "a/", pauses_at=100), Arm(bench, "b/", pauses_at=100)
@@ -121,3 +125,30 @@ def test_one_arm_whose_observer_is_killed_stands_and_the_other_goes_on(arms):
     assert set(range(b.pauses_at, 300)) <= set(
         numbers
     )  # those before, this reader may not have found in time
+
+
+def test_one_simulator_of_two_publishes_the_clock_until_another_node_does(tmp_path):
+    clock = {"rate": 200.0, "clock_rate": 50.0}
+    with Bench(tmp_path) as bench:
+        clocks, states = bench.tap(Clock, "/clock"), bench.tap(ArmState, "a/arm_state")
+        for side in "ab":
+            bench.start("simulator", {"arm": "R", **clock}, key=side, remaps=[f"__ns:=/{side}"])
+        silent = "/a/simulator publishes /clock, this node does not"
+        bench.wait_for("b to be silent", lambda: silent in bench.log("b"))
+        clocks.messages.clear()
+        states.messages.clear()
+        bench.wait_for("stamps of a", lambda: len(clocks.messages) > 20)
+        stamps = [m.clock.sec * 10**9 + m.clock.nanosec for m in clocks.messages]
+        assert {b - a for a, b in pairwise(stamps)} == {20_000_000}
+        bench.wait_for("the states", lambda: raw_ns(states.newest) > stamps[-1])
+        assert set(stamps[1:]) <= {raw_ns(m) for m in states.messages}
+        other = bench.node.create_publisher(Clock, "/clock", 10)
+        name = bench.node.get_fully_qualified_name()
+        bench.wait_for("a to be silent", lambda: f"{name} publishes /clock" in bench.log("a"))
+        bench.node.destroy_publisher(other)
+        bench.wait_for("a again", lambda: bench.log("a").rstrip().endswith("]: publishes /clock"))
+
+
+def raw_ns(state):
+    """The stamp of an arm's state [ns]."""
+    return state.header.stamp.sec * 10**9 + state.header.stamp.nanosec

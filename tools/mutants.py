@@ -645,6 +645,17 @@ LIMITS = [
     *of(
         "flexarm_control",
         "trajectory",
+        TESTS + "test_trajectory.py",
+        (
+            "reference",
+            "a motion under way that is joined: from its first point on",
+            "times_ns = trajectory.times_ns - (now_ns - trajectory.stamp_ns)",
+            "times_ns = trajectory.times_ns",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "trajectory",
         TORQUE,
         (
             "torque",

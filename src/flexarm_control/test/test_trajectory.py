@@ -421,6 +421,39 @@ def test_a_past_stamp_is_refused():
     assert at(generator, 3.5)[0] == 0.5
 
 
+def test_a_motion_under_way_is_joined_where_that_is_asked_for():
+    """From its own points on: the reference is at the same place as if it had come in time."""
+    on_time = held(start_tolerance=0.2)
+    late = held(start_tolerance=0.2)
+    trajectory = one([(1, 0.0, 0.0), (2, 0.5, 1.0), (3, 1.0, 0.0)], 4.0)
+    assert on_time.offer(trajectory).accepted
+    at(late, 5.4)
+    assert "is 1.4 s in the past" in late.offer(trajectory).reason
+    late.joins = True
+    verdict = late.offer(trajectory)
+    assert verdict.accepted and verdict.joined
+    assert verdict.reason == "joined 1.4 s after its start: starts at 5.4 s"
+    assert late.offer(trajectory).repeat
+    for time in (6.0, 6.3, 6.9, 7.0, 8.0):
+        np.testing.assert_allclose(at(late, time), at(on_time, time), atol=1e-12)
+    assert not late.offer(one([(0.5, 0.0)], 4.0)).accepted
+    assert "and so is its end" in late.offer(one([(0.5, 0.0)], 4.0)).reason
+
+
+def test_an_arm_that_is_not_on_its_way_gets_a_period_of_its_lowest_mode_to_join():
+    generator = held(period=0.8)
+    generator.joins = True
+    times = np.arange(1, 21) / 10.0
+    trajectory = one([(t, t) for t in times], 2.5)
+    at(generator, 3.0)
+    ahead = generator.ahead(trajectory)
+    np.testing.assert_allclose(ahead.times[0], 0.8)
+    np.testing.assert_allclose(ahead.positions[:, 0], times[times > 1.25])
+    short = generator.ahead(one([(0.6, 0.3), (0.7, 0.5)], 2.5))
+    np.testing.assert_allclose(short.times, [0.2])
+    assert generator.ahead(one([(0.6, 0.3)], 3.5)).stamp_ns == 3_500_000_000
+
+
 def test_a_stamp_of_another_clock_is_refused_with_both_clocks():
     generator = held(0.0)
     at(generator, 3)

@@ -71,6 +71,27 @@ class Sample:
     rate: np.ndarray | None = None
 
 
+class Thinned:
+    """Says which samples a topic of a lower rate takes: called with each stamp, it is true for those that are due.
+
+    Parameters
+    ----------
+    rate : float
+        Of that topic [Hz].
+    """
+
+    def __init__(self, rate):
+        self._period, self._due = round(SECOND / rate), 0  # [ns]
+
+    def __call__(self, stamp_ns, first):
+        """Whether the sample of a stamp [ns] is due; the `first` of a session is."""
+        if stamp_ns < self._due and not first:
+            return False
+        due = self._due + self._period
+        self._due = due if due > stamp_ns and not first else stamp_ns + self._period
+        return True
+
+
 def new_session():
     """A random session number: each start of a driver is a session of its own."""
     return int.from_bytes(os.urandom(4), "little")
@@ -160,7 +181,7 @@ class Driver(ArmNode):
         self._joint_publisher = rate and self.make_publisher(
             JointState, "joint_states", 10, qos_overriding_options=qos.overridable()
         )
-        self._joint_period, self._joint_due = rate and round(SECOND / rate), 0  # [ns]
+        self._joints_due = rate and Thinned(rate)
         self.connect(self.make_subscription(JointTorque, "joint_torque", self._on_torque))
 
     def make_gate(self):
@@ -264,14 +285,12 @@ class Driver(ArmNode):
 
     def publish_joints(self, sample):
         """Publish `joint_states` where it is due, for RViz and the like."""
-        first, stamp = sample.number == 0, sample.stamp_ns
-        if self._joint_publisher is None or (stamp < self._joint_due and not first):
+        if self._joint_publisher is None:
             return
-        due = self._joint_due + self._joint_period
-        self._joint_due = due if due > stamp and not first else stamp + self._joint_period
-        if self._joint_publisher.get_subscription_count():
+        due = self._joints_due(sample.stamp_ns, sample.number == 0)
+        if due and self._joint_publisher.get_subscription_count():
             message = self._joint_state
-            set_stamp(message.header.stamp, stamp)
+            set_stamp(message.header.stamp, sample.stamp_ns)
             message.position = array("d", sample.position)
             message.velocity = array("d", () if sample.velocity is None else sample.velocity)
             message.effort = array("d", () if sample.torque is None else sample.torque)

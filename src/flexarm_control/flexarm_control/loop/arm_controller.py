@@ -41,6 +41,10 @@ PARAMETERS = (
         "Largest torque that a trajectory may need, as a multiple of the torque limit: rigid arm with weight and"
         " friction, payload of the arm file; what needs more is refused. 0.0: not judged."
     ),
+    parameter("join_late_trajectories", False).described(
+        "Whether a trajectory whose stamp is past, and whose end is not, is joined midway, as"
+        " joint_trajectory_controller does; it is refused otherwise."
+    ),
     *supervisor.PARAMETERS,
     *estimator.PARAMETERS,
 )
@@ -203,6 +207,7 @@ class ArmController:
 
     def _take_limits(self, settings):
         self._applied.configure(settings, self.torque_limit)
+        self.reference.joins = settings["join_late_trajectories"]
         self._resume_gap = settings["resume_gap"]
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
@@ -309,7 +314,8 @@ class ArmController:
         if verdict.accepted:
             self._trajectory_reason = ""
             if self.law.feedforward is not None:
-                self.law.feedforward.take(plan, verdict.trajectory_id)
+                made_for_it = None if verdict.joined else plan
+                self.law.feedforward.take(made_for_it, verdict.trajectory_id)
         elif not verdict.repeat:
             self._trajectory_reason = verdict.reason
         return verdict

@@ -82,9 +82,11 @@ class TrajectoryInbox:
             return
         except CancelledError:
             return
-        plan, start = None, self._core.reference.resting
+        reference = self._core.reference
+        plan, start = None, reference.resting
+        whole = reference.ahead(data) is data  # a plan is for all of it
         try:
-            if feedforward is not None and feedforward.plans and start is not None:
+            if feedforward is not None and feedforward.plans and start is not None and whole:
                 plan = self._designer.prepare(feedforward, data, start)
         except CancelledError:
             return
@@ -99,7 +101,8 @@ class TrajectoryInbox:
         """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""
         reference, limit = self._core.reference, self._core.torque_allowed
         if not (np.isinf(limit).all() or reference.repeats(data)):
-            self._designer.judge(data, reference.start_of(data.stamp_ns), limit)
+            ahead = reference.ahead(data)
+            self._designer.judge(ahead, reference.start_of(ahead.stamp_ns), limit)
 
     def _refuse(self, reason):
         self._core.refuse(reason)

@@ -16,8 +16,8 @@ acceleration), so that a new trajectory takes over smoothly. After the last poin
 holds its position.
 
 This package is stricter than the joint_trajectory_controller: it refuses partial joint goals,
-velocities without positions, fields that some points lack, a start in the past, and what needs more torque
-than the joints have.
+velocities without positions, fields that some points lack, a start in the past (unless late ones are joined), and
+what needs more torque than the joints have.
 
 Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 """

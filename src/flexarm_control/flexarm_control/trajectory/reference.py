@@ -2,7 +2,7 @@
 """Generates the reference of the joints: holds, trajectories and stops."""
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Verdict:
     reason: str  # why it is refused, or when it starts and which trajectory it replaces
     trajectory_id: int  # counted from 1; of the repeated trajectory for a repeat; 0 if refused
     repeat: bool = False
+    joined: bool = False  # midway: its first points are left out
 
 
 class ReferenceGenerator:
@@ -79,6 +80,8 @@ class ReferenceGenerator:
         A stop is braking.
     accepted_id : int
         The number of the last accepted trajectory; 0: none since the reset.
+    joins : bool
+        Whether a trajectory whose start is past, and whose end is not, is followed from now on; else it is refused.
     """
 
     def __init__(self, joint_names, start_tolerance=0.01, velocity_max=None, period=0.0):
@@ -103,6 +106,7 @@ class ReferenceGenerator:
             )
         self._period = float(period)
         n = len(self.joint_names)
+        self.joins = False
         self._state = np.zeros((3, n))
         self._scratch, self._near = np.zeros((3, n)), np.zeros((3, n))
         self.position, self.velocity, self.acceleration = self._state
@@ -170,12 +174,38 @@ class ReferenceGenerator:
                 False, f"repeat of trajectory {self.accepted_id}", self.accepted_id, repeat=True
             )
         try:
-            self._check(trajectory)
+            ahead = self.ahead(trajectory)
+            self._check(ahead)
             if judge is not None:
-                judge(trajectory, self._scratch.copy())
+                judge(ahead, self._scratch.copy())
         except TrajectoryError as error:
             return Verdict(False, str(error), 0)
-        return self._accept(trajectory)
+        verdict = self._accept(ahead)
+        if ahead is not trajectory:
+            self._last_accepted = trajectory
+            late = seconds(self._last_ns - trajectory.stamp_ns)
+            reason = f"joined {late} after its start: {verdict.reason}"
+            verdict = replace(verdict, reason=reason, joined=True)
+        return verdict
+
+    def ahead(self, trajectory):
+        """What is left of a trajectory that is joined, see `joins`: it starts now, with fewer points; else itself.
+
+        An arm that is not on its way, within the tolerance of a start, is given at least the lowest mode's period to
+        get there: nearer points are left out, but the last. Any thread may ask.
+        """
+        now, start = self._last_ns, trajectory.stamp_ns
+        if not self.joins or now is None or not 0 < start < now:
+            return trajectory
+        elapsed = now - start
+        if elapsed >= trajectory.times_ns[-1]:
+            return trajectory  # `_check` refuses it
+        state = np.zeros((3, len(self.joint_names)))
+        path = Path(trajectory.times_ns, trajectory.fields)
+        path.begin(start, np.array([trajectory.positions[0], state[1], state[2]]))
+        path.evaluate(now, state)
+        on_its_way = (np.abs(state[0] - self.start_of(0)[0]) <= self._start_tolerance).all()
+        return rest_of(trajectory, now, 0.0 if on_its_way else self._period)
 
     def repeats(self, trajectory):
         """Whether a trajectory is the last accepted one again."""
@@ -232,8 +262,8 @@ class ReferenceGenerator:
             )
         if 0 < trajectory.stamp_ns < self._last_ns:
             raise TrajectoryError(
-                f"ns is {seconds(self._last_ns - trajectory.stamp_ns)} in the past: the arm's clock shows"
-                f" {seconds(self._last_ns)}",
+                f"ns is {seconds(self._last_ns - trajectory.stamp_ns)} in the past"
+                f"{', and so is its end' if self.joins else ''}: the arm's clock shows {seconds(self._last_ns)}",
                 field="header.stamp",
                 value=trajectory.stamp_ns,
                 hint="use stamp 0 for now",
@@ -394,6 +424,25 @@ class ReferenceGenerator:
             np.copyto(state, self._state)
             return False
         return path.evaluate(stamp_ns, state) and bool(state[1:].any())
+
+
+def rest_of(trajectory, now_ns, least):
+    """The points of a trajectory that lie at least a time ahead, or the last one, as one that starts now.
+
+    Parameters
+    ----------
+    trajectory : JointTrajectoryData
+        It ends after `now_ns`.
+    now_ns : int
+        [ns]
+    least : float
+        [s]
+    """
+    times_ns = trajectory.times_ns - (now_ns - trajectory.stamp_ns)
+    first = int(np.searchsorted(times_ns, max(round(least * SECOND), 1)))
+    left = slice(min(first, times_ns.size - 1), None)
+    fields = [values[left] for values in trajectory.fields]
+    return JointTrajectoryData(now_ns, trajectory.joint_names, times_ns[left], *fields)
 
 
 def _decelerations(deceleration, joint_names):

@@ -7,9 +7,9 @@ from flexarm_ros.start import leave
 from flexarm_ros.torque_gate import WRAP, TorqueGate
 
 from .. import simulator
-from . import faults, pacing, services
+from . import clock, faults, pacing, services
 
-PARAMETERS = (*pacing.PARAMETERS, *faults.PARAMETERS)
+PARAMETERS = (*pacing.PARAMETERS, *clock.PARAMETERS, *faults.PARAMETERS)
 
 
 class SimulatorNode(Driver):
@@ -34,6 +34,8 @@ class SimulatorNode(Driver):
         self.sim = sim = simulator.Simulator(parameters.group("", simulator.PARAMETERS))
         self.period = 1e-9 * sim.period_ns
         self.faults = faults.Faults(self.arm, parameters)
+        rate = parameters["clock_rate"]
+        self.clock = clock.Clock(self, rate) if rate else None
         self.pacing = (pacing.Lockstep if parameters["lockstep"] else pacing.RealTime)(self)
         parameters.on_change(self._changed)
         amplitude = sim.strain_map is not None and parameters["publish_modal_amplitude"]
@@ -121,6 +123,8 @@ class SimulatorNode(Driver):
         # The newest of several: the others are of the samples before it.
         self.awaited = max((m.sequence for m in self.sent if self._is_own(m)), default=None)
         self.publish_joints(sample)
+        if self.clock is not None:
+            self.clock.publish(sample.stamp_ns, sample.number == 0)
 
     def send(self, again=False):
         """Send the messages of the present sample, for the first time or, while simulated time stands still, again."""
