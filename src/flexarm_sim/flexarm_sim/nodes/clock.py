@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`/clock`: simulated time for nodes with `use_sim_time`, unless another node publishes it."""
 
-from rclpy.node import NodeNameNonExistentError
 from rosgraph_msgs.msg import Clock as Message
 
 from flexarm_dynamics.parameters import parameter
@@ -49,7 +48,9 @@ class Clock:
         node = self._node
         own = node.get_namespace(), node.get_name()
         ends = node.get_publishers_info_by_topic(TOPIC)
+        # Before a node's name is known, its namespace is a word without a slash.
         others = {(end.node_namespace, end.node_name) for end in ends} - {own}
+        others = {who for who in others if who[0].startswith("/")}
         ahead = sorted(who for who in others if not goes_first(own, who, self._simulates(who)))
         if bool(ahead) != self._silent:
             self._silent = bool(ahead)
@@ -61,7 +62,7 @@ class Clock:
         """Whether a node, as (namespace, name), is a simulator of flexarm: it publishes `arm_state`."""
         try:
             topics = self._node.get_publisher_names_and_types_by_node(who[1], who[0])
-        except NodeNameNonExistentError:
+        except RuntimeError:  # rclpy's, for a name that the graph does not know
             return False
         return any(ARM_STATE in types for _, types in topics)
 
