@@ -333,23 +333,7 @@ class Problem:
         """Of the free quantities and the initial state, scaled; see the module."""
         whole, x = len(self.measured), self._unknowns()
         J, r = self.jacobian(x, whole), self.residuals(x, whole)
-        size = np.sqrt(np.sum(J**2, axis=(0, 1)))
-        size[size == 0.0] = 1.0
-        J /= size
-        flat = J.reshape(-1, x.size)
-        bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)  # of white residuals
-        scores = np.einsum("kcx,kc->kx", J, r)
-        lags = min(bandwidth(r), whole // 4)
-        meat = scores.T @ scores
-        for lag in range(1, lags + 1):
-            gamma = scores[lag:].T @ scores[:-lag]
-            meat += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
-        robust = bread @ meat @ bread
-        variance = np.maximum(np.diag(robust), 1e-300)
-        grow = np.sqrt(np.maximum(np.diag(bread) / variance, 1.0))
-        used = np.count_nonzero(self.weight)
-        grow *= np.sqrt(used / max(used - x.size, 1))
-        return robust * np.outer(grow, grow) / np.outer(size, size)
+        return robust_covariance(J, r, np.count_nonzero(self.weight))
 
     def undetermined(self, limit):
         """Index of the free quantity with the widest interval relative to its value; None if within `limit`."""
@@ -431,6 +415,37 @@ class Problem:
             np.where(self.weight > 0.0, self.measured, np.nan), self.noise, self.held,
             tuple(self.left_out), tuple(self.warnings),
         )  # fmt: skip
+
+
+def robust_covariance(J, r, used):
+    """Covariance (p, p) of the unknowns of a least-squares fit with coloured residuals; see the module.
+
+    Parameters
+    ----------
+    J : ndarray, shape (s, c, p)
+        Derivative of the residuals; overwritten.
+    r : ndarray, shape (s, c)
+        Weighted residuals.
+    used : int
+        Measurements.
+    """
+    whole, unknowns = len(r), J.shape[-1]
+    size = np.sqrt(np.sum(J**2, axis=(0, 1)))
+    size[size == 0.0] = 1.0
+    J /= size
+    flat = J.reshape(-1, unknowns)
+    bread = np.linalg.pinv(flat.T @ flat, rcond=1e-15, hermitian=True)  # of white residuals
+    scores = np.einsum("kcx,kc->kx", J, r)
+    lags = min(bandwidth(r), whole // 4)
+    meat = scores.T @ scores
+    for lag in range(1, lags + 1):
+        gamma = scores[lag:].T @ scores[:-lag]
+        meat += (1.0 - lag / (lags + 1.0)) * (gamma + gamma.T)
+    robust = bread @ meat @ bread
+    variance = np.maximum(np.diag(robust), 1e-300)
+    grow = np.sqrt(np.maximum(np.diag(bread) / variance, 1.0))
+    grow *= np.sqrt(used / max(used - unknowns, 1))
+    return robust * np.outer(grow, grow) / np.outer(size, size)
 
 
 def bandwidth(r):

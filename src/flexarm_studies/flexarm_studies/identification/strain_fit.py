@@ -1,0 +1,530 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Fit of an arm's parameters to strains alone, its joints' motion prescribed as measured.
+
+With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `prescribed`, the parameters are those of
+
+.. math::
+    \min_\theta \sum_k \bigl|L^{-1}(e_k - \rho\,e_{k-1})\bigr|^2, \qquad
+    LL^T = \mathrm{Cov}(e_k - \rho\,e_{k-1}),
+
+generalised least squares with an autoregression :math:`\rho` of each gauge and a covariance between the gauges, both
+from the residuals (Ljung, System Identification, 1999, 7.4). What a model leaves is slow where it lacks friction, and
+the same in all gauges where they share a source of noise: without this, the slow part hides the vibration, and noise
+that could be taken off by comparing gauges counts as noise of each.
+
+The sum has many minima. The fit begins at several points, the first one the arm file's: at each, gains and biases
+follow by linear regression, then delays, offsets and drifts are held for the first steps; the best one goes on
+with all. Intervals are those of `fit` (Newey and West). A combination of parameters along which no strain changes is
+named, and one of it keeps the file's value. A parameter whose interval is too wide is named, too. It keeps its fitted
+value, for the others belong to it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..recordings.motion import CORNER
+from .fit import NORMAL, robust_covariance
+from .prescribed import MotionPredictor
+from .quantities import held
+from .strain_quantities import (
+    OF_GAUGES,
+    OF_RECORDING,
+    Setup,
+    changed,
+    strain_quantities,
+    value_of,
+    with_offset,
+)
+
+#: Held unless the user frees them: strains can't tell them from others, or a ruler can.
+HELD = ("links[*].mass_per_length", "gauges[*].position")
+#: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
+STEP = 1e-7
+#: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal's [-].
+FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
+#: Largest autoregression that is used [-].
+MAX_MEMORY = 0.98
+#: Starts, and the range of factors of stiffness and play from the second one on.
+STARTS, RANGE = 6, (0.6, 1.7)
+#: Kinds that a start varies; kinds that stay as they are for its first steps.
+VARIED = ("EI", "transmission_stiffness", "transmission_play")
+LATER = ("offset", "delay", "drift", "hub_inertia")
+#: Evaluations of a start, and of each pass with new weights.
+START_STEPS, PASS_STEPS, PASSES = 12, 12, 4
+#: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
+SINGULAR = 1e-4
+#: What takes part in a combination: this fraction of the singular vector [-].
+INVOLVED = 0.1
+#: Smallest noise [-].
+MIN_NOISE = 1e-9
+#: A residual of a model that diverges, in deviations.
+LOST = 1e4
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to fit.
+
+    Attributes
+    ----------
+    hold, free : tuple of str
+        Names, or patterns with ``*``, of quantities that keep the file's value, and of `HELD` ones that don't.
+    limit : float
+        A quantity is undetermined if its half-width exceeds this fraction of its value [-].
+    starts : int
+    corner : float
+        Of the low pass of the joint angles [Hz].
+    lead : int
+        Samples at the beginning that are predicted, but not compared.
+    """
+
+    hold: tuple = ()
+    free: tuple = ()
+    limit: float = 0.5
+    starts: int = STARTS
+    corner: float = CORNER
+    lead: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class StrainFit:
+    """Result of `identify_strains`.
+
+    Attributes
+    ----------
+    arm : Arm
+        With the fitted values, offsets of its joints included.
+    setup : Setup
+        The same arm without the offsets, and how it was recorded.
+    quantities : list of Quantity
+    values, half_widths : ndarray, shape (p,)
+        Values, and half-widths of the 95 % intervals, NaN where the file's value was kept [SI].
+    covariance : ndarray, shape (p, p)
+        Of the values; zero where they are held.
+    predicted, measured : ndarray, shape (s, g)
+        Strains of the fit, and of the recording.
+    noise, memory : ndarray, shape (g,)
+        Rms of the residuals' part that is new in each sample [-], and their autoregression [-].
+    correlation : ndarray, shape (g, g)
+        Of that part between the gauges.
+    held, undetermined : tuple of str
+        Kept on request or by default; not determined by the strains (those with a half-width have fitted values).
+    alike : tuple of tuple of str
+        Combinations, of all quantities, held ones too, along which no strain changes.
+    starts : tuple of float
+        Sum of squares that each start ended with; the smallest went on.
+    warnings : tuple of str
+    """
+
+    arm: object
+    setup: Setup
+    quantities: list
+    values: np.ndarray
+    half_widths: np.ndarray
+    covariance: np.ndarray
+    predicted: np.ndarray
+    measured: np.ndarray
+    noise: np.ndarray
+    memory: np.ndarray
+    correlation: np.ndarray
+    held: tuple = ()
+    undetermined: tuple = ()
+    alike: tuple = ()
+    starts: tuple = ()
+    warnings: tuple = ()
+
+
+def identify_strains(arm, recording, options=None, run=None, state=None, report=None):
+    """Fit an arm's parameters to the strains of a recording, its joint motion prescribed.
+
+    Parameters
+    ----------
+    arm : Arm
+    recording : Recording
+        It should begin at rest: the links start so.
+    options : Options, optional
+    run : callable, optional
+        ``run(function, calls)`` yields (i, ``function(*calls[i])``), as `workers.results`; here, one by one, if not
+        given.
+    state : FitState, optional
+        Where the fit goes on if it was interrupted, and what it has found so far.
+    report : callable, optional
+        ``report(label)`` at each step.
+
+    Returns
+    -------
+    StrainFit
+
+    Raises
+    ------
+    FlexarmError
+        For a pattern that matches nothing, an arm without gauges, and where no start can follow the motion.
+    """
+    options = options or Options()
+    report = report or (lambda label: None)
+    problem = StrainProblem(arm, recording, options)
+    kept = {} if state is None else dict(state.starts)
+    missing = [k for k in range(options.starts) if k not in kept]
+    calls = [(arm, recording, options, k) for k in missing]
+    run = run or (lambda f, c: ((i, f(*call)) for i, call in enumerate(c)))
+    if missing:
+        report(f"{len(missing)} starts")
+    for i, (cost, values) in run(fit_start, calls):
+        kept[missing[i]] = cost, list(values)
+        report(f"start {missing[i] + 1} of {options.starts}: {cost:.6g}")
+        if state is not None:
+            state.keep_start(missing[i], cost, values)
+    best = min(kept, key=lambda k: kept[k][0])
+    if not kept[best][0] < 0.1 * LOST**2 * problem.used:
+        raise FlexarmError(
+            "can't follow the motion from any start", field=arm.name,
+            hint="correct masses and stiffnesses in the arm file",
+        )  # fmt: skip
+    problem.values = np.array(kept[best][1])
+    if state is not None and state.best is not None:
+        problem.take(state.best)
+    problem.finish(report, state)
+    return problem.result(tuple(kept[k][0] for k in sorted(kept)))
+
+
+def fit_start(arm, recording, options, number):
+    """Fit from one start: sum of squares, which compares between starts, and values (p,)."""
+    problem = StrainProblem(arm, recording, options)
+    problem.begin(number)
+    problem.solve(START_STEPS, 1e-3, LATER)
+    return problem.cost, problem.values
+
+
+class StrainProblem:
+    """A fit in progress; see the module.
+
+    Parameters
+    ----------
+    arm : Arm
+    recording : Recording
+    options : Options
+    """
+
+    def __init__(self, arm, recording, options):
+        if not arm.gauges:
+            raise FlexarmError("has no gauges", field=arm.name, hint="strains are fitted: add them")
+        self.options, self.recording = options, recording
+        self.predictor = MotionPredictor(arm, recording, options.corner)
+        self.setup, self.found = Setup.of(arm), strain_quantities(arm, recording)
+        self.scale = np.array([q.scale for q in self.found])
+        self.low = np.array([q.low for q in self.found])
+        self.file = np.array([value_of(self.setup, q) for q in self.found])
+        self.values = self.file.copy()
+        default = held(self.found, [p for p in HELD if _any(self.found, p)])
+        names = (default - held(self.found, options.free)) | held(self.found, options.hold)
+        self.held = tuple(q.name for q in self.found if q.name in names)
+        self.free = np.array([q.name not in names for q in self.found], bool)
+        self.measured = recording.strain
+        self.known = np.isfinite(self.measured)
+        self.known[: options.lead] = False
+        self.used = int(self.known.sum())
+        self.left_out, self.alike, self.warnings = [], (), list(recording.notes)
+        g = self.measured.shape[1]
+        spread = np.array([column[k].std() if k.any() else 1.0 for column, k in self._columns()])
+        self.memory = np.full(g, FIRST_MEMORY)
+        self.whiten = np.diag(1.0 / np.maximum(FIRST_NOISE * spread, MIN_NOISE))
+        self.duration = max(float(recording.time[-1]), recording.period)
+        self.cost = np.inf
+
+    def _columns(self):
+        return zip(self.measured.T, self.known.T, strict=True)
+
+    # Residuals -------------------------------------------------------------------------------
+
+    def at(self, values):
+        """The `Setup` with these values of all quantities."""
+        return changed(self.setup, self.found, values)
+
+    def states(self, setup):
+        """As `MotionPredictor.states`."""
+        return self.predictor.states(setup.arm, setup.offset)
+
+    def strains(self, setup, states):
+        """As `MotionPredictor.strains`, from `states`."""
+        drift = setup.drift / self.duration
+        return self.predictor.strains(setup.arm, *states, setup.delay, drift)
+
+    def new_part(self, e):
+        """What of residuals (s, g) does not follow from the sample before; 0 where one of both is unknown."""
+        out = np.empty_like(e)
+        out[0] = e[0] * np.sqrt(1.0 - self.memory**2)
+        out[1:] = e[1:] - self.memory * e[:-1]
+        known = self.known.copy()
+        known[1:] &= self.known[:-1] | (self.memory == 0.0)
+        return np.where(known, out, 0.0)
+
+    def weighted(self, e):
+        """Residuals (s, g) as the sum of squares has them."""
+        return self.new_part(np.where(self.known, e, 0.0)) @ self.whiten
+
+    def residuals(self, values):
+        """Weighted residuals, shape (s, g)."""
+        setup = self.at(values)
+        r = self.weighted(self.measured - self.strains(setup, self.states(setup)))
+        return np.clip(np.nan_to_num(r, nan=LOST), -LOST, LOST)
+
+    def jacobian(self, values, which):
+        """Derivative of `residuals` by the quantities with the indices `which`, scaled, shape (s, g, len(which))."""
+        setup = self.at(values)
+        states = self.states(setup)
+        base = self.strains(setup, states)
+        out = np.zeros((*base.shape, len(which)))
+        for column, j in enumerate(which):
+            other = values.copy()
+            other[j] += STEP * self.scale[j]
+            moved = self.at(other)
+            same = self.found[j].kind in OF_GAUGES
+            made = self.strains(moved, states if same else self.states(moved))
+            out[:, :, column] = self.weighted((base - made) / STEP)
+        return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
+
+    # The fit ---------------------------------------------------------------------------------
+
+    def begin(self, number):
+        """Take the values of a start: the file's, or others drawn for its `number`; gains and biases by regression."""
+        self.values = self.file.copy()
+        if number:
+            random = np.random.default_rng(number)
+            for j, q in enumerate(self.found):
+                if q.kind in VARIED and self.free[j]:
+                    self.values[j] *= np.exp(random.uniform(*np.log(RANGE)))
+        self.regress()
+
+    def regress(self):
+        """Set the free gains and biases to those of a linear regression on the predicted strains."""
+        setup = self.at(self.values)
+        predicted = self.strains(setup, self.states(setup))
+        place = {(q.kind, *q.where): j for j, q in enumerate(self.found)}
+        for c, gauge in enumerate(setup.arm.gauges):
+            known, gain, bias = self.known[:, c], place.get(("gain", c)), place.get(("bias", c))
+            if gain is None or not np.isfinite(predicted[known, c]).all() or not known.any():
+                continue
+            read = predicted[known, c] - gauge.bias
+            X = np.column_stack([read * self.free[gain], np.full(read.size, self.free[bias])])
+            target = self.measured[known, c]
+            if not self.free[gain]:
+                target = target - read
+            factor, level = np.linalg.lstsq(X, target, rcond=None)[0]
+            if self.free[gain] and factor > 0.0:
+                self.values[gain] *= factor
+            if self.free[bias]:
+                self.values[bias] = level
+
+    def solve(self, steps, tolerance, later=(), keep=None):
+        """Least squares from the current values, quantities of the kinds `later` held; ``keep()`` after each step."""
+        which = np.array(
+            [j for j in np.flatnonzero(self.free) if self.found[j].kind not in later], int
+        )
+        if not which.size:
+            self.cost = float(np.sum(self.residuals(self.values) ** 2))
+            return
+        low = self.low[which] / self.scale[which]
+        start = np.maximum(self.values[which] / self.scale[which], low + 1e-6)
+
+        def full(x):
+            values = self.values.copy()
+            values[which] = x * self.scale[which]
+            return values
+
+        def residuals(x):
+            r = self.residuals(full(x)).ravel()
+            self.best = min(getattr(self, "best", (np.inf, None)), (float(r @ r), full(x)), key=_of)
+            return r
+
+        def jacobian(x):
+            if keep is not None:  # once a step
+                keep(*self.best)
+            return self.jacobian(full(x), which).reshape(-1, which.size)
+
+        self.best = (np.inf, None)
+        least_squares(
+            residuals, start, jacobian, (low, np.full(start.size, np.inf)),
+            max_nfev=steps, ftol=tolerance, xtol=1e-8, gtol=1e-12,
+        )  # fmt: skip
+        self.cost, self.values = self.best
+
+    def weigh(self):
+        """Memory and covariance of the residuals, and the weights that follow from them."""
+        setup = self.at(self.values)
+        e = np.where(self.known, self.measured - self.strains(setup, self.states(setup)), 0.0)
+        both = self.known[1:] & self.known[:-1]
+        power = np.maximum(np.sum(np.where(both, e[:-1] ** 2, 0.0), axis=0), 1e-300)
+        product = np.sum(np.where(both, e[1:] * e[:-1], 0.0), axis=0)
+        self.memory = np.clip(product / power, 0.0, MAX_MEMORY)
+        new = self.new_part(e)
+        count = np.maximum((new != 0.0).sum(axis=0), 1)
+        covariance = new.T @ new / np.sqrt(np.outer(count, count))
+        covariance += np.diag(np.full(len(covariance), MIN_NOISE**2))
+        self.covariance_of_new = covariance
+        self.whiten = np.linalg.inv(np.linalg.cholesky(covariance)).T
+
+    def finish(self, report, state):
+        """From the values of the best start to the end: passes with new weights, parameters that act alike left out."""
+        stage = 0 if state is None or state.best is None else state.best["stage"]
+        for number in range(stage, PASSES):
+            self.weigh()
+            self.solve(PASS_STEPS, 1e-6, keep=self._keeper(state, number))
+            report(f"pass {number + 1} of {PASSES}: {self.cost:.6g}")
+            if number == 0:
+                self.leave_out_alike()
+            if state is not None:
+                state.keep_best(self.snapshot(number + 1))
+        self.weigh()
+
+    def _keeper(self, state, number):
+        if state is None:
+            return None
+
+        def keep(cost, values):
+            if values is not None:
+                state.keep_best(self.snapshot(number) | {"values": list(values)})
+
+        return keep
+
+    def snapshot(self, stage):
+        """Plain data to go on from."""
+        return {
+            "stage": stage,
+            "values": [float(v) for v in self.values],
+            "left_out": [(int(i), why) for i, why in self.left_out],
+        }
+
+    def take(self, snapshot):
+        """Go on from a `snapshot`."""
+        self.values = np.array(snapshot["values"], float)
+        for index, why in snapshot["left_out"]:
+            self.leave_out(index, why)
+
+    # What is determined ----------------------------------------------------------------------
+
+    def covariance(self):
+        """Of the free quantities, scaled."""
+        which = np.flatnonzero(self.free)
+        J, r = self.jacobian(self.values, which), self.residuals(self.values)
+        return robust_covariance(J, r, self.used)
+
+    def leave_out_alike(self):
+        """Name combinations along which no strain changes; of free ones one quantity keeps the file's value."""
+        everything = np.arange(len(self.found))
+        J = self.jacobian(self.values, everything).reshape(-1, everything.size)
+        size = np.linalg.norm(J, axis=0)
+        self.alike = tuple(
+            tuple(self.found[j].name for j in involved)
+            for involved in _null(J, size, everything)
+        )  # fmt: skip
+        while self.free.any():
+            which = np.flatnonzero(self.free)
+            combinations = _null(J[:, which], size[which], which)
+            if not combinations:
+                return
+            least = min(combinations[0], key=lambda j: size[j])
+            names = ", ".join(self.found[j].name for j in combinations[0])
+            alone = len(combinations[0]) == 1
+            self.leave_out(least, "it changes no strain" if alone else f"{names} act alike")
+
+    def leave_out(self, index, why):
+        """Keep the file's value of a quantity, `why` in words."""
+        self.left_out.append((index, why))
+        self.free[index], self.values[index] = False, self.file[index]
+        q = self.found[index]
+        self.warnings.append(
+            f"{q.name} is not determined by these strains and keeps the file's {self.file[index]:.6g} {q.unit}: {why};"
+            " the others' intervals hold for that value"
+        )
+
+    def result(self, starts):
+        """The result of the fit, whose `starts` ended with these sums of squares."""
+        p, which = len(self.found), np.flatnonzero(self.free)
+        covariance, widths = np.zeros((p, p)), np.full(p, np.nan)
+        if which.size:
+            block = self.covariance() * np.outer(self.scale[which], self.scale[which])
+            covariance[np.ix_(which, which)] = block
+            widths[which] = NORMAL * np.sqrt(np.diag(block))
+        wide = self._wide(widths)
+        setup = self.at(self.values)
+        noise = np.sqrt(np.diag(self.covariance_of_new))
+        return StrainFit(
+            with_offset(setup.arm, setup.offset), setup, self.found, self.values, widths, covariance,
+            self.strains(setup, self.states(setup)), self.measured, noise, self.memory,
+            self.covariance_of_new / np.outer(noise, noise), self.held,
+            tuple(self.found[i].name for i, _ in self.left_out) + wide, self.alike, starts,
+            tuple(self.warnings),
+        )  # fmt: skip
+
+    def _wide(self, widths):
+        """Names of quantities whose interval is wider than the limit, with a warning for each."""
+        ratio = widths / np.maximum(np.abs(self.values), self.scale)
+        wide = np.flatnonzero(np.nan_to_num(ratio) > self.options.limit)
+        for j in wide:
+            q = self.found[j]
+            self.warnings.append(
+                f"{q.name} is not determined by these strains: {self.values[j]:.4g} +- {widths[j]:.2g} {q.unit};"
+                " hold it (--hold) where you know it"
+            )
+        return tuple(self.found[j].name for j in wide)
+
+
+def _of(pair):
+    return pair[0]
+
+
+def _any(found, pattern):
+    try:
+        held(found, [pattern])
+    except FlexarmError:
+        return False
+    return True
+
+
+def _null(J, size, indices):
+    """Combinations of columns of J, lists of `indices`, along which it does not change; `size` (p,) is of columns."""
+    silent = size <= 1e-9 * max(size.max(initial=0.0), 1e-300)
+    if silent.any():
+        return [[int(j)] for j in indices[silent]]
+    _, values, directions = np.linalg.svd(J / size, full_matrices=False)
+    null = directions[values < SINGULAR * values[0]]
+    return [[int(indices[k]) for k in np.flatnonzero(np.abs(row) > INVOLVED)] for row in null]
+
+
+def predict(found, recording, options, middle=None):
+    """Strains (s, g) that a `StrainFit` predicts for another recording, or for a longer part of the same.
+
+    Parameters
+    ----------
+    found : StrainFit
+    recording : Recording
+    options : Options
+        Those of the fit.
+    middle : float, optional
+        Time of no drift in this recording [s]; None: the readings don't drift.
+    """
+    setup = found.setup
+    predictor = MotionPredictor(setup.arm, recording, options.corner)
+    predictor.middle = 0.0 if middle is None else middle
+    duration = max((len(found.measured) - 1) * recording.period, recording.period)
+    drift = None if middle is None else setup.drift / duration
+    states = predictor.states(setup.arm, setup.offset)
+    return predictor.strains(setup.arm, *states, setup.delay, drift)
+
+
+def of_recording(found):
+    """What a `StrainFit` found of the recording, not of the arm: name to value."""
+    pairs = zip(found.quantities, found.values, strict=True)
+    return {q.name: float(v) for q, v in pairs if q.kind in OF_RECORDING}
+
+
+def with_noise(found):
+    """The fitted arm with the noise of its gauges: what is new in each residual."""
+    gauges = (
+        replace(g, noise=float(s)) for g, s in zip(found.arm.gauges, found.noise, strict=True)
+    )
+    return replace(found.arm, gauges=tuple(gauges))
