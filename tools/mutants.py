@@ -114,14 +114,32 @@ KERNELS = of(
     (
         "chain",
         "foreshortening's acceleration: missing",
-        "bias[0], bias[1], bias[2] = t[5, 0] - w.node[3, g]",
-        "bias[0], bias[1], bias[2] = t[5, 0]",
+        "    F[0] += (wy * wy + wz * wz) * short - link[SHORT_DD]\n",
+        "    F[0] += (wy * wy + wz * wz) * short\n",
+    ),
+    (
+        "chain",
+        "foreshortening's moment r x r'': sign",
+        "2.0 * (syd * wx - xsd * wy) - zsdd",
+        "2.0 * (syd * wx - xsd * wy) + zsdd",
+    ),
+    (
+        "chain",
+        "foreshortening's part of a mode's centrifugal force: missing",
+        "            w.q[i, j] -= wx * wz * mode[j, SPHI] - 2.0 * wy * mode[j, SDPHI]\n",
+        "            w.q[i, j] += 2.0 * wy * mode[j, SDPHI]\n",
+    ),
+    (
+        "chain",
+        "coupling of modes by foreshortening: missing",
+        "+= modes[j, k] if k <= j else modes[k, j]",
+        "+= 0.0",
     ),
     (
         "chain",
         "foreshortening of the tip: sign",
-        "w.partial[n, j, 0] = -w.node_partial[1, G, j]",
-        "w.partial[n, j, 0] = w.node_partial[1, G, j]",
+        "w.partial[n, j, 0] = -w.of_mode[i, j, P_TIP]",
+        "w.partial[n, j, 0] = w.of_mode[i, j, P_TIP]",
     ),
     (
         "chain",

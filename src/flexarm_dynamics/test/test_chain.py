@@ -646,7 +646,6 @@ def test_points_turn_and_move_as_in_the_second_derivation(seed, layout, level, l
     frames = reference.frames(*jets)
     _, R, p = frames[i]
     place, turn = reference.section(i, jets[1], where)
-    # Between the ends the model interpolates its quadrature of the foreshortening.
     point, turn = p + turned(R, place) + turned(R @ turn, offset), R @ turn
     close(chain.point(name, position, q, delta, offset), point.c[0, -1], 1e-12, "point")
     angular = np.einsum("bij,bj->bi", turn.c[0], spin(turn)[0])

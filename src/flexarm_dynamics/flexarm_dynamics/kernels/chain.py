@@ -38,6 +38,10 @@ JOINT_PARTS = True
 ENGAGEMENT = 0.1
 TWIST, Y, Z = 0, 1, 2
 FIRST_ORDER, FORESHORTENING, FINITE_SLOPE = 0, 1, 2
+#: Columns of `of_link`: integrals of s, its second derivative along delta_d and X^2 - x^2 over the mass; at the tip.
+SHORT, SHORT_DD, XX, SHORT_TIP, SHORT_TIP_DD = 0, 1, 2, 3, 4
+#: Columns of `of_mode`: of P_j, X P_j, y P_j, z P_j, y' P_j, z' P_j, s'' P_j, s phi_j, s' phi_j, s'' phi_j; at the tip.
+P, XP, YP, ZP, YDP, ZDP, SDDP, SPHI, SDPHI, SDDPHI, P_TIP = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
 
 #: Constants of an arm: N links, at most K modes each, G quadrature nodes. SI.
 DATA = {
@@ -78,7 +82,11 @@ DATA = {
     "node_slope": ("N", "G", "K"),
     "node_bend": ("N", "G", "K"),  # phi''
     "node_ei": ("N", "G", 2),  # quadrature weight times EI along y and z
-    "cumulate": ("N", "G+1", "G"),  # integrals from the base to each node and to the tip
+    "cumulate": (
+        "N",
+        "G",
+        "G+1",
+    ),  # of a function at the nodes: integrals from the base to each node and to the tip
     "bishop": ("N", "K", "K"),  # int phi_y'' phi_z' dx
     "payload_mass": (1,),
     "payload_moment": (3,),  # in the tip's frame, about the tip
@@ -133,8 +141,11 @@ WORK = {
     "S": ("N", 3),
     "t": (12, 3),  # scratch
     "tm": (6, 3, 3),  # scratch
-    "node": (5, "G+1"),  # integrands at the nodes and what they integrate to
-    "node_partial": (2, "G+1", "K"),
+    "of_link": ("N", 5),  # see `integrals`: SHORT, SHORT_DD ...
+    "of_mode": ("N", "K", 11),  # P, XP ...
+    "of_modes": ("N", "K", "K"),  # int P_j P_k dm for k <= j
+    "node": (4, "G+1"),  # integrands at the nodes and what they integrate to
+    "node_partial": (2, "K", "G+1"),
 }
 
 Data = namedtuple("Data", DATA)
@@ -208,6 +219,10 @@ def about_axis(a, angle, out):
 def shorten(d, w, i, delta, delta_d):
     """Foreshortening s of link i at its nodes and tip, its partials, and its second derivative along delta_d."""
     K, G, first = d.count[i], d.nodes, d.first[i]
+    for h in range(G + 1):
+        w.node[2, h], w.node[3, h] = 0.0, 0.0
+        for j in range(K):
+            w.node_partial[1, j, h] = 0.0
     for g in range(G):
         sy, sz, syd, szd = 0.0, 0.0, 0.0, 0.0
         for j in range(K):
@@ -228,27 +243,75 @@ def shorten(d, w, i, delta, delta_d):
             w.node[0, g] = 0.5 * u
             gain = 1.0
         w.node[1, g] = dd
+        sy, sz = gain * sy, gain * sz
         for j in range(K):
             if d.direction[i, j] == Y:
-                w.node_partial[0, g, j] = gain * sy * d.node_slope[i, g, j]
+                w.node_partial[0, j, g] = sy * d.node_slope[i, g, j]
             elif d.direction[i, j] == Z:
-                w.node_partial[0, g, j] = gain * sz * d.node_slope[i, g, j]
-            else:
-                w.node_partial[0, g, j] = 0.0
-    for h in range(G + 1):
-        s, sdd = 0.0, 0.0
+                w.node_partial[0, j, g] = sz * d.node_slope[i, g, j]
+    for g in range(G):
+        s, sdd = w.node[0, g], w.node[1, g]
+        for h in range(G + 1):
+            w.node[2, h] += d.cumulate[i, g, h] * s
+            w.node[3, h] += d.cumulate[i, g, h] * sdd
+    for j in range(K):
+        if d.direction[i, j] == TWIST:
+            continue
         for g in range(G):
-            s += d.cumulate[i, h, g] * w.node[0, g]
-            sdd += d.cumulate[i, h, g] * w.node[1, g]
-        w.node[2, h], w.node[3, h] = s, sdd
-        sd = 0.0
+            part = w.node_partial[0, j, g]
+            for h in range(G + 1):
+                w.node_partial[1, j, h] += d.cumulate[i, g, h] * part
+
+
+def integrals(d, w, i, delta, delta_d):
+    """Integrals over link i's mass that hold its foreshortening: functions of its deflections and their rates alone.
+
+    With P_j = ds/d delta_j and X = x - s, into `WORK`'s `of_link`, `of_mode` and `of_modes`.
+    """
+    K, G, first = d.count[i], d.nodes, d.first[i]
+    shorten(d, w, i, delta, delta_d)
+    link, mode, modes = w.of_link[i], w.of_mode[i], w.of_modes[i]
+    for n in range(3):
+        link[n] = 0.0
+    link[SHORT_TIP], link[SHORT_TIP_DD] = w.node[2, G], w.node[3, G]
+    for j in range(K):
+        for n in range(10):
+            mode[j, n] = 0.0
+        mode[j, P_TIP] = w.node_partial[1, j, G]
+        for k in range(K):
+            modes[j, k] = 0.0
+    for g in range(G):
+        mass, x, s, sdd = d.node_mass[i, g], d.node_x[i, g], w.node[2, g], w.node[3, g]
+        y, z, yd, zd, sd = 0.0, 0.0, 0.0, 0.0, 0.0
         for j in range(K):
-            acc = 0.0
-            for g in range(G):
-                acc += d.cumulate[i, h, g] * w.node_partial[0, g, j]
-            w.node_partial[1, h, j] = acc
-            sd += acc * delta_d[first + j]
-        w.node[4, h] = sd
+            phi, v = d.node_phi[i, g, j], delta_d[first + j]
+            sd += w.node_partial[1, j, g] * v
+            if d.direction[i, j] == Y:
+                y += phi * delta[first + j]
+                yd += phi * v
+            elif d.direction[i, j] == Z:
+                z += phi * delta[first + j]
+                zd += phi * v
+        link[SHORT] += mass * s
+        link[SHORT_DD] += mass * sdd
+        link[XX] += mass * s * (s - 2.0 * x)
+        for j in range(K):
+            if d.direction[i, j] == TWIST:
+                continue
+            part, phi = mass * w.node_partial[1, j, g], mass * d.node_phi[i, g, j]
+            mode[j, P] += part
+            mode[j, XP] += (x - s) * part
+            mode[j, YP] += y * part
+            mode[j, ZP] += z * part
+            mode[j, YDP] += yd * part
+            mode[j, ZDP] += zd * part
+            mode[j, SDDP] += sdd * part
+            mode[j, SPHI] += s * phi
+            mode[j, SDPHI] += sd * phi
+            mode[j, SDDPHI] += sdd * phi
+            for k in range(j + 1):
+                if d.direction[i, k] != TWIST:
+                    modes[j, k] += part * w.node_partial[1, k, g]
 
 
 def body_first_order(d, w, i, delta, delta_d, om):
@@ -338,84 +401,72 @@ def body_first_order(d, w, i, delta, delta_d, om):
     N[2] += 2.0 * (wz * rr - (rxz * wx + ryz * wy + rzz * wz))
 
 
-def body_at_nodes(d, w, i, delta, delta_d, om):
-    """Integrals of link i over its mass by quadrature, foreshortening included."""
-    K, G, first = d.count[i], d.nodes, d.first[i]
-    shorten(d, w, i, delta, delta_d)
+def body_foreshortened(d, w, i, delta, delta_d, om):
+    """Integrals of link i over its mass with its foreshortening, from those of `integrals`."""
+    K, first = d.count[i], d.first[i]
+    link, mode, modes = w.of_link[i], w.of_mode[i], w.of_modes[i]
+    body_first_order(d, w, i, delta, delta_d, om)
+    # What X = x - s adds to r = (x, y, z), to r', and r'' along delta_d. Xy is the integral of X y, and so on.
     c, J, N, F, t = w.c[i], w.J[i], w.N[i], w.F[i], w.t
-    point, rate, bias, part, other = t[0], t[1], t[2], t[3], t[4]
-    for k in range(3):
-        c[k] = 0.0
-        N[k] = 0.0
-        F[k] = 0.0
-        for n in range(3):
-            J[k, n] = d.inertia[i, k, n]
-    # What the straight beam adds is integrated below with the rest.
-    straight = 0.0
-    for g in range(G):
-        straight += d.node_mass[i, g] * d.node_x[i, g] * d.node_x[i, g]
-    J[1, 1] -= straight
-    J[2, 2] -= straight
-    spin = 0.0
+    wx, wy, wz = om[0], om[1], om[2]
+    short_d, xsd, sy, sz, ysd, zsd, ysdd, zsdd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    syd, szd = 0.0, 0.0
     for j in range(K):
-        for k in range(3):
-            w.p[i, j, k] = 0.0
-            w.l[i, j, k] = 0.0
-        twist = d.direction[i, j] == TWIST
-        if twist:
-            w.l[i, j, 0] = d.s[i, j]
-            spin += d.s[i, j] * delta_d[first + j]
+        dj, vj = delta[first + j], delta_d[first + j]
+        kind = d.direction[i, j]
+        if kind == TWIST:
+            continue
+        short_d += mode[j, P] * vj
+        xsd += mode[j, XP] * vj
+        w.p[i, j, 0] = -mode[j, P]
+        w.l[i, j, 1] -= mode[j, ZP]
+        w.l[i, j, 2] += mode[j, YP]
+        # -P_j times the x component of w x (w x r) + 2 w x r' + r''; r'' is -s''.
+        w.q[i, j] += (
+            (wy * wy + wz * wz) * mode[j, XP]
+            - wx * (wy * mode[j, YP] + wz * mode[j, ZP])
+            - 2.0 * (wy * mode[j, ZDP] - wz * mode[j, YDP])
+            + mode[j, SDDP]
+        )
+        if kind == Y:
+            sy += mode[j, SPHI] * dj
+            syd += mode[j, SPHI] * vj
+            ysd += mode[j, SDPHI] * dj
+            ysdd += mode[j, SDDPHI] * dj
+            w.l[i, j, 2] -= mode[j, SPHI]
+            w.q[i, j] -= wx * wy * mode[j, SPHI] + 2.0 * wz * mode[j, SDPHI]
+        else:
+            sz += mode[j, SPHI] * dj
+            szd += mode[j, SPHI] * vj
+            zsd += mode[j, SDPHI] * dj
+            zsdd += mode[j, SDDPHI] * dj
+            w.l[i, j, 1] += mode[j, SPHI]
+            w.q[i, j] -= wx * wz * mode[j, SPHI] - 2.0 * wy * mode[j, SDPHI]
         for k in range(K):
-            w.M[i, j, k] = d.gram[i, j, k] if twist and d.direction[i, k] == TWIST else 0.0
-        w.q[i, j] = 0.0
-    # So far J holds the hub and the sections' polar inertia: their part of N.
-    apply(J, om, t[6])
-    t[6, 0] += spin
-    cross(om, t[6], t[7])
+            if d.direction[i, k] != TWIST:
+                w.M[i, j, k] += modes[j, k] if k <= j else modes[k, j]
+    # F = w x (w x c) + 2 w x c' + c''
+    short = link[SHORT]
+    c[0] -= short
+    F[0] += (wy * wy + wz * wz) * short - link[SHORT_DD]
+    F[1] -= wx * wy * short + 2.0 * wz * short_d
+    F[2] -= wx * wz * short - 2.0 * wy * short_d
+    # N = w x (J w) + 2 int r x (w x r') + int r x r''
+    xx = link[XX]
+    J[1, 1] += xx
+    J[2, 2] += xx
+    J[0, 1] += sy
+    J[1, 0] += sy
+    J[0, 2] += sz
+    J[2, 0] += sz
+    t[1, 0], t[1, 1], t[1, 2] = sy * wy + sz * wz, sy * wx + xx * wy, sz * wx + xx * wz
+    cross(om, t[1], t[0])
     for k in range(3):
-        N[k] += t[7, k]
-    for g in range(G):
-        mass = d.node_mass[i, g]
-        point[0], point[1], point[2] = d.node_x[i, g] - w.node[2, g], 0.0, 0.0
-        rate[0], rate[1], rate[2] = -w.node[4, g], 0.0, 0.0
-        for j in range(K):
-            kind = d.direction[i, j]
-            if kind != TWIST:
-                point[kind] += d.node_phi[i, g, j] * delta[first + j]
-                rate[kind] += d.node_phi[i, g, j] * delta_d[first + j]
-        cross(om, point, bias)
-        for k in range(3):
-            bias[k] += 2.0 * rate[k]
-        cross(om, bias, t[5])
-        bias[0], bias[1], bias[2] = t[5, 0] - w.node[3, g], t[5, 1], t[5, 2]
-        square = dot(point, point)
-        for k in range(3):
-            c[k] += mass * point[k]
-            F[k] += mass * bias[k]
-            J[k, k] += mass * square
-            for n in range(3):
-                J[k, n] -= mass * point[k] * point[n]
-        cross(point, bias, t[5])
-        for k in range(3):
-            N[k] += mass * t[5, k]
-        for j in range(K):
-            kind = d.direction[i, j]
-            if kind == TWIST:
-                continue
-            part[0], part[1], part[2] = -w.node_partial[1, g, j], 0.0, 0.0
-            part[kind] += d.node_phi[i, g, j]
-            cross(point, part, t[5])
-            for k in range(3):
-                w.p[i, j, k] += mass * part[k]
-                w.l[i, j, k] += mass * t[5, k]
-            w.q[i, j] += mass * dot(part, bias)
-            for k in range(K):
-                kind2 = d.direction[i, k]
-                if kind2 == TWIST:
-                    continue
-                other[0], other[1], other[2] = -w.node_partial[1, g, k], 0.0, 0.0
-                other[kind2] += d.node_phi[i, g, k]
-                w.M[i, j, k] += mass * dot(part, other)
+        N[k] += t[0, k]
+    # int r.r' without its first-order part is -xsd; int (w.r) r' is (-xsd wx - ysd wy - zsd wz, -syd wx, -szd wx).
+    N[0] += 2.0 * (ysd * wy + zsd * wz)
+    N[1] += 2.0 * (syd * wx - xsd * wy) - zsdd
+    N[2] += 2.0 * (szd * wx - xsd * wz) + ysdd
 
 
 def elastic_force(d, w, i, delta):
@@ -473,12 +524,13 @@ def slopes_and_bends(d, i, g, delta):
 def tip(d, w, i, delta, delta_d, om):
     """Link i's tip and what hangs on it: frame, partial velocities and biases, into row i + 1 of the work space."""
     K, first, n = d.count[i], d.first[i], i + 1
-    G = d.nodes
     arm, frame, t, tm = w.arm[n], w.frame[n], w.t, w.tm
     short, short_d, short_dd = 0.0, 0.0, 0.0
     if d.level != FIRST_ORDER and K > 0:
-        # `body_at_nodes` has just filled them for this link.
-        short, short_dd, short_d = w.node[2, G], w.node[3, G], w.node[4, G]
+        short, short_dd = w.of_link[i, SHORT_TIP], w.of_link[i, SHORT_TIP_DD]
+        for j in range(K):
+            if d.direction[i, j] != TWIST:
+                short_d += w.of_mode[i, j, P_TIP] * delta_d[first + j]
     arm[0], arm[1], arm[2] = d.length[i] - short, 0.0, 0.0
     rate = t[0]
     rate[0], rate[1], rate[2] = -short_d, 0.0, 0.0
@@ -496,7 +548,7 @@ def tip(d, w, i, delta, delta_d, om):
         rate[kind] += d.tip[i, j] * v
         w.partial[n, j, kind] = d.tip[i, j]
         if d.level != FIRST_ORDER:
-            w.partial[n, j, 0] = -w.node_partial[1, G, j]
+            w.partial[n, j, 0] = -w.of_mode[i, j, P_TIP]
         if kind == Y:
             sy += d.slope[i, j] * x
             syd += d.slope[i, j] * v
@@ -662,7 +714,8 @@ def prepare(d, w, q, delta, qd, delta_d):
         if d.level == FIRST_ORDER or d.count[i] == 0:
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
-            body_at_nodes(d, w, i, delta, delta_d, w.omega[i])
+            integrals(d, w, i, delta, delta_d)
+            body_foreshortened(d, w, i, delta, delta_d, w.omega[i])
         elastic_force(d, w, i, delta)
         tip(d, w, i, delta, delta_d, w.omega[i])
 

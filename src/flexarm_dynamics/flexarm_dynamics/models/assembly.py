@@ -217,7 +217,10 @@ def assemble(arm, shapes, loads):
     if arm.finite_slope:
         level = kernel.FINITE_SLOPE
     most = max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
-    G = 1 if level == kernel.FIRST_ORDER or not most else 12 + 4 * most
+    G = 1
+    if level != kernel.FIRST_ORDER and most:
+        # Slopes squared are integrated to some 1e-12, roots of them to 1e-9 up to slopes of 0.6.
+        G = 3 * most + (6 if level == kernel.FORESHORTENING else 12)
     points, weights = np.polynomial.legendre.leggauss(G)
     points, weights = 0.5 * (points + 1.0), 0.5 * weights
     integrate = cumulative(points, np.append(points, 1.0))
@@ -244,7 +247,7 @@ def assemble(arm, shapes, loads):
         "gram": z((N, K, K)), "stiffness": z((N, K, K)), "damping": z((N, K, K)), "tip": z((N, K)),
         "slope": z((N, K)), "node_x": z((N, G)), "node_mass": z((N, G)), "node_phi": z((N, G, K)),
         "node_slope": z((N, G, K)), "node_bend": z((N, G, K)), "node_ei": z((N, G, 2)),
-        "cumulate": z((N, G + 1, G)), "bishop": z((N, K, K)),
+        "cumulate": z((N, G, G + 1)), "bishop": z((N, K, K)),
     }  # fmt: skip
     # An axis (0, 0, 1) of integers is another type, and would be another compilation.
     a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
@@ -253,7 +256,7 @@ def assemble(arm, shapes, loads):
         body = _straight(link, joint)
         a["mass"][i], a["moment"][i], a["inertia"][i] = body.mass, body.moment[0], body.inertia
         a["node_x"][i], a["node_mass"][i] = L * points, L * rho * weights
-        a["cumulate"][i] = L * integrate
+        a["cumulate"][i] = L * integrate.T
         for c, direction in enumerate(("y", "z")):
             a["node_ei"][i, :, c] = L * weights * link.stiffness.get(direction, 0.0)
         for j, (shape, number, direction) in enumerate(modes[i]):
@@ -286,7 +289,7 @@ def assemble(arm, shapes, loads):
     )
     if level != kernel.FIRST_ORDER:
         for i in range(N):
-            data.bishop[i] = bishop_integrals(data, i, data.cumulate[i, -1])
+            data.bishop[i] = bishop_integrals(data, i, data.cumulate[i, :, -1])
     return data
 
 

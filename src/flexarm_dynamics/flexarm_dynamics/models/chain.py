@@ -28,7 +28,6 @@ from ..kernels import generated, integrators, load
 from .assembly import (
     assemble,
     bishop_integrals,
-    cumulative,
     modes_of,
     outboard,
     packed,
@@ -481,21 +480,29 @@ class Chain(ArmModel):
         d = self.data
         xi = position / link.length
         tip, slope, length = d.tip.copy(), d.slope.copy(), d.length.copy()
-        bishop, cumulate = d.bishop.copy(), d.cumulate.copy()
         length[index] = position
         for j, (shapes, number, direction) in enumerate(modes_of(link, self._shapes)):
             tip[index, j] = 0.0 if direction == "twist" else shapes(xi)[number]
             slope[index, j] = shapes(xi, 0 if direction == "twist" else 1)[number] / (
                 1.0 if direction == "twist" else link.length
             )
-        if d.level != plain.FIRST_ORDER:
-            points = d.node_x[index] / link.length
-            cumulate[index, -1] = link.length * cumulative(points, np.array([xi]))[0]
-            bishop[index] = bishop_integrals(d, index, cumulate[index, -1])
-        return d._replace(
-            links=index + 1, tip=tip, slope=slope, length=length, bishop=bishop,
-            cumulate=cumulate,
-        )  # fmt: skip
+        piece = d._replace(links=index + 1, tip=tip, slope=slope, length=length)
+        return piece if d.level == plain.FIRST_ORDER else self._with_nodes_up_to(piece, index, xi)
+
+    def _with_nodes_up_to(self, data, index, xi):
+        """The data with the nodes of link `index` between its base and `xi`, for the kinematics of that section."""
+        link, d = self.arm.links[index], data
+        node_slope, node_bend = d.node_slope.copy(), d.node_bend.copy()
+        cumulate, bishop = d.cumulate.copy(), d.bishop.copy()
+        points = xi * d.node_x[index] / link.length
+        for j, (shapes, number, direction) in enumerate(modes_of(link, self._shapes)):
+            if direction != "twist":
+                node_slope[index, :, j] = shapes(points, 1)[:, number] / link.length
+                node_bend[index, :, j] = shapes(points, 2)[:, number] / link.length**2
+        cumulate[index, :, -1] *= xi
+        data = d._replace(node_slope=node_slope, node_bend=node_bend, cumulate=cumulate)
+        bishop[index] = bishop_integrals(data, index, cumulate[index, :, -1])
+        return data._replace(bishop=bishop)
 
     def tip_position(self, q, delta):
         return self.frames(q, delta)[1][-1]
