@@ -108,7 +108,10 @@ def test_keys_of_the_messages_are_those_of_their_build():
     found = set(re.findall(r"find_package\((\w+)", text))
     tools = {d.name for d in package.buildtool_depends}
     assert found == tools | {d.name for d in package.build_depends}
-    types = re.findall(r"^(\w+)/\w+", "".join(p.read_text() for p in path.glob("msg/*.msg")), re.M)
+    files = [*path.glob("msg/*.msg"), *path.glob("action/*.action")]
+    types = re.findall(r"^(\w+)/\w+", "".join(p.read_text() for p in files), re.M)
+    assert any(p.suffix == ".action" for p in files)
+    types += ["action_msgs"]  # of the services that an action is made of
     assert set(types) == {d.name for d in package.build_depends}
     assert set(types) <= {d.name for d in package.exec_depends}
 

@@ -21,6 +21,7 @@ setup(
             "observer = flexarm_control.nodes:start_observer",
             "controller = flexarm_control.nodes:start_controller",
             "observer_controller = flexarm_control.nodes:start_observer_controller",
+            "goals = flexarm_control.nodes:start_goals",
             "excite = flexarm_control.nodes:start_excite",
         ],
         "flexarm.slow_laws": [

@@ -50,6 +50,7 @@ LOCKSTEP = Argument(
 LOG_LEVEL = Argument("info", "least severity that is logged", LEVELS)
 SIMULATOR = Argument("true", "false: a driver of yours takes the simulator's place", SWITCH)
 SHAPE = Argument("false", "true: the node shape draws the arm, for RViz and Foxglove", SWITCH)
+GOALS = Argument("true", "false: no action servers, joint_trajectory alone", SWITCH)
 AUTOSTART = Argument(
     "true",
     "true: torque follows with the first valid state; false: the controller waits for a lifecycle manager",
@@ -61,6 +62,7 @@ ONE_ARM = {
     "controller": CONTROLLER,
     "namespace": NAMESPACE,
     "with_simulator": SIMULATOR,
+    "with_goals": GOALS,
     "with_shape": SHAPE,
     "lockstep": LOCKSTEP,
     "log_level": LOG_LEVEL,
@@ -73,6 +75,7 @@ TWO_ARMS = {
     "right_arm": ARM,
     "right_controller": CONTROLLER,
     "with_simulator": SIMULATOR,
+    "with_goals": GOALS,
     "lockstep": LOCKSTEP,
     "log_level": LOG_LEVEL,
 }
@@ -81,6 +84,7 @@ BESIDE_A_DRIVER = {
     "controller": CONTROLLER,
     "namespace": NAMESPACE,
     "autostart": AUTOSTART,
+    "with_goals": GOALS,
     "driver_package": Argument("", "package of a driver to start as well; empty: it runs already"),
     "driver_executable": Argument("driver", "executable of driver_package"),
     "driver_parameters": Argument("", "parameter file of the driver, beside the controller file"),
@@ -110,7 +114,8 @@ def one_arm(values):
     ParameterError
         For a controller file that does not exist, or a value that is not one of an argument's choices.
     """
-    values = {"with_shape": SHAPE.default, **values}  # not an argument of every launch file
+    # Not arguments of every launch file.
+    values = {"with_goals": GOALS.default, "with_shape": SHAPE.default, **values}
     check(values, ONE_ARM)
     arm, file = values["arm"] or "R", values["controller"]
     file = parameter_files.find(file) if file else parameter_files.of_arm(arm)
@@ -126,6 +131,8 @@ def one_arm(values):
         # It must not start paused: nothing would unpause it.
         pace = {"lockstep": is_true(values["lockstep"]), "pause_at": -1.0}
         starts.insert(0, Start("flexarm_sim", "simulator", parameters=[*common, pace], **own))
+    if is_true(values["with_goals"]):
+        starts.append(Start("flexarm_control", "goals", parameters=list(common), **own))
     if is_true(values["with_shape"]):
         starts.append(Start("flexarm_bringup", "shape", parameters=list(common), **own))
     return starts
@@ -152,7 +159,8 @@ def beside_a_driver(values):
     """Observer and controller, and the driver if its package is given; see `one_arm`."""
     check(values, BESIDE_A_DRIVER)
     starts = one_arm({**values, "with_simulator": "false", "lockstep": "false"})
-    starts[-1].parameters.append({"autostart": is_true(values["autostart"])})
+    controller = next(s for s in starts if s.executable == "controller")
+    controller.parameters.append({"autostart": is_true(values["autostart"])})
     if values["driver_package"]:
         driver = Start(values["driver_package"], values["driver_executable"], values["namespace"])
         driver.parameters = [*starts[0].parameters, *filter(None, [values["driver_parameters"]])]
@@ -165,7 +173,7 @@ def case_study(values):
     """The three nodes, and the paper's motion; see `one_arm`."""
     check(values, CASE_STUDY)
     more = {"with_simulator": values["simulate"], "lockstep": "false", "log_level": "info"}
-    starts = one_arm({**values, **more})
+    starts = one_arm({**values, **more, "with_goals": "false"})
     if is_true(values["move"]):
         publisher = Start("flexarm_bringup", "publish_trajectory", values["namespace"])
         publisher.arguments = ["paper", "--arm", values["arm"], "--timeout", "30"]

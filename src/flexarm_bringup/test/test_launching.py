@@ -83,18 +83,23 @@ def test_a_launch_file_declares_described_arguments_and_starts_nodes_by_default(
     assert all(a.ros_arguments == ["--log-level", "info"] for a in actions)
 
 
-def test_one_arm_is_three_nodes_in_a_namespace_with_one_file():
+def test_one_arm_is_four_nodes_in_a_namespace_with_one_file():
     given = {"controller": "two_link", "namespace": "left", "lockstep": "true"}
     starts = launching.one_arm(values(launching.ONE_ARM, **given))
-    assert [s.executable for s in starts] == ["simulator", "observer", "controller"]
+    assert [s.executable for s in starts] == ["simulator", "observer", "controller", "goals"]
     assert {s.namespace for s in starts} == {"left"}
     assert {s.parameters[0] for s in starts} == {str(parameter_files.find("two_link"))}
     # The arm is the file's; in lockstep the simulator does not wait to be unpaused.
-    assert [merged(s) for s in starts] == [{"lockstep": True, "pause_at": -1.0}, {}, {}]
+    assert [merged(s) for s in starts] == [{"lockstep": True, "pause_at": -1.0}, {}, {}, {}]
 
 
 def test_with_simulator_false_leaves_the_simulator_out_and_an_arm_goes_to_every_node():
-    given = {"with_simulator": "false", "arm": "one_link", "log_level": "debug"}
+    given = {
+        "with_simulator": "false",
+        "with_goals": "false",
+        "arm": "one_link",
+        "log_level": "debug",
+    }
     starts = launching.one_arm(values(launching.ONE_ARM, **given))
     assert [s.executable for s in starts] == ["observer", "controller"]
     assert [merged(s) for s in starts] == [{"arm": "one_link"}] * 2
@@ -113,7 +118,9 @@ def test_two_arms_have_all_their_nodes_in_namespaces_of_their_own():
     given = {"right_controller": "two_link", "right_namespace": "r"}
     starts = launching.two_arms(values(launching.TWO_ARMS, **given))
     assert [(s.namespace, s.executable) for s in starts] == [
-        (side, node) for side in ("left", "r") for node in ("simulator", "observer", "controller")
+        (side, node)
+        for side in ("left", "r")
+        for node in ("simulator", "observer", "controller", "goals")
     ]
     files = {s.namespace: s.parameters[0] for s in starts}
     assert files["left"].endswith("composite.yaml") and files["r"].endswith("two_link.yaml")
@@ -126,6 +133,7 @@ def test_beside_a_driver_the_controller_may_wait_and_the_driver_is_started_where
     assert [(s.executable, merged(s)) for s in starts] == [
         ("observer", {}),
         ("controller", {"autostart": False}),
+        ("goals", {}),
     ]
     given = {"driver_package": "my_driver", "driver_parameters": "mine.yaml", "namespace": "n"}
     driver, *_ = launching.beside_a_driver(values(launching.BESIDE_A_DRIVER, **given))

@@ -270,6 +270,7 @@ class CompositeStateWriter:
         msg.saturated = controller.saturated
         msg.rejected_reason = controller.reason
         msg.accepted_trajectory_id = controller.trajectory_id
+        msg.judged_trajectory, msg.judged_reason = controller.judged
         msg.compute_time = float(compute_time)
         return msg
 
@@ -297,6 +298,20 @@ class ObserverStateWriter:
         msg.gauge_health = array("B", health)
         msg.converged = observer.converged
         return msg
+
+
+#: Longest name of a trajectory that `controller/state` repeats, in bytes.
+MAX_NAME = 64
+
+
+def trajectory_name(raw):
+    """`header.frame_id` of a serialised `JointTrajectory`, at most `MAX_NAME` bytes; empty if unreadable."""
+    try:
+        (length,) = struct.unpack_from("<I" if raw[1] & 1 else ">I", raw, 4 + 8)
+    except (struct.error, IndexError):
+        return ""
+    name = bytes(raw[16 : 16 + min(max(length - 1, 0), MAX_NAME)])
+    return name.decode(errors="ignore").replace("\0", "")
 
 
 def trajectory_points(raw):

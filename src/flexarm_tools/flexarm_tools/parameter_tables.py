@@ -10,8 +10,8 @@ BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 
 def groups():
     """Node name to its declared parameters by prefix."""
-    from flexarm_control.nodes import controller, excite, observer
-    from flexarm_ros.node import COMMON
+    from flexarm_control.nodes import controller, excite, goals, observer
+    from flexarm_ros.node import ARM, COMMON
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
 
@@ -21,6 +21,7 @@ def groups():
         "simulator": {"": (*simulator.PARAMETERS, *simulator_node.PARAMETERS)},
         "observer": observer.parameter_groups(),
         "controller": controller.parameter_groups(),
+        "goals": {"": (ARM, *goals.PARAMETERS)},
         "excite": excite.parameter_groups(),
         "replay": {"": replay.PARAMETERS},
     }

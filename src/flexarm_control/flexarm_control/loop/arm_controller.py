@@ -14,7 +14,7 @@ from . import applied, authority, supervisor
 from .applied import Applied
 from .authority import Authority
 from .samples import ArmSample, SampleOrder
-from .supervisor import State, Supervisor
+from .supervisor import State, Supervisor, longest_period
 from .torque_delay import TorqueDelay
 
 #: Time in which the fast control comes back, or goes, when it is switched [s].
@@ -89,6 +89,8 @@ class ArmController:
         How long after a state's stamp its torque acts, from what the driver reports.
     controller_id : int
         Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
+    judged : tuple of str
+        Name of the last trajectory that was accepted or refused, and why it was refused, or empty.
     payload : PayloadEstimator or None
         What `learn` finds of the payload; None: `payload_estimate` is off.
     """
@@ -98,13 +100,13 @@ class ArmController:
         self.model, self.law, self.answered_by = model, law, law
         fastest = model.arm.velocity_limits
         self.reference = ReferenceGenerator(
-            model.joint_names, start_tolerance, fastest, _longest_period(model)
+            model.joint_names, start_tolerance, fastest, longest_period(model)
         )
         self._start_tolerance = start_tolerance
         self._nothing = np.zeros(0)
         self.position_error, self.velocity_error = np.zeros(n), np.zeros(n)
         self.enabled, self.saturated, self.fast_enabled = False, False, True
-        self._trajectory_reason = ""
+        self._trajectory_reason, self.judged = "", ("", "")
         self._waiting = False  # joints known, deflections not yet
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
@@ -122,7 +124,7 @@ class ArmController:
         self._take_limits(settings)
         self.payload = self._estimator(settings)
         # So long the joints have been slow, as far as the payload needs to know [s].
-        self._slow_for, self._bending_period = 0.0, _longest_period(model)
+        self._slow_for, self._bending_period = 0.0, longest_period(model)
 
     def _estimator(self, settings):
         mode = settings["payload_estimate"]
@@ -261,9 +263,9 @@ class ArmController:
             **computed,
         }
 
-    def refuse(self, reason):
+    def refuse(self, reason, name=""):
         """Note a trajectory that was refused before it could be offered."""
-        self._trajectory_reason = reason
+        self._trajectory_reason, self.judged = reason, (name, reason)
 
     @property
     def plans(self):
@@ -291,8 +293,10 @@ class ArmController:
     def _judge_torque(self, trajectory, start):
         refuse_torque(self.model, trajectory, start, self.torque_allowed)
 
-    def offer(self, trajectory, plan=None, judged=False):
+    def offer(self, trajectory, plan=None, judged=False, name=""):
         """Offer a `trajectory`, with the `plan` that `prepare` made for it; a refusal is kept in `reason`.
+
+        Its `name` is in `judged` then.
 
         The torque that it needs is judged here, which takes a while, unless that has been done: `judged`.
 
@@ -318,6 +322,8 @@ class ArmController:
                 self.law.feedforward.take(made_for_it, verdict.trajectory_id)
         elif not verdict.repeat:
             self._trajectory_reason = verdict.reason
+        refused = not (verdict.accepted or verdict.repeat)
+        self.judged = name, verdict.reason if refused else ""
         return verdict
 
     def step(self, sample, now_ns=None):
@@ -627,13 +633,6 @@ class ArmController:
             name = self.model.joint_names[int(np.argmax(moved))]
             return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
         return ""
-
-
-def _longest_period(model):
-    """Period of the lowest bending mode with straight, locked joints [s]; 0 for a rigid arm."""
-    if not model.n_modes:
-        return 0.0
-    return 2.0 * np.pi / float(model.frequencies(locked=True)[0])
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):

@@ -320,3 +320,10 @@ def _deceleration(model, torque_limit):
     most = np.diag(B) * torque_limit
     # What gravity takes of it; a fifth is left in any case.
     return np.maximum(most - np.abs(a), 0.2 * most)
+
+
+def longest_period(model):
+    """Period of the lowest bending mode with straight, locked joints [s]; 0 for a rigid arm."""
+    if not model.n_modes:
+        return 0.0
+    return 2.0 * np.pi / float(model.frequencies(locked=True)[0])

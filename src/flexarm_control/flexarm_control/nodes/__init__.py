@@ -9,4 +9,5 @@ from flexarm_ros.start import start
 start_observer = partial(start, "flexarm_control.nodes.observer")
 start_controller = partial(start, "flexarm_control.nodes.controller")
 start_observer_controller = partial(start, "flexarm_control.nodes.observer_controller")
+start_goals = partial(start, "flexarm_control.nodes.goals")
 start_excite = partial(start, "flexarm_control.nodes.excite")

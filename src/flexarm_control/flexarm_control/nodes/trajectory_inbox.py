@@ -8,7 +8,7 @@ from rclpy.serialization import deserialize_message
 from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
-from flexarm_ros.messages import stamp_ns, trajectory_points
+from flexarm_ros.messages import stamp_ns, trajectory_name, trajectory_points
 
 from .. import trajectory
 
@@ -74,11 +74,12 @@ class TrajectoryInbox:
 
     def _read_and_prepare(self, raw, feedforward):
         """In a thread: make a message ready to be offered."""
+        name = trajectory_name(raw)
         try:
             data = read(raw, self._core.model.arm)
             self._judge_torque(data)
         except TrajectoryError as error:
-            self._node.hand_over(self._refuse, str(error))
+            self._node.hand_over(self._refuse, str(error), name)
             return
         except CancelledError:
             return
@@ -95,7 +96,7 @@ class TrajectoryInbox:
                 return
             kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self._node.get_logger().warning(f"trajectory without preview: {kind}{error}")
-        self._node.hand_over(self._offer, data, plan)
+        self._node.hand_over(self._offer, data, plan, name)
 
     def _judge_torque(self, data):
         """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""
@@ -104,12 +105,12 @@ class TrajectoryInbox:
             ahead = reference.ahead(data)
             self._designer.judge(ahead, reference.start_of(ahead.stamp_ns), limit)
 
-    def _refuse(self, reason):
-        self._core.refuse(reason)
+    def _refuse(self, reason, name):
+        self._core.refuse(reason, name)
         self._node.get_logger().warning(f"trajectory refused: {reason}")
 
-    def _offer(self, data, plan):
-        verdict = self._core.offer(data, plan, judged=True)
+    def _offer(self, data, plan, name):
+        verdict = self._core.offer(data, plan, judged=True, name=name)
         if verdict.accepted:
             text = f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}"
             self._node.get_logger().info(text)

@@ -21,6 +21,7 @@ NODES = {
     "observer": "flexarm_control",
     "controller": "flexarm_control",
     "observer_controller": "flexarm_control",
+    "goals": "flexarm_control",
 }
 
 

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories as action goals, over real DDS: results, feedback, cancelling, replacing, and what goes wrong."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from harness import Arm, Bench
+from rclpy.action import ActionClient
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from flexarm_msgs.action import FollowJointTrajectory as Follow
+from flexarm_msgs.msg import CompositeState, JointTolerance
+from flexarm_ros.messages import set_stamp
+
+R = Follow.Result
+LINE = {"arm": "R", "lockstep": True, "pause_at": -1.0, "rate": 500.0, "design_process": False}
+#: Random goals; FLEXARM_GOALS=100 for more.
+SENT = int(os.environ.get("FLEXARM_GOALS", "10"))
+
+
+def trajectory(*points, joints=("joint1",), stamp_ns=0):
+    """A `JointTrajectory` of (time, position) with quintics from rest to rest."""
+    message = JointTrajectory(joint_names=list(joints))
+    set_stamp(message.header.stamp, stamp_ns)
+    for time, position in points:
+        point = JointTrajectoryPoint(positions=[position], velocities=[0.0], accelerations=[0.0])
+        set_stamp(point.time_from_start, round(time * 1e9))
+        message.points.append(point)
+    return message
+
+
+class Client:
+    """An action client of a bench."""
+
+    def __init__(self, bench, name="controller/follow_trajectory", kind=Follow):
+        self.bench, self.kind = bench, kind
+        self.client = ActionClient(bench.node, kind, name)
+        bench.wait_for("the action server", self.client.server_is_ready)
+
+    def send(self, message, **fields):
+        """Send a goal; its handle once it is accepted, and the feedback that comes."""
+        feedback = []
+        futures, again = [], 0.0
+
+        def answered():
+            nonlocal again
+            if (
+                time.monotonic() > again
+            ):  # a server that has not found the client yet drops its answer
+                again = time.monotonic() + 3.0
+                futures.append(
+                    self.client.send_goal_async(
+                        self.kind.Goal(trajectory=message, **fields),
+                        feedback_callback=lambda m: feedback.append(m.feedback),
+                    )
+                )
+            return next((f.result() for f in futures if f.done()), None)
+
+        return self.bench.wait_for("the goal's answer", answered), feedback
+
+    def result(self, handle):
+        """Status and result of a goal."""
+        future = handle.get_result_async()
+        self.bench.wait_for("the result", future.done)
+        return future.result().status, future.result().result
+
+    def follow(self, message, **fields):
+        """Send a goal and wait; status and result."""
+        handle, _ = self.send(message, **fields)
+        assert handle.accepted
+        return self.result(handle)
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory):
+    """Arm R in lockstep, running, with the action server."""
+    with Bench(tmp_path_factory.mktemp("log")) as bench:
+        bench.start_loop(**LINE)
+        bench.start("goals", {"arm": "R", "state_timeout": 5.0})
+        arm = Arm(bench)
+        arm.wait_ready()
+        client = Client(bench)
+        yield bench, arm, client
+        client.client.destroy()
+
+
+def home(line):
+    """Bring the arm back to zero, at rest, whatever a test has left."""
+    bench, arm, client = line
+    arm.recover()
+    bench.wait_for("torque", arm.ready)
+    assert client.follow(trajectory((2.0, 0.0)))[1].error_code == R.SUCCESSFUL
+
+
+def test_a_goal_succeeds_when_the_tip_rests_and_not_when_the_joints_are_there(line):
+    home(line)
+    _, arm, client = line
+    handle, feedback = client.send(trajectory((1.0, 0.3)))
+    status, result = client.result(handle)
+    assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, R.SUCCESSFUL)
+    assert 0.0 < result.tip_swing <= 1e-3 * 1.2192
+    assert feedback and feedback[-1].joint_names == ["joint1"]
+    actual = [f.actual.positions[0] for f in feedback]
+    assert max(actual) <= 0.35 and abs(arm.state.reference_position[0] - 0.3) < 1e-9
+    assert all(
+        np.isclose(f.desired.positions[0] - f.actual.positions[0], f.error.positions[0])
+        for f in feedback
+    )
+
+
+def test_a_tip_that_may_not_swing_at_all_is_waited_for_until_the_time_is_over(line):
+    home(line)
+    _, _, client = line
+    message = trajectory((0.6, 0.05))
+    limits = {"tip_tolerance": 1e-12}
+    goal_time = Follow.Goal().goal_time_tolerance
+    goal_time.sec = 1
+    status, result = client.follow(message, goal_time_tolerance=goal_time, **limits)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.GOAL_TOLERANCE_VIOLATED)
+    assert "goal_time_tolerance of 1 s is over: the tip swings by" in result.error_string
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "text"),
+    [
+        (trajectory((1.0, 0.1), joints=["elbow"]), R.INVALID_JOINTS, "elbow"),
+        (trajectory((1.0, float("nan"))), R.INVALID_GOAL, "points[0].positions"),
+        (trajectory(), R.INVALID_GOAL, "points"),
+        (trajectory((1.0, 0.1), stamp_ns=1), R.OLD_HEADER_TIMESTAMP, "in the past"),
+        (trajectory((0.05, 3.0)), R.INVALID_GOAL, "more than the torque limit"),
+    ],
+    ids=["joints", "NaN", "empty", "past", "too fast"],
+)
+def test_what_the_controller_refuses_is_aborted_with_its_reason(line, message, code, text):
+    status, result = line[2].follow(message)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, code)
+    assert text in result.error_string
+
+
+def test_a_tolerance_of_a_joint_that_there_is_not_is_refused(line):
+    tolerance = [JointTolerance(name="elbow", position=0.1)]
+    status, result = line[2].follow(trajectory((1.0, 0.1)), goal_tolerance=tolerance)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.INVALID_JOINTS)
+    assert "goal_tolerance[0].name: 'elbow' is no joint of this arm" in result.error_string
+
+
+def test_a_violated_path_tolerance_stops_the_arm(line):
+    home(line)
+    bench, arm, client = line
+    tolerance = [JointTolerance(name="joint1", position=1e-5)]
+    status, result = client.follow(trajectory((2.0, 0.8)), path_tolerance=tolerance)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED)
+    assert "path tolerance violated: joint1 is off by" in result.error_string
+    bench.wait_for("rest", lambda: arm.state.supervisor_state == CompositeState.HOLDING)
+    assert abs(arm.state.reference_position[0]) < 0.8
+
+
+def test_a_cancelled_goal_is_canceled_once_the_arm_has_stopped(line):
+    home(line)
+    bench, arm, client = line
+    handle, _ = client.send(trajectory((6.0, 0.8)))
+    bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    handle.cancel_goal_async()
+    status, result = client.result(handle)
+    assert status == GoalStatus.STATUS_CANCELED
+    assert result.error_string == "cancelled: the arm was stopped"
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    assert 0.0 < arm.state.reference_position[0] < 0.8
+
+
+def test_a_goal_that_is_replaced_has_a_result(line):
+    home(line)
+    bench, arm, client = line
+    first, _ = client.send(trajectory((6.0, 0.8)))
+    bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    second, _ = client.send(trajectory((2.0, 0.1)))
+    status, result = client.result(first)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.INVALID_GOAL)
+    assert result.error_string == "replaced by a newer goal"
+    bench.wait_for("the second", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    arm.publish_trajectory(trajectory((2.0, 0.0)))
+    status, result = client.result(second)
+    assert (status, result.error_string) == (
+        GoalStatus.STATUS_ABORTED,
+        "replaced by a newer trajectory",
+    )
+
+
+def test_a_stop_and_a_fault_abort_with_the_controllers_own_reason(line):
+    home(line)
+    bench, arm, client = line
+    handle, _ = client.send(trajectory((6.0, 0.8)))
+    bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    assert bench.call(Trigger, "controller/stop").success
+    status, result = client.result(handle)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED)
+    assert result.error_string == "~/stop was called"
+    home(line)
+    handle, _ = client.send(trajectory((6.0, 0.8)))
+    bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    assert bench.call(Trigger, "simulator/reset").success
+    status, result = client.result(handle)
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED)
+    assert "restarted during a motion" in result.error_string
+
+
+def test_random_goals_cancelled_and_replaced_always_have_a_result(line):
+    """Each with the status that its fate has; none is left, and the arm can go on."""
+    home(line)
+    bench, arm, client = line
+    rng = np.random.default_rng(0)
+    sent = []
+    for k in range(SENT):
+        fate = rng.choice(["wait", "cancel", "replace"])
+        handle, _ = client.send(trajectory((rng.uniform(0.5, 2.0), rng.uniform(-0.5, 0.5))))
+        wanted = arm.now + round(rng.uniform(0.0, 0.5) * 1e9)
+        bench.wait_for("a while", lambda wanted=wanted: arm.now > wanted)
+        if fate == "cancel":
+            handle.cancel_goal_async()
+        status = client.result(handle)[0] if fate != "replace" or k == SENT - 1 else None
+        sent.append((handle, fate, status))
+    for handle, fate, status in sent:
+        status = status or client.result(handle)[0]
+        allowed = {
+            "wait": {GoalStatus.STATUS_SUCCEEDED},
+            "cancel": {GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_SUCCEEDED},
+            "replace": {GoalStatus.STATUS_ABORTED, GoalStatus.STATUS_SUCCEEDED},
+        }[fate]
+        assert status in allowed, fate
+    home(line)
+
+
+def test_without_a_controller_a_goal_is_aborted(tmp_path):
+    with Bench(tmp_path) as bench:
+        bench.start("goals", {"arm": "R", "state_timeout": 0.1})
+        client = Client(bench)
+        status, result = client.follow(trajectory((1.0, 0.1)))
+        assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.INVALID_GOAL)
+        assert "the controller has not answered for 0.5 s" in result.error_string
+        client.client.destroy()
+
+
+def test_where_control_msgs_is_installed_its_action_is_served_too(tmp_path, monkeypatch):
+    """A stand-in of that name, with our own action: the wheels have no control_msgs."""
+    package = tmp_path / "control_msgs" / "action"
+    package.mkdir(parents=True)
+    (package.parent / "__init__.py").touch()
+    (package / "__init__.py").write_text("from flexarm_msgs.action import FollowJointTrajectory\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    with Bench(tmp_path / "log") as bench:
+        bench.start_loop(**LINE)
+        bench.start("goals", {"arm": "R"})
+        arm = Arm(bench)
+        arm.wait_ready()
+        client = Client(bench, "controller/follow_joint_trajectory")
+        status, result = client.follow(trajectory((0.5, 0.01)))
+        assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, R.SUCCESSFUL)
+        client.client.destroy()
