@@ -26,9 +26,9 @@ def trajectory(*points, joints=("joint1",), stamp_ns=0):
     """A `JointTrajectory` of (time, position) with quintics from rest to rest."""
     message = JointTrajectory(joint_names=list(joints))
     set_stamp(message.header.stamp, stamp_ns)
-    for time, position in points:
+    for seconds, position in points:
         point = JointTrajectoryPoint(positions=[position], velocities=[0.0], accelerations=[0.0])
-        set_stamp(point.time_from_start, round(time * 1e9))
+        set_stamp(point.time_from_start, round(seconds * 1e9))
         message.points.append(point)
     return message
 
