@@ -83,6 +83,16 @@ def test_shorter_steps_change_no_tenth_of_a_microstrain(arm):
     assert np.abs(coarse - fine).max() < 1e-7
 
 
+def test_sharp_flanks_take_shorter_steps(arm):
+    sharp = replace(arm.joints[0], transmission=replace(arm.joints[0].transmission, rounding=0.0))
+    arm = replace(arm, joints=(sharp, arm.joints[1]))
+    predictor = MotionPredictor(arm, moved())
+    coarse = predictor.strains(arm, *predictor.states(arm))
+    predictor.substeps *= 8
+    error = coarse - predictor.strains(arm, *predictor.states(arm))
+    assert np.sqrt(np.mean(error**2)) < 1e-7
+
+
 def test_delay_drift_bias_and_offset_do_what_they_say(arm):
     measured = moved()
     predictor = MotionPredictor(arm, measured)

@@ -124,10 +124,10 @@ def test_the_fitted_arm_has_the_offset_in_its_joint(arm, fitted):
     other = MotionPredictor(found.arm, recording)
     strain = other.strains(found.arm, *other.states(found.arm), found.setup.delay)
     drift = np.outer(recording.time / recording.time[-1] - 0.5, found.setup.drift)
-    np.testing.assert_allclose(strain + drift, found.predicted, atol=1e-11)
+    np.testing.assert_allclose(strain + drift, found.predicted, atol=2e-7)
     middle = 0.5 * recording.time[-1]
     np.testing.assert_allclose(
-        predict(found, recording, Options(), middle), found.predicted, atol=1e-11
+        predict(found, recording, Options(), middle), found.predicted, atol=2e-7
     )
 
 

@@ -16,6 +16,8 @@ from .quantities import KEY, damping_of
 
 #: Significant digits of the written values, and the relative error allowed when they are read back [-].
 DIGITS, TOLERANCE = 8, 1e-6
+#: Kind of a `Quantity`: the angle by which a joint's zero is off; it turns the joint's origin.
+OFFSET = "offset"
 #: A gauge or a section stays on one line, however long.
 WIDTH = 4096
 
@@ -24,13 +26,14 @@ class _Number(str):
     """A number as it stands in the file."""
 
 
-def rewritten(text, identified, heading=()):
+def rewritten(text, identified, heading=(), notes=None):
     """The `text` of the arm file that the fit started from with the `identified` values, below a comment, `heading`.
 
+    `notes`, by names of quantities, stand behind their numbers where the file gives these a line of their own.
     Refused when the new text does not read as the identified arm.
     """
     try:
-        made = _edited(text, identified)
+        made = _edited(text, identified, notes or {})
     except (YAMLError, LookupError, TypeError, AttributeError) as error:
         raise FlexarmError(
             f"can't be edited: {error}", field="arm file", hint="write the values by hand"
@@ -38,6 +41,8 @@ def rewritten(text, identified, heading=()):
     made = "".join(f"# {line}".rstrip() + "\n" for line in heading) + made
     arm = arm_file.parse(made)
     for quantity, value in zip(identified.quantities, identified.values, strict=True):
+        if quantity.kind == OFFSET:
+            continue
         if not np.isclose(
             quantity.get(arm), value, rtol=TOLERANCE, atol=TOLERANCE * quantity.scale
         ):
@@ -45,10 +50,16 @@ def rewritten(text, identified, heading=()):
                 "is not what the written arm file reads as", field=quantity.name, value=value, limit=quantity.get(arm),
                 hint="write the values by hand",
             )  # fmt: skip
+    turns = [np.array([j.origin_rpy for j in a.joints]) for a in (arm, identified.arm)]
+    if not np.allclose(*turns, atol=TOLERANCE):
+        raise FlexarmError(
+            "is not what the written arm file reads as", field="origin of a joint", value=turns[1],
+            limit=turns[0], hint="write the values by hand",
+        )  # fmt: skip
     return made
 
 
-def _edited(text, identified):
+def _edited(text, identified, notes):
     yaml = YAML()
     yaml.preserve_quotes, yaml.width = True, WIDTH
     yaml.representer.add_representer(
@@ -59,42 +70,69 @@ def _edited(text, identified):
         yaml.indent(mapping=2, sequence=indent, offset=offset or 0)
     system = data.get("units", "si")
     changes = list(_changes(identified))
-    for i in {path[1] for _, _, path in changes if path[0] == "links" and path[2] in KEY.values()}:
+    for i in {
+        path[1] for _, _, path, _ in changes if path[0] == "links" and path[2] in KEY.values()
+    }:
         if "section" in data["links"][i]:
             _without_section(data["links"][i], identified.arm.links[i], system)
-    for value, dimension, path in changes:
+    beside = {}
+    for value, dimension, path, name in changes:
         _put(data, path, _number(value, system, dimension))
+        if name in notes:
+            beside.setdefault(path, []).append(notes[name])
+    for path, words in beside.items():
+        _note(data, path, "; ".join(words))
     out = io.StringIO()
     yaml.dump(data, out)
     return out.getvalue()
 
 
 def _changes(identified):
-    """Yield value (SI), dimension and path in the file of everything that the fit determined."""
-    arm = identified.arm
+    """Yield value (SI), dimension, path in the file, and name of everything that the fit determined."""
     for q, width in zip(identified.quantities, identified.half_widths, strict=True):
-        if np.isnan(width):
-            continue
-        value, where = q.get(arm), q.where
-        if q.kind == "hub_inertia":
-            yield value, q.dimension, ("joints", where[0], "hub_inertia")
-        elif q.kind in ("viscous", "coulomb"):
-            yield value, q.dimension, ("joints", where[0], "friction", q.kind)
-        elif q.kind == "EI":
-            yield value, q.dimension, ("links", where[0], KEY[where[1]])
-            flexibility = arm.links[where[0]].flexible[where[1]]
-            if flexibility.frequencies:
-                path = ("links", where[0], "flexible", where[1], "frequencies")
-                yield flexibility.frequencies, "frequency", path
-        elif q.kind == "damping":
-            values = damping_of(arm.links[where[0]].flexible[where[1]])
-            yield values, q.dimension, ("links", where[0], "flexible", where[1], "damping")
-        elif q.kind == "payload_mass":
-            yield value, q.dimension, ("payload", "mass")
-        elif q.kind == "payload_inertia":
-            yield _inertia(arm), q.dimension, ("payload", "inertia")
-        else:
-            yield value, q.dimension, ("gauges", where[0], q.kind)
+        if not np.isnan(width):
+            for value, dimension, path in _change(identified.arm, q):
+                yield value, dimension, path, q.name
+
+
+#: Kinds with an index of a joint, link or gauge: list and keys in the file.
+_PLACES = {
+    "hub_inertia": ("joints", "hub_inertia"),
+    "motor_mass": ("joints", "motor_mass"),
+    "viscous": ("joints", "friction", "viscous"),
+    "coulomb": ("joints", "friction", "coulomb"),
+    "mass_per_length": ("links", "mass_per_length"),
+}
+
+
+def _change(arm, q):
+    """Value, dimension and path of each entry in the file that a quantity changes."""
+    where, dimension = q.where, q.dimension
+    if q.kind == OFFSET:
+        yield arm.joints[where[0]].origin_rpy, "angle", ("joints", where[0], "origin", "rpy")
+        return
+    value = q.get(arm)
+    if q.kind in _PLACES:
+        part, *keys = _PLACES[q.kind]
+        yield value, dimension, (part, where[0], *keys)
+    elif q.kind.startswith("transmission_"):
+        path = ("joints", where[0], "transmission", q.kind.removeprefix("transmission_"))
+        yield value, dimension, path
+    elif q.kind == "EI":
+        yield value, dimension, ("links", where[0], KEY[where[1]])
+        flexibility = arm.links[where[0]].flexible[where[1]]
+        if flexibility.frequencies:
+            path = ("links", where[0], "flexible", where[1], "frequencies")
+            yield flexibility.frequencies, "frequency", path
+    elif q.kind == "damping":
+        values = damping_of(arm.links[where[0]].flexible[where[1]])
+        yield values, dimension, ("links", where[0], "flexible", where[1], "damping")
+    elif q.kind == "payload_mass":
+        yield value, dimension, ("payload", "mass")
+    elif q.kind == "payload_inertia":
+        yield _inertia(arm), dimension, ("payload", "inertia")
+    else:
+        yield value, dimension, ("gauges", where[0], q.kind)
 
 
 def _inertia(arm):
@@ -131,6 +169,16 @@ def _put(data, path, value):
         data[key] = value
     else:
         _add(data, key, value)
+
+
+def _note(data, path, words):
+    """Write a comment behind an entry, in the place of one that is there; not in a mapping on one line."""
+    for key in path[:-1]:
+        if isinstance(data, CommentedMap) and data.fa.flow_style():
+            return
+        data = data[key]
+    if isinstance(data, CommentedMap) and not data.fa.flow_style():
+        data.yaml_add_eol_comment(words, path[-1])
 
 
 def _add(data, key, value):

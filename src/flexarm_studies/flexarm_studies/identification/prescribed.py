@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.kernels.chain import ENGAGEMENT
 from flexarm_dynamics.models import fixed_step, model
 from flexarm_dynamics.models.chain import Chain
 
@@ -27,7 +28,10 @@ from ..recordings.motion import CORNER, low_passed
 
 #: Explicit method of order four: with the highest mode's phase below `PHASE` a step, a strain is off by less than a
 #: tenth of a microstrain on arms like TUDOR (tested).
-METHOD, PHASE = "rk4", 0.5
+METHOD, PHASE = "rk4", 1.2
+#: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
+#: then off by some hundredths of a microstrain rms (tested).
+FLANK_SPEED = 1.5
 #: Modes of arms that the fit tries may be this much faster than the file's [-].
 MARGIN = 1.5
 
@@ -65,7 +69,15 @@ class MotionPredictor:
         self.position, self.velocity, self.acceleration = motion
         self.middle = 0.5 * float(recording.time[-1])
         fastest = MARGIN * float(np.max(driven_frequencies(built, self.position[0]), initial=0.0))
-        self.substeps = max(1, int(np.ceil(fastest * self.period / PHASE)))
+        flanks = FLANK_SPEED / min(
+            (
+                ENGAGEMENT * 0.5 * t.play + t.rounding
+                for j in arm.joints
+                if (t := j.transmission) and t.play
+            ),
+            default=np.inf,
+        )
+        self.substeps = max(1, int(np.ceil(max(fastest / PHASE, flanks) * self.period)))
 
     def states(self, arm, offset=None, samples=None):
         """Amplitudes and rates of the modes at so many `samples`, or all.

@@ -7,10 +7,10 @@ With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `presc
     \min_\theta \sum_k \bigl|L^{-1}(e_k - \rho\,e_{k-1})\bigr|^2, \qquad
     LL^T = \mathrm{Cov}(e_k - \rho\,e_{k-1}),
 
-generalised least squares with an autoregression :math:`\rho` of each gauge and a covariance between the gauges, both
-from the residuals (Ljung, System Identification, 1999, 7.4). What a model leaves is slow where it lacks friction, and
-the same in all gauges where they share a source of noise: without this, the slow part hides the vibration, and noise
-that could be taken off by comparing gauges counts as noise of each.
+beside a wide prior about the file's values: generalised least squares with an autoregression :math:`\rho` of each
+gauge and a covariance between the gauges, both from the residuals (Ljung, System Identification, 1999, 7.4). What a
+model leaves is slow where it lacks friction, and the same in all gauges where they share a source of noise: without
+this, the slow part hides the vibration, and noise that could be taken off by comparing gauges counts as noise of each.
 
 The sum has many minima. The fit begins at several points, the first one the arm file's: at each, gains and biases
 follow by linear regression, then delays, offsets and drifts are held for the first steps; the best one goes on
@@ -53,10 +53,14 @@ STARTS, RANGE = 6, (0.6, 1.7)
 #: Kinds that a start varies; kinds that stay as they are for its first steps.
 VARIED = ("EI", "transmission_stiffness", "transmission_play")
 LATER = ("offset", "delay", "drift", "hub_inertia")
+#: Each start is fitted to the first samples, this fraction of all, at least so many seconds of them.
+START_PART, START_SECONDS = 0.35, 10.0
 #: Evaluations of a start, and of each pass with new weights.
 START_STEPS, PASS_STEPS, PASSES = 12, 12, 4
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-4
+#: Deviation of the prior about the file's value, in scales: what strains hardly tell stays near it [-].
+PRIOR = 1.0
 #: What takes part in a combination: this fraction of the singular vector [-].
 INVOLVED = 0.1
 #: Smallest noise [-].
@@ -179,7 +183,7 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
         if state is not None:
             state.keep_start(missing[i], cost, values)
     best = min(kept, key=lambda k: kept[k][0])
-    if not kept[best][0] < 0.1 * LOST**2 * problem.used:
+    if not kept[best][0] < 0.1 * LOST**2 * START_PART * problem.used:
         raise FlexarmError(
             "can't follow the motion from any start", field=arm.name,
             hint="correct masses and stiffnesses in the arm file",
@@ -193,7 +197,11 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
 
 def fit_start(arm, recording, options, number):
     """Fit from one start: sum of squares, which compares between starts, and values (p,)."""
-    problem = StrainProblem(arm, recording, options)
+    part = max(
+        START_PART * (len(recording.position) - options.lead), START_SECONDS / recording.period
+    )
+    found = strain_quantities(arm, recording)
+    problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found)
     problem.begin(number)
     problem.solve(START_STEPS, 1e-3, LATER)
     return problem.cost, problem.values
@@ -207,14 +215,17 @@ class StrainProblem:
     arm : Arm
     recording : Recording
     options : Options
+    found : list of Quantity, optional
+        Those of `strain_quantities` if not given.
     """
 
-    def __init__(self, arm, recording, options):
+    def __init__(self, arm, recording, options, found=None):
         if not arm.gauges:
             raise FlexarmError("has no gauges", field=arm.name, hint="strains are fitted: add them")
         self.options, self.recording = options, recording
         self.predictor = MotionPredictor(arm, recording, options.corner)
-        self.setup, self.found = Setup.of(arm), strain_quantities(arm, recording)
+        self.setup = Setup.of(arm)
+        self.found = strain_quantities(arm, recording) if found is None else found
         self.scale = np.array([q.scale for q in self.found])
         self.low = np.array([q.low for q in self.found])
         self.file = np.array([value_of(self.setup, q) for q in self.found])
@@ -335,15 +346,18 @@ class StrainProblem:
             values[which] = x * self.scale[which]
             return values
 
+        middle = self.file[which] / self.scale[which]
+
         def residuals(x):
-            r = self.residuals(full(x)).ravel()
+            r = np.concatenate([self.residuals(full(x)).ravel(), (x - middle) / PRIOR])
             self.best = min(getattr(self, "best", (np.inf, None)), (float(r @ r), full(x)), key=_of)
             return r
 
         def jacobian(x):
             if keep is not None:  # once a step
                 keep(*self.best)
-            return self.jacobian(full(x), which).reshape(-1, which.size)
+            J = self.jacobian(full(x), which).reshape(-1, which.size)
+            return np.vstack([J, np.eye(which.size) / PRIOR])
 
         self.best = (np.inf, None)
         least_squares(

@@ -27,7 +27,7 @@ ALIKE = 0.5
 def summary(recording):
     """All that is found in a `recording`, ready for JSON: numbers in SI, None for what is not known."""
     parts = rest.stretches(recording)
-    quiet, rings = _quiet_and_rings(recording, parts)
+    quiet, rings = quiet_and_rings(recording, parts)
     slowest = min((r.frequency for r in rings), default=None)
     return {
         **_times(recording),
@@ -57,8 +57,20 @@ def channels(recording):
                 yield quantity, name, column
 
 
-def _quiet_and_rings(recording, parts):
-    """The longest rest in which nothing rings, and the ring-downs in the others."""
+def quiet_and_rings(recording, parts):
+    """The longest rest of a `recording` in which nothing rings (None: there is none), and the ring-downs in the others.
+
+    Parameters
+    ----------
+    recording : Recording
+    parts : list of slice
+        Of `rest.stretches`.
+
+    Returns
+    -------
+    quiet : Noise or None
+    rings : list of RingDown
+    """
     rings = []
     for part in sorted(parts, key=lambda p: p.stop - p.start, reverse=True):
         found = rest.noise(recording, part)

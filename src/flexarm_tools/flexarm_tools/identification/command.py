@@ -16,6 +16,7 @@ from flexarm_studies.progress import Progress
 from flexarm_studies.recordings import mapping as mappings
 
 from . import recording as recordings
+from . import strains
 
 UNDETERMINED = 0.5
 
@@ -25,7 +26,8 @@ def add_arguments(parser):
     parser.description = (
         "Fits the arm file's model to a bag or CSV file: stiffness, damping, inertias, "
         "payload, friction, gauges, each with its 95 % interval; writes an arm file with "
-        "them."
+        "them. Of a recording without torque the joints are moved as recorded and the strains fitted: "
+        "transmissions with play, stiffness, damping, masses, gauges."
     )
     parser.epilog = (
         "example: flexarm identify results/sweep my_arm.yaml --out identified.yaml --plot fit.png"
@@ -54,6 +56,7 @@ def add_arguments(parser):
         help=f"half-interval, of the value, beyond which the file's value is kept ({UNDETERMINED:g})",
     )
     add("--json", action="store_true", help="print JSON")
+    strains.add_arguments(parser)
 
 
 def identify(options):
@@ -83,7 +86,8 @@ def identify(options):
         measured = recordings.read(
             options.recording, arm, mappings.of_options(options), options.namespace
         )
-    measured.need_torque()
+    if strains.asked(options) or not np.isfinite(measured.torque).any():
+        return without_torque(options, arm, measured, progress, out)
     progress.step(f"fit {arm.name} to {len(measured.position)} samples")
     found = fit(arm, measured, options.hold, options.undetermined)
     progress.done()
@@ -98,6 +102,29 @@ def identify(options):
         print(json.dumps(result, allow_nan=False))
     else:
         print("\n".join(text_of(result)))
+        for warning in result["warnings"]:
+            print(f"flexarm identify: {warning}", file=sys.stderr)
+    return result
+
+
+def without_torque(options, arm, measured, progress, out):
+    """Fit the strains alone; the result as plain data."""
+    found, result, (run, predicted) = strains.identify(options, arm, measured, progress)
+    progress.done()
+    if out:
+        text = strains.arm_text(options.arm)
+        head, notes = strains.heading(result), strains.origins(result)
+        out.write_text(rewritten(text, strains.for_file(found), head, notes), encoding="utf-8")
+        result["out"] = str(out)
+    if options.plot:
+        result["plot"] = strains.draw(found, run, predicted, result, options.plot)
+    if options.json:
+        print(json.dumps(result, allow_nan=False))
+    else:
+        print("\n".join(strains.text_of(result, _line)))
+        for key in ("out", "plot"):
+            if key in result:
+                print(f"{key}: {result[key]}")
         for warning in result["warnings"]:
             print(f"flexarm identify: {warning}", file=sys.stderr)
     return result

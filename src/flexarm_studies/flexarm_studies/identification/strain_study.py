@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm identified without torque from one part of a recording, and scored on another."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+
+from ..recordings import rest
+from ..recordings.summary import quiet_and_rings
+from . import scores
+from .prescribed import MotionPredictor
+from .strain_fit import Options, identify_strains, predict
+
+#: Where joints move at the beginning of the fitted part, the prediction begins so much before it [s].
+LEAD = 10.0
+
+
+@dataclass(frozen=True)
+class Study:
+    """What to fit and what to score.
+
+    Attributes
+    ----------
+    fit, score : tuple of float, or None
+        Beginning and end, as the recording counts the time [s]; None: all of it, and nothing but the fitted part.
+    above : float
+        Frequency above which scores are given beside those of everything [Hz].
+    """
+
+    fit: tuple | None = None
+    score: tuple | None = None
+    above: float = 1.0
+
+
+def whole_of(recording):
+    """Beginning and end of a recording [s]."""
+    return recording.start, recording.start + recording.period * len(recording.position)
+
+
+def study(arm, recording, wanted, options=None, other=None, **fitting):
+    """Identify an arm from the strains of a part of a recording, and score it on another.
+
+    Parameters
+    ----------
+    arm : Arm
+    recording : Recording
+        With the arm's joints and gauges.
+    wanted : Study
+    options : Options, optional
+        Its `lead` is set here.
+    other : Recording, optional
+        What is scored, if not the same; its biases are taken anew where it rests.
+    fitting
+        As for `identify_strains`.
+
+    Returns
+    -------
+    found : StrainFit
+    result : dict
+        Plain data: ``parts``, ``gauges``, ``ring_downs``.
+    run : tuple
+        Recording, measured and predicted strains (s, g), from the beginning to the end of all that was predicted.
+    """
+    fit = wanted.fit or whole_of(recording)
+    score = wanted.score or (None if other is None else whole_of(other))
+    spans = [fit] if other is not None or score is None else [fit, score]
+    begin = _begin(recording, min(a for a, _ in spans))
+    run = recording.between(begin, max(b for _, b in spans))
+    row = lambda t: round((t - run.start) / recording.period)  # noqa: E731
+    fitted = slice(max(row(fit[0]), 0), min(row(fit[1]), len(run.position)))
+    options = replace(options or Options(), lead=fitted.start)
+    found = identify_strains(arm, run.part(fitted.stop), options, **fitting)
+    middle = 0.5 * (fitted.stop - 1) * run.period
+    predicted = predict(found, run, options, middle)
+    parts = {"fit": _scored(found, recording, run, predicted, fitted, fitted, wanted, options)}
+    if other is None and score is not None:
+        scored = slice(max(row(score[0]), 0), min(row(score[1]), len(run.position)))
+        parts["score"] = _scored(found, recording, run, predicted, scored, fitted, wanted, options)
+    elif other is not None:
+        parts["score"] = _other(found, other, score, wanted, options)
+    noise = _noise(recording, found)
+    rings = scores.ring_downs(run, predicted, noise)
+    result = {
+        "fit_s": fit,
+        "score_s": score,
+        "parts": parts,
+        "ring_downs": [_ring(run, *r) for r in rings],
+    }
+    return found, result, (run, predicted)
+
+
+def _begin(recording, start):
+    """Where the prediction begins: at the `start` [s] if the joints stand there, else at rest before it."""
+    still = rest.still(recording)
+    row = min(max(round((start - recording.start) / recording.period), 0), len(still) - 1)
+    before = max(row - round(LEAD / recording.period), 0)
+    standing = np.flatnonzero(still[before : row + 1])
+    return recording.start + recording.period * (before + (standing[-1] if standing.size else 0))
+
+
+def _noise(recording, found):
+    quiet, _ = quiet_and_rings(recording, rest.stretches(recording))
+    return found.noise if quiet is None else quiet.rms
+
+
+def _scored(found, recording, run, predicted, part, fitted, wanted, options):
+    """Scores of the model and of what needs none on a `part` of a run, as plain data."""
+    if part.stop - part.start < 20:
+        raise FlexarmError(
+            "has too few samples", field="scored part", value=part.stop - part.start, limit=20
+        )
+    predictor = MotionPredictor(found.setup.arm, run, options.corner)
+    motion = predictor.position, predictor.velocity, predictor.acceleration
+    made = {"model": predicted}
+    sizes = {}
+    for name, (values, size) in scores.baselines(motion, run.strain, fitted).items():
+        made[name], sizes[name] = values, size
+    return _table(found, recording, run, made, sizes, part, wanted.above)
+
+
+def _other(found, other, score, wanted, options):
+    """Scores on another recording, with the biases of its longest rest."""
+    predicted = predict(found, other, options)
+    rests = sorted(rest.stretches(other), key=lambda p: p.stop - p.start)
+    if rests:
+        predicted = predicted + np.nanmean((other.strain - predicted)[rests[-1]], axis=0)
+    rows = np.round((np.array(score) - other.start) / other.period).astype(int)
+    part = slice(max(int(rows[0]), 0), min(int(rows[1]), len(other.position)))
+    return _table(found, other, other, {"model": predicted}, {}, part, wanted.above)
+
+
+def _table(found, recording, run, made, sizes, part, above):
+    names = found.arm.gauge_names
+    rows = {name: {} for name in names}
+    for what, values in made.items():
+        score = scores.explained(run.strain, values, part, run.period, above)
+        for c, name in enumerate(names):
+            rows[name][what] = {key: _number(value[c]) for key, value in score.items()}
+            if what in sizes:
+                rows[name][what]["coefficients"] = sizes[what]
+    best = scores.ceiling(recording, run.strain, part, above)
+    for c, name in enumerate(names):
+        memory, bound = scores.whiteness((run.strain - made["model"])[part, c])
+        rows[name]["residual_correlation"] = {"value": _number(memory), "white_within": bound}
+        rows[name]["ceiling"] = (
+            None if best is None else {k: _number(v[c]) for k, v in best.items()}
+        )
+    return rows
+
+
+def _number(value):
+    return float(value) if np.isfinite(value) else None
+
+
+def _ring(run, measured, modelled):
+    return {
+        "from_s": run.start + run.period * measured.part.start,
+        "to_s": run.start + run.period * measured.part.stop,
+        "gauge": run.gauge_names[measured.gauge] if run.gauge_names else str(measured.gauge),
+        "amplitude": measured.amplitude,
+        **{
+            f"{who}_{what}": _number(getattr(ring, what))
+            for who, ring in (("measured", measured), ("modelled", modelled))
+            for what in ("frequency", "damping")
+        },
+        "frequency_width": _number(measured.frequency_width),
+        "damping_width": _number(measured.damping_width),
+    }

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`flexarm identify` without torque: what is fitted, what is scored, what is written, and going on where it stopped."""
+
+import json
+
+import numpy as np
+import pytest
+
+from flexarm_dynamics.arm import arm_file
+
+ARM = """
+name: geared
+gravity: [0.0, -9.81, 0.0]
+joints:
+- name: shoulder
+  axis: [0, 0, 1]
+  hub_inertia: 0.03            # assumed
+  rotor_inertia: 1.0e-4
+  gear_ratio: 50.0
+  transmission:
+    stiffness: 700.0           # a guess
+    damping: 2.0
+    play: 0.010
+links:
+- name: beam
+  length: 0.6
+  mass_per_length: 0.4
+  EI_y: {EI}                   # a guess
+  flexible: {{y: {{modes: 1, shape: loaded, damping: [0.01]}}}}
+payload: {{mass: 1.0}}
+gauges:
+- {{name: root, link: beam, position: 0.05, direction: y, surface_distance: 0.003}}
+- {{name: middle, link: beam, position: 0.3, direction: y, surface_distance: 0.003}}
+"""
+MAPPING = """
+columns:
+- {column: t, quantity: time, unit: s}
+- {column: shoulder, quantity: position, joint: shoulder, unit: rad}
+- {column: root, quantity: strain, gauge: root, unit: microstrain}
+- {column: middle, quantity: strain, gauge: middle, unit: microstrain}
+"""
+HOLD = ("--hold", "payload.mass", "joints[0].hub_inertia", "--starts", 1, "--workers", 1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Arm file, mapping and recording: 12 s at 100 Hz of an arm that is softer than its file."""
+    from flexarm_studies.identification import recording as recordings
+    from flexarm_studies.identification.prescribed import MotionPredictor
+
+    folder = tmp_path_factory.mktemp("strains")
+    time = np.arange(0.0, 12.0, 0.01)
+    position = np.full(time.size, 0.4)
+    for at, size in ((1.0, 1.2), (3.0, 1.0), (5.0, -1.4), (7.0, 0.9), (9.5, -0.8)):
+        s = np.clip((time - at) / 0.6, 0.0, 1.0)
+        position += size * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    arm = arm_file.parse(ARM.format(EI=24.0))
+    recording = recordings.uniform(
+        time, {"position": position[:, None], "strain": np.zeros((time.size, 2))}, joint_names=("shoulder",)
+    )  # fmt: skip
+    predictor = MotionPredictor(arm, recording)
+    strain = predictor.strains(arm, *predictor.states(arm))
+    strain = 1e6 * strain + np.random.default_rng(1).normal(0.0, 0.5, strain.shape)
+    rows = np.column_stack([time, position, strain])
+    np.savetxt(
+        folder / "run.csv", rows, delimiter=",", header="t,shoulder,root,middle", comments=""
+    )
+    (folder / "arm.yaml").write_text(ARM.format(EI=30.0))
+    (folder / "mapping.yaml").write_text(MAPPING)
+    return folder
+
+
+@pytest.fixture
+def identify(flexarm, folder):
+    def run(*words):
+        return flexarm(
+            "identify", folder / "run.csv", folder / "arm.yaml", "--mapping", folder / "mapping.yaml", *words
+        )  # fmt: skip
+
+    return run
+
+
+def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(identify, folder):
+    out, plot = folder / "out.yaml", folder / "fit.png"
+    code, printed, err = identify(
+        *HOLD, "--fit", "0:8", "--score", "8:12", "--json", "--out", out, "--plot", plot,
+    )  # fmt: skip
+    assert code == 0, err
+    result = json.loads(printed)
+    for row in result["parts"]["score"].values():
+        assert row["model"]["vaf"] > 99.5 and row["model"]["vaf"] > row["rigid"]["vaf"] + 1.0
+        assert row["ceiling"]["vaf"] > row["model"]["vaf"] - 0.5
+        assert row["quasi-static"]["coefficients"] == 3
+    rows = {row["name"]: row for row in result["parameters"]}
+    stiffness = rows["links[0].EI_y"]
+    assert abs(stiffness["value"] - 24.0) < 2.0 * stiffness["half_width"] < 2.0
+    assert rows["payload.mass"]["kept"] == "held" and rows["payload.mass"]["half_width"] is None
+    assert result["ring_downs"]
+    for ring in result["ring_downs"]:
+        assert ring["modelled_frequency"] == pytest.approx(ring["measured_frequency"], rel=0.02)
+    text, made = out.read_text(), arm_file.load(out)
+    assert made.links[0].stiffness["y"] == pytest.approx(stiffness["value"], rel=1e-5)
+    line = next(line for line in text.splitlines() if "EI_y:" in line and "#" in line)
+    assert "identified: +- " in line and "a guess" not in line
+    assert "hub_inertia: 0.03            # assumed" in text
+    assert "root delay" in text and plot.stat().st_size > 10_000
+
+
+def test_without_parts_all_is_fitted_and_printed_for_people(identify):
+    code, printed, err = identify(*HOLD)
+    assert code == 0, err
+    assert "links[0].EI_y" in printed and "quasi-static" in printed and "ring-down" in printed
+    assert "score 8 to" not in printed and "the strains do not tell apart" in printed
+    assert "start 1 of 1" in err and "pass 1 of" in err
+
+
+def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(identify, folder):
+    state = folder / "state.json"
+    code, first, err = identify(*HOLD, "--fit", "0:5", "--state", state, "--json")
+    assert code == 0 and "start 1 of 1" in err, err
+    code, second, err = identify(*HOLD, "--fit", "0:5", "--state", state, "--json")
+    assert code == 0 and "start" not in err, err
+    values = [[row["value"] for row in json.loads(text)["parameters"]] for text in (first, second)]
+    np.testing.assert_allclose(*values, rtol=1e-9)
+    code, _, err = identify(*HOLD, "--fit", "0:6", "--state", state)
+    assert code != 0 and "another arm, recording or options" in err
+    state.write_text("{}")
+    code, _, err = identify(*HOLD, "--fit", "0:5", "--state", state)
+    assert code != 0 and "is no state of a fit" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--fit", "8"), "FROM:TO in seconds"),
+        (("--fit", "9:8"), "FROM:TO in seconds"),
+        (("--fit", "90:95"), "samples"),
+        (("--above", "60"), "half of the rate"),
+        (("--starts", "0"), "--starts"),
+        (("--free", "links[7].EI_y"), "matches no parameter"),
+    ],
+)
+def test_options_out_of_range_are_refused(identify, words, message):
+    code, _, err = identify(*words)
+    assert code != 0 and message in err
+
+
+def test_another_file_is_scored_with_its_own_bias(identify, folder):
+    rows = np.genfromtxt(folder / "run.csv", delimiter=",", skip_header=1)
+    rows[:, 2:] += 40.0
+    other = folder / "other.csv"
+    np.savetxt(other, rows, delimiter=",", header="t,shoulder,root,middle", comments="")
+    code, printed, err = identify(*HOLD, "--fit", "0:8", "--score-file", other, "--json")
+    assert code == 0, err
+    for row in json.loads(printed)["parts"]["score"].values():
+        assert row["model"]["vaf"] > 99.5 and row["model"]["rms"] < 2e-6
