@@ -16,6 +16,7 @@ from flexarm_dynamics.models import model
 from flexarm_sim.integrators import METHODS, substeps
 
 from .. import tables
+from ..identification.prescribed import prescribed_torque
 from ..identification.recording import read_csv
 from ..progress import Progress
 from ..recordings import mapping as mappings
@@ -246,21 +247,6 @@ def _prescribed(chain, motion, times, options):
         # The joints are where the table says, not where rounding took them.
         state[:n], state[n + m : 2 * n + m], acceleration = motion(t)
         yield state, prescribed_torque(chain, state, acceleration)
-
-
-def prescribed_torque(chain, state, acceleration):
-    """Torque under which the joints have an acceleration, the modes moving freely, shape (n,) [N m]."""
-    n, m = chain.n_joints, chain.n_modes
-    q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
-    M = chain.mass_matrix(q, delta)
-    forces = chain.forces(q, qd, delta, delta_d)
-    modal = np.linalg.solve(M[n:, n:], -forces[n:] - M[n:, :n] @ acceleration)
-    return (
-        M[:n, :n] @ acceleration
-        + M[:n, n:] @ modal
-        + forces[:n]
-        + chain.friction(qd, delta, delta_d)
-    )
 
 
 def column_names(chain):

@@ -29,11 +29,14 @@ from ..recordings.motion import CORNER, low_passed
 #: Explicit method of order four: with the highest mode's phase below `PHASE` a step, a strain is off by less than a
 #: tenth of a microstrain on arms like TUDOR (tested).
 METHOD, PHASE = "rk4", 1.2
+#: Largest product of a step and the rate of what is damped so strongly that it does not ring: the method is stable up
+#: to 2.8.
+STABLE = 2.7
 #: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
 #: then off by some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
 #: Modes of arms that the fit tries may be this much faster than the file's [-].
-MARGIN = 1.5
+MARGIN = 1.4
 
 
 class MotionPredictor:
@@ -68,7 +71,8 @@ class MotionPredictor:
         motion = (np.ascontiguousarray(spline(recording.time, k)) for k in range(3))
         self.position, self.velocity, self.acceleration = motion
         self.middle = 0.5 * float(recording.time[-1])
-        fastest = MARGIN * float(np.max(driven_frequencies(built, self.position[0]), initial=0.0))
+        phase = MARGIN * float(np.max(driven_frequencies(built, self.position[0]), initial=0.0))
+        stiff = MARGIN * fastest_rate(built, self.position[0])
         flanks = FLANK_SPEED / min(
             (
                 ENGAGEMENT * 0.5 * t.play + t.rounding
@@ -77,7 +81,9 @@ class MotionPredictor:
             ),
             default=np.inf,
         )
-        self.substeps = max(1, int(np.ceil(max(fastest / PHASE, flanks) * self.period)))
+        self.substeps = max(
+            1, int(np.ceil(max(phase / PHASE, stiff / STABLE, flanks) * self.period))
+        )
 
     def states(self, arm, offset=None, samples=None):
         """Amplitudes and rates of the modes at so many `samples`, or all.
@@ -156,6 +162,32 @@ def shifted(values, slopes, delay, period):
     )  # fmt: skip
 
 
+def fastest_rate(built, position):
+    """Largest rate of what moves while the motors are held, damped or not [1/s]: size of the poles, play closed.
+
+    Parameters
+    ----------
+    built : Chain
+    position : ndarray, shape (n,)
+        [rad]
+    """
+    n, m, arm = built.n_joints, built.n_modes, built.arm
+    if not m:
+        return 0.0
+    M = built.mass_matrix(np.asarray(position, float))[n:, n:]
+    K, C = built.stiffness_matrix(), built.terms(position, np.zeros(n)).C2.copy()
+    rest = built.static_deflection(position)
+    for joint in arm.joints:
+        if (t := joint.transmission) is not None:
+            j = arm.mode_names.index(f"{joint.name}_transmission")
+            load = t.load_damping * t.stiffness * abs(rest[j])
+            C[j, j] += max(t.play_damping - t.damping, 0.0) + load
+    A = np.zeros((2 * m, 2 * m))
+    A[:m, m:] = np.eye(m)
+    A[m:, :m], A[m:, m:] = -np.linalg.solve(M, K), -np.linalg.solve(M, C)
+    return float(np.abs(np.linalg.eigvals(A)).max())
+
+
 def driven_frequencies(built, position, delta=None):
     """Angular frequencies of links and transmissions while the motors are held, ascending [rad/s]; play closed.
 
@@ -174,6 +206,29 @@ def driven_frequencies(built, position, delta=None):
         return np.zeros(0)
     M = built.mass_matrix(np.asarray(position, float), delta)[n:, n:]
     return np.sqrt(np.maximum(eigh(built.stiffness_matrix(), M, eigvals_only=True), 0.0))
+
+
+def prescribed_torque(chain, state, acceleration):
+    """Torque under which the joints have an acceleration, the modes moving freely, shape (n,) [N m].
+
+    Parameters
+    ----------
+    chain : Chain
+    state : ndarray, shape (2 (n + m),)
+    acceleration : ndarray, shape (n,)
+        Of the joints [rad/s^2].
+    """
+    n, m = chain.n_joints, chain.n_modes
+    q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
+    M = chain.mass_matrix(q, delta)
+    forces = chain.forces(q, qd, delta, delta_d)
+    modal = np.linalg.solve(M[n:, n:], -forces[n:] - M[n:, :n] @ acceleration)
+    return (
+        M[:n, :n] @ acceleration
+        + M[:n, n:] @ modal
+        + forces[:n]
+        + chain.friction(qd, delta, delta_d)
+    )
 
 
 def _chain(arm):

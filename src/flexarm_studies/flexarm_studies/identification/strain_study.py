@@ -10,6 +10,7 @@ from flexarm_dynamics.errors import FlexarmError
 from ..recordings import rest
 from ..recordings.summary import quiet_and_rings
 from . import scores
+from .currents import motor_fits
 from .prescribed import MotionPredictor
 from .strain_fit import Options, identify_strains, predict
 
@@ -59,7 +60,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     -------
     found : StrainFit
     result : dict
-        Plain data: ``parts``, ``gauges``, ``ring_downs``.
+        Plain data: ``parts`` with scores by gauge, ``ring_downs``, ``currents``.
     run : tuple
         Recording, measured and predicted strains (s, g), from the beginning to the end of all that was predicted.
     """
@@ -82,10 +83,13 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
         parts["score"] = _other(found, other, score, wanted, options)
     noise = _noise(recording, found)
     rings = scores.ring_downs(run, predicted, noise)
+    last = scored if other is None and score is not None else fitted
+    motors = motor_fits(found, run, fitted, last, options.corner)
     result = {
         "fit_s": fit,
         "score_s": score,
         "parts": parts,
+        "currents": [_motor(m) for m in motors],
         "ring_downs": [_ring(run, *r) for r in rings],
     }
     return found, result, (run, predicted)
@@ -152,6 +156,23 @@ def _table(found, recording, run, made, sizes, part, above):
 
 def _number(value):
     return float(value) if np.isfinite(value) else None
+
+
+def _motor(made):
+    pairs = {
+        "torque_constant": made.constant, "viscous": made.viscous, "coulomb": made.coulomb,
+        "inertia": made.inertia,
+    }  # fmt: skip
+    return {
+        "joint": made.joint,
+        **{
+            name: {"value": _number(value), "half_width": _number(width)}
+            for name, (value, width) in pairs.items()
+        },
+        "left_of_fitted": _number(made.left),
+        "left_of_scored": _number(made.left_of_scored),
+        "explained": made.explained,
+    }
 
 
 def _ring(run, measured, modelled):

@@ -58,7 +58,7 @@ def drift_and_delay(recording, vibration=None):
             continue
         rate = derivative(low_passed(strain[:, None], period, CORNER), period)
         slow = low_passed(np.hstack([regressors, line, rate, strain[:, None]]), period, corner)
-        value, width = _regression(slow[:, :-1], slow[:, -1], int(1.5 / corner / period))
+        value, width = regression(slow[:, :-1], slow[:, -1], int(1.5 / corner / period))
         out[:, i] = value[-2], width[-2], -value[-1], width[-1]
     return out
 
@@ -78,8 +78,20 @@ def _rigid(recording):
     return np.column_stack([p * m for m in motions for p in products])
 
 
-def _regression(X, y, lags):
-    """Least squares: coefficients, and halves of their 95 % intervals with residuals correlated over so many lags."""
+def regression(X, y, lags):
+    """Least squares: coefficients, and halves of their 95 % intervals with residuals correlated over so many lags.
+
+    Parameters
+    ----------
+    X : ndarray, shape (s, p)
+        Regressors.
+    y : ndarray, shape (s,)
+    lags : int
+
+    Returns
+    -------
+    value, width : ndarray, shape (p,)
+    """
     inverse = np.linalg.pinv(X, rcond=1e-9)
     value = inverse @ y
     scores = inverse * (y - X @ value)

@@ -207,6 +207,16 @@ def text_of(result, line):
             f"{name} {row['residual_correlation']['value']:.2f}" for name, row in gauges.items()
         )
         yield f"correlation of the residuals from one sample to the next (0: white): {white}"
+    for motor in result["currents"]:
+        if not motor["explained"]:
+            yield f"current of {motor['joint']}: the model's torque and friction don't explain it"
+            continue
+        constant, viscous, coulomb = (motor[k] for k in ("torque_constant", "viscous", "coulomb"))
+        yield (
+            f"current of {motor['joint']}: {_pair(constant)} N m/A, friction {_pair(viscous)} N m s/rad and"
+            f" {_pair(coulomb)} N m; {motor['left_of_fitted']:.3f} of it is left where fitted,"
+            f" {motor['left_of_scored']:.3f} where scored"
+        )
     if result["ring_downs"]:
         yield ""
         yield f"{'ring-down [s]':18}{'gauge':10}{'measured [Hz], damping':>26}{'modelled':>20}"
@@ -216,6 +226,10 @@ def text_of(result, line):
             f"{ring['measured_frequency']:14.3f} {ring['measured_damping']:11.4f}"
             f"{ring['modelled_frequency'] or np.nan:12.3f} {ring['modelled_damping'] or np.nan:7.4f}"
         )
+
+
+def _pair(row):
+    return f"{row['value']:.4g} +- {row['half_width']:.2g}"
 
 
 def _cell(score):
@@ -272,7 +286,7 @@ def for_file(found):
 def draw(found, run, predicted, result, path):
     """Draw measured, predicted and residual strains; the path.
 
-    `run` is the recording of the prediction, `predicted` (s, g) and `result` are of `identify`.
+    `run` is the recording of the prediction; `found`, `predicted` (s, g) and `result` are of `identify`.
     """
     from flexarm_studies.commands.options import check_file
     from flexarm_studies.plotting import plt, save

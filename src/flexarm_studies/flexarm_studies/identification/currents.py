@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Motor currents beside the torque that the motion takes: torque constant and friction of each joint.
+
+With the torque :math:`\tau` of the model whose joints move as recorded,
+
+.. math::
+    K\,I = \tau + J\ddot q + f_v\dot q + f_c\tanh(\dot q/v_0) + b,
+
+linear in 1/K, J/K, f_v/K, f_c/K and b/K: a regression on the fitted part. K is the torque per ampere at the joint,
+in the scale of masses that the arm file has; J is what the rotor's inertia in the file lacks. How much
+of the current is left is the normalised residual sum of squares :math:`\sum(I - \hat I)^2/\sum(I - \bar I)^2`; 0:
+nothing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..recordings.trends import regression
+from .prescribed import MotionPredictor, prescribed_torque
+
+#: Lags of the residuals' correlation in the intervals [s].
+CORRELATED = 0.5
+#: A joint is explained if no more than this is left of its current [-].
+EXPLAINED = 0.5
+
+
+@dataclass(frozen=True)
+class MotorFit:
+    """Current of one joint's motor, explained.
+
+    Attributes
+    ----------
+    joint : str
+    constant, viscous, coulomb, inertia : tuple of float
+        Value and half of its 95 % interval: torque per ampere [N m/A], friction [N m s/rad], [N m], inertia beside the
+        file's [kg m^2].
+    left, left_of_scored : float
+        Normalised residual sum of squares of the fitted and of the scored part [-].
+    """
+
+    joint: str
+    constant: tuple
+    viscous: tuple
+    coulomb: tuple
+    inertia: tuple
+    left: float
+    left_of_scored: float
+
+    @property
+    def explained(self):
+        """Whether the model explains the current, so that friction and constant mean something."""
+        return self.constant[0] > 0.0 and self.left < EXPLAINED
+
+
+def torques(arm, run, corner, offset=None):
+    """Torque of each motor without friction under the recorded motion, shape (s, n) [N m], and the predictor.
+
+    Parameters
+    ----------
+    arm : Arm
+    run : Recording
+        It begins at rest.
+    corner : float
+        Of the low pass of the joint angles [Hz].
+    offset : ndarray, shape (n,), optional
+        Added to the measured angles [rad].
+    """
+    predictor = MotionPredictor(arm, run, corner)
+    delta, rate, built = predictor.states(arm, offset)
+    position = predictor.position + (0.0 if offset is None else offset)
+    states = np.hstack([position, delta, predictor.velocity, rate])
+    friction = np.array([built.friction(v) for v in predictor.velocity])
+    found = np.array(
+        [
+            prescribed_torque(built, s, a)
+            for s, a in zip(states, predictor.acceleration, strict=True)
+        ]
+    )
+    return found - friction, predictor
+
+
+def motor_fits(found, run, fitted, scored, corner):
+    """A `MotorFit` of each joint whose current was recorded.
+
+    Parameters
+    ----------
+    found : StrainFit
+    run : Recording
+    fitted, scored : slice
+        Samples.
+    corner : float
+        Of the low pass of the joint angles [Hz].
+    """
+    if run.current is None:
+        return []
+    arm = found.setup.arm
+    torque, predictor = torques(arm, run, corner, found.setup.offset)
+    made = []
+    for j, joint in enumerate(arm.joints):
+        current, speed = run.current[:, j], predictor.velocity[:, j]
+        if not np.isfinite(current).all():
+            continue
+        X = np.column_stack(
+            [
+                torque[:, j], predictor.acceleration[:, j], speed,
+                np.tanh(speed / joint.friction.smoothing), np.ones(len(speed)),
+            ]
+        )  # fmt: skip
+        lags = int(CORRELATED / run.period)
+        value, width = regression(X[fitted], current[fitted], lags)
+        predicted = X @ value
+        made.append(_made(joint.name, value, width, current, predicted, fitted, scored))
+    return made
+
+
+def _made(name, value, width, current, predicted, fitted, scored):
+    """A `MotorFit` from the regression's coefficients: inertia and friction are ratios to the first one."""
+    left = [
+        float(
+            np.sum((current - predicted)[p] ** 2)
+            / max(np.sum((current[p] - current[p].mean()) ** 2), 1e-300)
+        )
+        for p in (fitted, scored)
+    ]
+    a, wide = value[0], width[0] / max(abs(value[0]), 1e-300)
+    ratio = lambda k: (float(value[k] / a), float(np.hypot(width[k] / a, value[k] / a * wide)))  # noqa: E731
+    return MotorFit(
+        name, (float(1.0 / a), float(wide / abs(a))), ratio(2), ratio(3), ratio(1), *left
+    )
