@@ -867,6 +867,35 @@ LIMITS = [
             "        if False:\n",
         ),
     ),
+    *of(
+        "flexarm_dynamics",
+        "models",
+        "flexarm_dynamics/test/test_levels.py",
+        (
+            "levels",
+            "level: lower than its loads need",
+            "    if stiffening > NEGLIGIBLE:\n",
+            "    if stiffening < NEGLIGIBLE:\n",
+        ),
+        (
+            "levels",
+            "level: unknown loads are none",
+            "        return np.inf, np.inf\n",
+            "        return 0.0, 0.0\n",
+        ),
+        (
+            "levels",
+            "level: bending that stiffness would prevent is not counted",
+            "            error += self._unstiffened(q, qd, delta)\n",
+            "            error += 0.0\n",
+        ),
+        (
+            "levels",
+            "level: out of range without a warning",
+            "        if not beyond and np.isfinite(error):\n",
+            "        if np.isfinite(error):\n",
+        ),
+    ),
     *[
         Mutant(
             name,

@@ -6,7 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.errors import ShapeError
+from flexarm_dynamics.models import levels, model
 
 from . import integrators
 
@@ -16,8 +18,9 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
 
     Parameters
     ----------
-    models : ArmModel or sequence of ArmModel
-        One for all, or one each with the same numbers of joints and modes.
+    models : ArmModel or Arm, or sequence of them
+        One for all, or one each with the same numbers of joints and modes. An `Arm` is simulated at the level that
+        its loads need, see `levels.simulated`.
     states : ndarray, shape (b, 2 (n + m))
         Initial (q, delta, qd, delta_d).
     starts, ends : ndarray, shape (s, n) or (b, s, n)
@@ -43,14 +46,21 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
     """
     states = np.atleast_2d(np.asarray(states, float))
     count, size = states.shape
+    if isinstance(models, (list, tuple)):
+        models = [_built(each) for each in models]
+    else:
+        models = _built(models)
     each = list(models) if isinstance(models, (list, tuple)) else [models] * count
     if len(each) != count:
         raise ShapeError("must be one per state", field="models", value=len(each), limit=count)
-    for model in each:
-        if 2 * (model.n_joints + model.n_modes) != size:
-            entries = 2 * (model.n_joints + model.n_modes)
+    for arm_model in each:
+        if 2 * (arm_model.n_joints + arm_model.n_modes) != size:
+            entries = 2 * (arm_model.n_joints + arm_model.n_modes)
             raise ShapeError(
-                f"entries do not fit {model.arm.name}", field="states", value=size, limit=entries
+                f"entries do not fit {arm_model.arm.name}",
+                field="states",
+                value=size,
+                limit=entries,
             )
     first = models[0] if isinstance(models, (list, tuple)) and models else models
     n = getattr(first, "n_joints", 0)
@@ -76,3 +86,8 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
         # Interleaved chunks cost the same whatever the order of the runs.
         list(pool.map(run, [range(k, count, workers) for k in range(workers)]))
     return out
+
+
+def _built(given):
+    """A model as it is, and that of an `Arm` at the level that its loads need."""
+    return model.build(levels.simulated(given)) if isinstance(given, Arm) else given

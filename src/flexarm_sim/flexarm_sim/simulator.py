@@ -17,6 +17,9 @@ from . import integrators
 from .plant import Plant
 from .sensors import Sensors
 
+#: How often the range of the simulated arm's level is checked [s].
+CHECK_PERIOD = 0.01
+
 PARAMETERS = (
     parameter("arm", "", read_only=True).described(
         "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map are this file's."
@@ -29,7 +32,7 @@ PARAMETERS = (
     ),
     parameter("level", levels.AUTO, choices=levels.LEVELS, read_only=True).described(
         "Kinematics of bending of the simulated arm: first_order; stiffening (links keep their length); finite_slope"
-        " (curvature and tips' angles are exact as well); auto: that of its file."
+        " (curvature and tips' angles are exact as well); auto: what its loads need (docs/dynamics.md)."
     ),
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0, read_only=True).described(
         "Control rate: samples per second of simulated time."
@@ -69,6 +72,8 @@ class Simulator:
     ----------
     sequence : int
         Number of the present sample.
+    range : levels.Range
+        Its `warning` states when the simulated arm has left the range of its level.
     stamp_ns : int
         Its time [ns]: sequence times the period, from `START_NS`.
     position, velocity, torque, strain, amplitude, rate : ndarray
@@ -94,7 +99,9 @@ class Simulator:
         gauges = {g.name: g for g in plant_arm.gauges}
         plant_arm = replace(plant_arm, gauges=tuple(gauges[name] for name in arm.gauge_names))
         self.plant_model = model.build(levels.simulated(plant_arm, settings["level"]))
+        self.range = levels.Range(self.plant_model)
         self.period_ns = round(1e9 / settings["rate"])
+        self._samples_per_check = max(1, round(CHECK_PERIOD * settings["rate"]))
         self.plant = Plant(self.plant_model, 1e-9 * self.period_ns, settings["integrator"])
         self.sensors = Sensors(
             self.plant_model, settings["noise"], settings["seed"], 1e-9 * self.period_ns
@@ -143,6 +150,7 @@ class Simulator:
         else:
             self.plant.reset(*motors_at_rest(self.plant_model, position))
         self.sensors.reset()
+        self.range.reset()
         self.sequence, self.stamp_ns = 0, self.START_NS
         self.torque[:] = 0.0
         self._measure()
@@ -167,6 +175,8 @@ class Simulator:
                 self.torque += fraction * np.asarray(torque)
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
+        if self.sequence % self._samples_per_check == 0:
+            self.range.check(self.plant.q, self.plant.qd, self.plant.delta)
         self._measure()
 
     def _measure(self):

@@ -226,6 +226,7 @@ def test_a_state_that_is_not_finite_is_a_model_error_and_a_reset_recovers_it():
 
 @pytest.mark.parametrize("level", levels.LEVELS[1:])
 def test_the_simulated_arm_alone_is_at_the_level_asked_for(level):
-    sim = simulator("two_link", level=level)
+    checked = check_all(PARAMETERS, {"level": level}, {"joints": 2})
+    sim = Simulator(checked | {"arm": "two_link", "plant_arm": ""})
     assert levels.level_of(sim.plant_model.arm) == level
     assert levels.level_of(sim.nominal.arm) == "first_order"  # the control model stays the paper's

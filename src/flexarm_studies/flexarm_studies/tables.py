@@ -143,6 +143,11 @@ class Steps:
     def __init__(self, times, values):
         self.times, self.values = times, values
 
+    @property
+    def largest(self):
+        """Largest size of each value, shape (n,)."""
+        return np.abs(self.values).max(axis=0)
+
     def right_of(self, t):
         """Value just after time t, shape (n,)."""
         return self._at(t, np.searchsorted(self.times, t, "right"))

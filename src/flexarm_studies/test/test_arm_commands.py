@@ -13,10 +13,22 @@ from hypothesis import strategies as st
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.models import levels
 from flexarm_dynamics.models.chain import Chain
 from flexarm_studies import tables
 
 DATA = Path(__file__).resolve().parents[3] / "tests" / "data"
+FALLING = """name: falling
+gravity: [0, -9.81, 0]
+joints:
+- {name: j1, hub_inertia: 0.1}
+- {name: j2, hub_inertia: 0.05, motor_mass: 0.5}
+links:
+- {name: l1, length: 1.0, mass_per_length: 0.6, EI_y: 80.0, flexible: {y: {modes: 3, shape: loaded}}}
+- {name: l2, length: 0.8, mass_per_length: 0.4, EI_y: 40.0, flexible: {y: {modes: 3, shape: loaded}}}
+payload: {mass: 0.3}
+"""
+
 TWO_LINK = """
 name: reference
 joints:
@@ -65,12 +77,10 @@ def two_link(tmp_path):
 @pytest.mark.parametrize(
     ("options", "angle", "tip"),
     [
-        ((), 7.6e-3, 4e-3),
+        (("--modes", "3"), 5e-5, 2e-5),
         (("--foreshortening",), 1e-3, 1e-4),
         (("--finite-slope", "--modes", "3"), 5e-5, 2e-5),
         (("--level", "first_order"), 7.6e-3, 4e-3),
-        (("--level", "stiffening"), 1e-3, 1e-4),
-        (("--level", "finite_slope", "--modes", "3"), 5e-5, 2e-5),
     ],
 )
 def test_a_simulated_table_is_that_of_independent_codes(
@@ -123,7 +133,7 @@ def test_torques_of_a_prescribed_motion_bring_the_motion_about(simulated, table_
         assert np.abs(a[name] - b[name]).max() < 2e-6, name
 
 
-def test_a_link_spun_up_past_its_bending_frequency_returns_to_straight_with_foreshortening(
+def test_a_link_spun_up_past_its_bending_frequency_returns_to_straight(
     flexarm, simulated, table_file, tmp_path
 ):
     first = Chain(arm_file.load("one_link")).frequencies(locked=True)[0]
@@ -132,12 +142,39 @@ def test_a_link_spun_up_past_its_bending_frequency_returns_to_straight_with_fore
     spun_up = s**2 / 2.0 + (np.cos(2.0 * np.pi * s) - 1.0) / (4.0 * np.pi**2)
     motion = table_file("q", t, 3.0 * first * (5.0 * spun_up + np.maximum(t - 5.0, 0.0)))
     words = ("one_link", "--prescribed", motion, "--duration", "7")
-    bent = np.abs(simulated(*words, "--foreshortening")["link1_defl_y"])
-    assert 0.05 < bent.max() < 0.15
-    assert bent[-50:].max() < 1e-3
-    code, _, err = flexarm("simulate", *words, "--out", tmp_path / "none.csv")
-    assert code == 1 and "or --foreshortening where links spin fast" in err
+    for options in ((), ("--foreshortening",)):
+        bent = np.abs(simulated(*words, *options)["link1_defl_y"])
+        assert 0.05 < bent.max() < 0.15
+        assert bent[-50:].max() < 1e-3
+    first_order = ("--level", "first_order", "--out", tmp_path / "none.csv")
+    code, _, err = flexarm("simulate", *words, *first_order)
+    assert code == 1 and "take level finite_slope" in err
+    assert (
+        err.count("level first_order of one_link leaves out some") == 2
+    )  # when it does, and in the end
     assert not (tmp_path / "none.csv").exists()
+
+
+def test_a_falling_arm_is_simulated_as_it_falls_and_first_order_reports_what_it_leaves_out(
+    flexarm, tmp_path
+):
+    """Two links under gravity alone: by default as at the finest level; first order names its error."""
+    path = tmp_path / "falling.yaml"
+    path.write_text(FALLING)
+    found = {}
+    for level in ("auto", "first_order", "stiffening", "finite_slope"):
+        words = ("--level", level, "--duration", "2", "--json", "--out", tmp_path / f"{level}.csv")
+        code, out, _ = flexarm("simulate", path, *words)
+        found[level] = json.loads(out)
+        assert code == 0
+    tip = {k: np.array([d["last"][f"tip_{axis}"] for axis in "xy"]) for k, d in found.items()}
+    assert found["auto"]["level"] == "finite_slope" and not found["auto"]["warnings"]
+    assert found["auto"]["last"] == found["finite_slope"]["last"]
+    assert np.linalg.norm(tip["stiffening"] - tip["finite_slope"]) < 2e-6
+    (warning,) = found["first_order"]["warnings"]
+    assert "level first_order of falling leaves out some 0.2" in warning
+    off = 1e3 * np.linalg.norm(tip["first_order"] - tip["finite_slope"])
+    assert 0.5 < off / found["first_order"]["left_out_mm"] < 20.0
 
 
 def test_columns_are_as_documented(flexarm):
@@ -160,7 +197,7 @@ def test_columns_are_as_documented(flexarm):
 def test_joints_that_are_prescribed_to_stand_carry_links_at_rest_and_gauges_show_their_sag(
     simulated, table_file
 ):
-    arm = arm_file.load("long_reach")
+    arm = levels.simulated(arm_file.load("long_reach"))
     built, q, t = Chain(arm), [0.3, -0.4, 0.5], np.linspace(0.0, 0.5, 6)
     q += [0.1] * (built.n_joints - len(q))
     got = simulated("long_reach", "--prescribed", table_file("q", t, *(0.0 * t + x for x in q)))
@@ -233,7 +270,7 @@ def test_frequencies_are_those_of_the_exact_beam(two_link, result, angle):
 
 def test_show_warns_of_what_matters(flexarm):
     _, out, _ = flexarm("show", "long_reach")
-    assert "upper sags by 7." in out and "--finite-slope" in out
+    assert "upper sags by 7." in out and "(simulated: finite_slope)" in out
     assert "sags by" not in flexarm("show", "long_reach", "--finite-slope")[1]
     assert "link1 has no damping in y" in flexarm("show", "R")[1]
 

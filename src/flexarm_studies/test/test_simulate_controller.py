@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Payload
 from flexarm_dynamics.errors import FlexarmError, ParameterError, TrajectoryError
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 from flexarm_sim.integrators import integrate
 from flexarm_sim.plant import Plant
 from flexarm_sim.simulator import Simulator
@@ -88,8 +88,8 @@ def damped(arm):
 def test_each_option_changes_the_plant_alone_as_it_says(option, by_hand):
     arm = arm_file.load("one_link")
     loop = loop_of(Scenario("one_link", PAPER, **option))
-    direct = Plant(model.build(by_hand(arm)), 1e-3)
-    unchanged = Plant(model.build(arm), 1e-3)
+    direct = Plant(model.build(levels.simulated(by_hand(arm))), 1e-3)
+    unchanged = Plant(model.build(levels.simulated(arm)), 1e-3)
     direct.reset()
     unchanged.reset()
     for k in range(30):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulator node: the simulated arm as a driver, in lockstep or in real time."""
 
+from flexarm_dynamics.models import levels
 from flexarm_ros.driver import Driver, Sample
 from flexarm_ros.node import ERROR, OK, WARN, run
 from flexarm_ros.start import leave
@@ -50,6 +51,7 @@ class SimulatorNode(Driver):
             rate=sim.rate if parameters["publish_rates"] else None,
         )
         self.sent, self.awaited = [], None
+        self._range_reported = False
         self.paused = self.pacing.pauses_at(0)
 
     def make_gate(self):
@@ -82,7 +84,10 @@ class SimulatorNode(Driver):
 
     def start(self):
         rate = self.parameters["rate"]
-        self.get_logger().info(f"arm {self.arm.name}, {self.pacing.name}, {rate:g} Hz")
+        level = levels.level_of(self.sim.plant_model.arm)
+        self.get_logger().info(
+            f"arm {self.arm.name}, level {level}, {self.pacing.name}, {rate:g} Hz"
+        )
         self._publish_sample()
         self.pacing.go_on()
 
@@ -107,6 +112,9 @@ class SimulatorNode(Driver):
             self.get_logger().error(f"stopped: {self.fault}")
             self.paused = True
             return
+        if self.sim.range.warning and not self._range_reported:
+            self._range_reported = True
+            self.get_logger().warning(f"t = {self.sim.time:.3f} s: {self.sim.range.warning}")
         self.paused = self.paused or self.pacing.pauses_at(self.sim.sequence)
         self._publish_sample()
 
@@ -147,7 +155,7 @@ class SimulatorNode(Driver):
         self.sim.reset()
         self.gate.begin((self.gate.session + 1) % WRAP)
         self.faults.reset()
-        self.fault = ""
+        self.fault, self._range_reported = "", False
         self.paused = self.pacing.pauses_at(0)
         self._publish_sample()
         self.pacing.go_on()
@@ -167,6 +175,8 @@ class SimulatorNode(Driver):
         values = {
             "mode": self.pacing.name,
             "simulated time [s]": f"{self.sim.time:.3f}",
+            "level": levels.level_of(self.sim.plant_model.arm),
+            "left out by the level at the tip [mm]": f"{1e3 * self.sim.range.error:.2g}",
             "periods without a fresh torque": self.pacing.late,
             "controllers seen": len(self.gate.controllers.ids),
         }

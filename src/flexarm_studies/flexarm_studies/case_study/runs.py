@@ -66,7 +66,11 @@ class Run:
     @property
     def simulator(self):
         """Parameters of the simulator."""
-        return {"arm": self.arm, "publish_rates": self.rates == "true"}
+        return {
+            "arm": self.arm,
+            "publish_rates": self.rates == "true",
+            "level": "first_order",  # the paper's equations
+        }
 
 
 RUNS = (
@@ -92,7 +96,7 @@ def run_without_ros(run, recorder=None):
     -------
     Record
     """
-    values = scenario.parameters(run.file) | {"slow.gain": run.gain}
+    values = scenario.parameters(run.file) | {"slow.gain": run.gain, "level": "first_order"}
     if run.rates == "true":
         values["observer.type"] = "true_rates"
     loop = scenario.loop_of(Scenario(run.arm, values))

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 
 from .arm_figure import draw
 from .options import add_arm_arguments, add_model_arguments, angles, load_arm
@@ -144,6 +144,7 @@ def describe(arm_model, q):
         "model": arm.model,
         "foreshortening": arm.foreshortening or arm.finite_slope,
         "finite_slope": arm.finite_slope,
+        "simulated_level": levels.level_of(levels.simulated(arm)),
         "gravity": list(arm.gravity),
         "mass": mass + arm.payload.mass,
         "q": q.tolist(),
@@ -182,7 +183,7 @@ def warnings(arm_model, q, result):
             if fraction > LARGE_SAG and not (arm.foreshortening or arm.finite_slope):
                 found.append(
                     f"{link.name} sags by {100 * fraction:.1f} % of its length under gravity, beyond small deflections:"
-                    " use --finite-slope (finite_slope: true)"
+                    " simulation takes level finite_slope, the control model does not (finite_slope: true)"
                 )
     except ModelError as error:
         found.append(str(error))
@@ -224,6 +225,7 @@ def text(d):
         yield f"source: {d['source']}"
     level = "foreshortening" if d["foreshortening"] else "first order"
     level = "finite slope" if d["finite_slope"] else level
+    level += f" (simulated: {d['simulated_level']})"
     yield f"model {d['model']}, {level}; {d['mass']:.4g} kg in all; gravity {d['gravity']} m/s^2"
     yield ""
     yield f"{'joint':18}{'hub':>10}{'rotor':>10}{'motor':>10}{'all':>12}{'limit':>10}  safe action"

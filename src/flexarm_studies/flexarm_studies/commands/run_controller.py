@@ -160,6 +160,8 @@ def warnings(scenario, loop):
             f" {1e3 * loop.designed.bears_delay:.3g} ms that the design bears: design for it, --set"
             f" design.delay={scenario.delay:g}"
         )
+    if loop.simulator.range.warning:
+        yield loop.simulator.range.warning
     if loop.unprepared:
         yield f"no preview of the trajectory: {loop.unprepared}"
     if scenario.noise and not any(g.noise or g.drift for g in gauges):

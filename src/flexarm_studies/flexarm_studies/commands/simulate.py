@@ -12,7 +12,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError, ModelError
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 from flexarm_sim.integrators import METHODS, substeps
 
 from .. import tables
@@ -22,12 +22,14 @@ from ..progress import Progress
 from ..recordings import mapping as mappings
 from ..recordings.motion import CORNER, motion_of
 from . import run_controller
-from .options import add_arm_arguments, add_model_arguments, angles, chain_of, load_arm
+from .options import add_arm_arguments, add_model_arguments, angles, chain_of, level_of, load_arm
 
 #: More rows must be a mistake in --rate or --duration.
 MAX_ROWS = 10_000_000
 #: More rows show their progress.
 SHOWN = 5000
+#: Instants at which a prescribed motion's accelerations are looked at for its level.
+SAMPLES = 1000
 #: Defaults of options without a controller.
 DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
 
@@ -111,21 +113,22 @@ def simulate(options, recorder=None, reader=read_csv):
         run_controller.run_controller(options, recorder)
         return
     arm = load_arm(options)
-    arm_model = model.build(arm)
-    kinematics = chain_of(arm_model)
     if options.torque and options.prescribed:
         raise FlexarmError("exclude each other", field="--torque and --prescribed")
     drive = motion = None
     if options.torque:
         drive = tables.Steps(*tables.read(options.torque, "tau", arm.joint_names))
     if options.prescribed:
-        if arm_model is not kinematics:
+        if arm.model != "chain":
             problem = f"of {arm.name} supports no --prescribed"
             raise ModelError(problem, field="model", value=arm.model, limit="chain")
         if options.initial:
             problem = "is not possible: a prescribed motion starts where its table does"
             raise FlexarmError(problem, field="--initial")
         motion = _motion(options, arm, reader)
+    arm = levels.simulated(arm, level_of(options), _known_of(drive, motion, len(arm.joints)))
+    arm_model = model.build(arm)
+    kinematics = chain_of(arm_model)
     for name, value in DEFAULTS.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
@@ -140,19 +143,22 @@ def simulate(options, recorder=None, reader=read_csv):
     progress = Progress() if times.size > SHOWN else None
     if progress:
         progress.step(f"{arm.name}, {times[-1] - times[0]:g} s")
+    n, m, inside = arm_model.n_joints, arm_model.n_modes, levels.Range(arm_model)
     for k, (state, torque) in enumerate(run):
         if not np.isfinite(state).all() or np.abs(state).max() > 1e9:
             raise ModelError(
                 f"stopped at t = {times[k]:g} s: the state is beyond the validity of this model",
                 field=arm.name,
-                hint="take a shorter --step, or --foreshortening where links spin fast",
+                hint=f"take a shorter --step; {inside.warning or 'or more of the arm is wrong'}",
             )
+        if inside.check(state[:n], state[n + m : 2 * n + m], state[n : n + m]):
+            print(f"flexarm simulate: t = {times[k]:g} s: {inside.warning}", file=sys.stderr)
         rows[k] = row(kinematics, times[k], state, torque, strains)
         if progress and k % (times.size // 50) == 0:
             progress.fraction(k / times.size)
     if progress:
         progress.done()
-    _report(options, arm_model, columns, rows)
+    _report(options, arm_model, columns, rows, inside)
     return columns, rows
 
 
@@ -277,12 +283,27 @@ def row(chain, t, state, torque, strains):
     return np.concatenate(values)
 
 
-def _report(options, arm_model, columns, rows):
+def _known_of(drive, motion, joints):
+    """The `levels.Drive` of a table of torques, or of a prescribed motion."""
+    if motion is None:
+        return levels.Drive(np.zeros(joints) if drive is None else drive.largest)
+    times = np.linspace(motion.start, motion.end, SAMPLES)
+    _, speeds, accelerations = (
+        np.abs(each).max(axis=0) for each in zip(*map(motion, times), strict=True)
+    )
+    return levels.Drive(acceleration=accelerations, velocity=speeds)
+
+
+def _report(options, arm_model, columns, rows, inside):
     arm = arm_model.arm
     if options.out or not options.json:
         tables.write(columns, rows, options.out)
     if options.json:
-        result = {"arm": arm.name, "model": arm.model, "columns": columns}
+        result = {"arm": arm.name, "model": arm.model, "level": inside.level, "columns": columns}
+        result |= {
+            "left_out_mm": 1e3 * inside.error,
+            "warnings": [inside.warning] * bool(inside.warning),
+        }
         if options.out:
             result |= {"out": options.out, "rows": len(rows)}
             result["last"] = dict(zip(columns, rows[-1].tolist(), strict=True))

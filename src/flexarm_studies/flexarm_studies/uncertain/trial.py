@@ -20,7 +20,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 from flexarm_sim.integrators import substeps
 
 from ..loop import scenario as scenarios
@@ -121,6 +121,7 @@ def loop_of(case, setup, variant, seed=0):
     rate = variant.rate or given.get("rate", RATE)
     plant = plant_of(known, variant)
     explicit = substeps(model.build(plant), 1.0 / rate) <= EXPLICIT
+    given["level"] = levels.level_of(plant)
     given["integrator"] = "dop853" if explicit else "implicit"
     scenario = scenarios.Scenario(
         known,
