@@ -163,6 +163,25 @@ class ClosedLoop:
         self._advance(torque)
         return torque
 
+    def recorded_step(self):
+        """As `step`; the sample's stamp [ns] and a row for `record_of`.
+
+        Raises
+        ------
+        ModelError
+            When the plant leaves what its model holds for.
+        """
+        enabled = self._answer()
+        stamp, row = self.simulator.stamp_ns, self._row()
+        self._advance(self.controller.torque if enabled else None)
+        return stamp, row
+
+    def record_of(self, steps):
+        """A `SimulatedRecord` of what `recorded_step` gave, its time from the first on."""
+        stamps, rows = zip(*steps, strict=True)
+        time = 1e-9 * (np.array(stamps) - stamps[0])
+        return self._record(np.column_stack([time, rows]))
+
     def _answer(self):
         """Measure, estimate, control: whether torque is enabled; a sample that was answered is answered alike."""
         return self._answer_to(self.measure())
