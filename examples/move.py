@@ -21,14 +21,8 @@ print(f"at rest after {arrival.seconds:.2f} s: the tip swings by {1e3 * arrival.
 record = run.record
 figure, (joints, bending) = plt.subplots(2, sharex=True, layout="constrained")
 joints.plot(record.time, record.position, label=arm.model.joint_names)
-joints.plot(
-    record.time,
-    record.reference,
-    "k--",
-    linewidth=1,
-    label=["reference", *[None] * (record.reference.shape[1] - 1)],
-)
-joints.set_ylabel("joint position [rad]")
+joints.plot(record.time, record.reference, "k--", linewidth=1)
+joints.set_ylabel("joint position [rad]\nreference dashed")
 joints.legend()
 bending.plot(record.time, record.amplitude, label=arm.model.mode_names)
 bending.legend()

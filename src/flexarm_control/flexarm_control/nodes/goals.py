@@ -36,13 +36,14 @@ PARAMETERS = (
     ),
     parameter("state_timeout", 1.0, "s", 0.05, 3600.0, read_only=True).described(
         "A goal is aborted when controller/state has not come for so long, or nothing has answered the goal in five"
-        " times as long."
+        " times as long; a controller that sends its state has sixty times as long to judge a trajectory."
     ),
 )
 #: Between two looks at the arm, and before a trajectory without an answer is sent again (wall time) [s].
 LOOK, AGAIN = 0.01, 1.0
-#: Waits for an answer are this many times longer than for a state: a trajectory's torque is judged first.
-PATIENCE = 5.0
+#: Waits for an answer are so many times longer than for a state: of a silent controller, and of one that sends its
+#: state, since a trajectory's torque is judged first, in a process that may have just been started.
+PATIENCE, JUDGING = 5.0, 60.0
 #: Beginnings of a refusal that have a number of their own.
 REFUSALS = {
     "joint_names": goal.Code.INVALID_JOINTS,
@@ -195,7 +196,8 @@ class GoalsNode(ArmNode):
         """The `Outcome` of a goal at this look; None while it is under way."""
         timeout = self.parameters["state_timeout"]
         if each.check is None:
-            return self._offered(each, state, now, PATIENCE * timeout)
+            silent = now - max(self._came, each.began) > timeout
+            return self._offered(each, state, now, (PATIENCE if silent else JUDGING) * timeout)
         if state is None:
             if now - self._came <= timeout:
                 return None
