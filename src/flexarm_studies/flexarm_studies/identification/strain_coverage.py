@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How often the intervals of fits to strains alone cover the truth, for simulated arms with play drawn at random.
+
+``python -m flexarm_studies.identification.strain_coverage --arms 100`` draws arms around `NOMINAL`, moves their joint
+as a position control would, and measures: strains with noise of which most is common to the gauges and follows from
+sample to sample, with bias, drift and a delay; the motor's current with friction. Each one is identified from the
+nominal arm's file.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model
+
+from .. import workers
+from ..recordings.motion import CORNER
+from . import recording as recordings
+from .currents import motor_fits, torques
+from .strain_fit import Options, StrainProblem, identify_strains
+
+NOMINAL = """
+name: geared
+gravity: [0.0, -9.81, 0.0]
+joints:
+- {name: shoulder, axis: [0, 0, 1], hub_inertia: 0.03, rotor_inertia: 1.0e-4, gear_ratio: 50.0,
+   friction: {viscous: 1.0, coulomb: 1.0, smoothing: 0.03},
+   transmission: {stiffness: 600.0, damping: 2.0, play: 0.012, load_damping: 0.05,
+   rounding: 0.001, play_damping: 0.5}}
+links:
+- {name: beam, length: 0.6, mass_per_length: 0.4, EI_y: 28.0,
+   flexible: {y: {modes: 1, shape: loaded, damping: [0.012]}}}
+payload: {mass: 1.0}
+gauges:
+- {name: root, link: beam, position: 0.05, direction: y, surface_distance: 0.003}
+- {name: middle, link: beam, position: 0.3, direction: y, surface_distance: 0.003}
+"""
+#: Known to the user, and held at the true value.
+HOLD = ("joints[0].hub_inertia", "payload.mass")
+#: Largest relative deviation of each parameter from the nominal one [-]; of biases, drifts [-], delays [s] and offsets
+#: [rad].
+SPREAD = 0.2
+BIAS, DRIFT, DELAY, OFFSET = 50e-6, 15e-6, 0.008, 0.03
+#: Noise that gauges share, its memory, and noise of each [-]; of the current [A]; torque per ampere [N m/A].
+COMMON, MEMORY, OWN, OF_CURRENT, CONSTANT = 1.0e-6, 0.5, 0.3e-6, 0.03, 12.0
+RATE, SECONDS = 100.0, 20.0
+
+
+def motion():
+    """Joint angle (s,) of moves through the upper position, with rests [rad]."""
+    time = np.arange(0.0, SECONDS, 1.0 / RATE)
+    angle = np.full(time.size, 0.4)
+    moves = (
+        (0.6, 0.6, 1.2),
+        (3.0, 0.5, 1.0),
+        (6.0, 0.7, -1.4),
+        (9.0, 0.5, 1.6),
+        (12.0, 0.6, -0.8),
+        (15.0, 0.5, -1.2),
+    )
+    for at, long, size in moves:
+        s = np.clip((time - at) / long, 0.0, 1.0)
+        angle += size * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    return time, angle
+
+
+def drawn(seed):
+    """A `Recording` of an arm drawn at random, and the true values by name."""
+    random, (time, angle) = np.random.default_rng(seed), motion()
+    arm = arm_file.parse(NOMINAL)
+    signals = {"position": angle[:, None], "strain": np.zeros((time.size, 2))}
+    run = recordings.uniform(time, signals, joint_names=("shoulder",), gauge_names=arm.gauge_names)
+    problem = StrainProblem(arm, run, Options(hold=HOLD))
+    sizes = {"bias": BIAS, "drift": DRIFT, "delay": DELAY, "offset": OFFSET}
+    values = problem.file.copy()
+    for j in np.flatnonzero(problem.free):
+        size = sizes.get(problem.found[j].kind)
+        spread = random.uniform(-1.0, 1.0)
+        values[j] = size * spread if size else values[j] * (1.0 + SPREAD * spread)
+    setup = problem.at(values)
+    strain = problem.strains(setup, problem.states(setup))
+    noise = np.zeros(time.size)
+    for k, new in enumerate(random.standard_normal(time.size) * np.sqrt(1.0 - MEMORY**2)):
+        noise[k] = MEMORY * noise[k - 1] + new
+    strain += COMMON * noise[:, None] + OWN * random.standard_normal(strain.shape)
+    friction = {name: float(random.uniform(0.5, 1.5)) for name in ("viscous", "coulomb")}
+    torque, predictor = torques(setup.arm, run, CORNER, setup.offset)
+    speed = predictor.velocity[:, 0]
+    effort = torque[:, 0] + friction["viscous"] * speed
+    effort += friction["coulomb"] * np.tanh(speed / arm.joints[0].friction.smoothing)
+    current = effort / CONSTANT + OF_CURRENT * random.standard_normal(time.size)
+    truth = {q.name: float(v) for q, v in zip(problem.found, values, strict=True)}
+    truth |= {"current: constant": CONSTANT}
+    truth |= {f"current: {name}": value for name, value in friction.items()}
+    return replace(run, strain=strain, current=current[:, None]), truth
+
+
+def one(seed):
+    """Rows of one arm: name, true value, value found, half-width."""
+    run, truth = drawn(seed)
+    found = identify_strains(arm_file.parse(NOMINAL), run, Options(hold=HOLD, starts=2))
+    rows = [
+        (q.name, truth[q.name], float(v), float(w))
+        for q, v, w in zip(found.quantities, found.values, found.half_widths, strict=True)
+        if np.isfinite(w)
+    ]
+    everything = slice(0, len(run.position))
+    for motor in motor_fits(found, run, everything, everything, CORNER):
+        for name in ("constant", "viscous", "coulomb"):
+            value, width = getattr(motor, name)
+            rows.append((f"current: {name}", truth[f"current: {name}"], value, width))
+    return rows
+
+
+def run(arms, seed=0, count=None, progress=None):
+    """Identify so many `arms`; a row per parameter: how many intervals covered, errors, half-widths.
+
+    Parameters
+    ----------
+    arms : int
+    seed : int
+    count : int, optional
+        Processes.
+    progress : callable, optional
+        ``progress(done)``
+    """
+    table = {}
+    calls = [([seed, k],) for k in range(arms)]
+    for done, (_, rows) in enumerate(workers.results(one, calls, count)):
+        for name, true, value, width in rows:
+            row = table.setdefault(name, {"arms": 0, "covered": 0, "errors": [], "widths": []})
+            row["arms"] += 1
+            row["covered"] += bool(abs(value - true) <= width)
+            row["errors"].append(abs(value - true) / max(abs(true), 1e-300))
+            row["widths"].append(width / max(abs(true), 1e-300))
+        if progress:
+            progress(done + 1)
+    return table
+
+
+def text(table):
+    """Lines of the table of `run`, as Markdown."""
+    yield "| parameter | covered | median error [%] | largest error [%] | median half-width [%] |"
+    yield "| --- | --- | --- | --- | --- |"
+    for name, row in table.items():
+        errors, widths = 100.0 * np.array(row["errors"]), 100.0 * np.array(row["widths"])
+        yield (
+            f"| `{name}` | {row['covered']} of {row['arms']} | {np.median(errors):.2g} | {errors.max():.2g} |"
+            f" {np.median(widths):.2g} |"
+        )
+    covered, arms = (sum(row[k] for row in table.values()) for k in ("covered", "arms"))
+    yield f"| all | {100.0 * covered / arms:.1f} % | | | |"
+
+
+def main(words=None):
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--arms", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args(words)
+    model.build(arm_file.parse(NOMINAL))  # a clear error before the workers start
+    shown = lambda done: print(f"{done} of {options.arms}", file=sys.stderr, flush=True)  # noqa: E731
+    table = run(options.arms, options.seed, options.workers, shown)
+    print(json.dumps(table) if options.json else "\n".join(text(table)))
+
+
+if __name__ == "__main__":
+    main()
