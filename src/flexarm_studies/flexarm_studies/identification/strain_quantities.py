@@ -135,9 +135,6 @@ def with_offset(arm, offset):
 
 def roll_pitch_yaw(R):
     """Angles, as in URDF, of a rotation matrix [rad]."""
-    pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
-    return (
-        float(np.arctan2(R[2, 1], R[2, 2])),
-        pitch,
-        float(np.arctan2(R[1, 0], R[0, 0])),
-    )
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    angles = np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])
+    return tuple(float(a) + 0.0 for a in angles)  # no -0.0 in files

@@ -3,6 +3,7 @@
 
 import functools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -244,7 +245,8 @@ def _cell(score):
 def heading(result):
     """Lines of the comment at the head of the written arm file."""
     start, end = result["fit_s"]
-    yield f"Identified from the strains of {result['source']}, {start:g} to {end:g} s, the joints moved as measured."
+    source = Path(result["source"]).name
+    yield f"Identified from the strains of {source}, {start:g} to {end:g} s, the joints moved as measured."
     for name, row in (result["parts"].get("score") or result["parts"]["fit"]).items():
         score = row["model"]
         yield (
@@ -267,7 +269,8 @@ def origins(result):
     notes = {}
     for row in result["parameters"]:
         if row["half_width"] is not None:
-            weak = "" if row["determined"] else ", weakly"
+            sure = row["determined"] and row["half_width"] <= abs(row["value"])
+            weak = "" if sure else ", weakly"
             notes[row["name"]] = f"identified{weak}: +- {row['half_width']:.2g}"
     return notes
 
