@@ -71,6 +71,26 @@ def test_columns_come_in_the_order_of_the_arm():
     assert_array_equal(trajectory.accelerations, [[6, 5], [10, 9]])
 
 
+@pytest.mark.parametrize("fields", [1, 2, 3])
+def test_joints_that_are_left_out_stay_where_they_are_held(fields):
+    given = [point(1, *[[0.5]] * fields)]
+    if fields > 1:
+        given.append(point(2, *[[0.5], [0.0], [0.0]][:fields]))
+    whole = validate(["b"], ARM, 0, given, held=[0.3, 9.0])
+    np.testing.assert_array_equal(whole.positions[:, 0], 0.3)
+    np.testing.assert_array_equal(whole.positions[:, 1], 0.5)
+    for values in whole.fields[1:]:
+        np.testing.assert_array_equal(values[:, 0], 0.0)
+        assert values[0, 1] == 0.5
+    # A joint that is held beyond a limit stays refused by name; and an empty list of joints is no motion.
+    with pytest.raises(TrajectoryError, match="joint a"):
+        validate(["b"], ARM, 0, given, [-0.1, -9.0], [0.1, 9.0], held=[0.3, 0.0])
+    with pytest.raises(TrajectoryError, match="joint_names"):
+        validate([], ARM, 0, [point(1, [])], held=[0.3, 0.0])
+    with pytest.raises(TrajectoryError, match="is missing"):
+        validate(["b"], ARM, 0, given)
+
+
 def test_arrays_of_ros_messages_are_read():
     empty = array("d")
     trajectory = validate(ARM, ARM, 0, [(S, array("d", [1.0, 2.0]), empty, empty, empty)])

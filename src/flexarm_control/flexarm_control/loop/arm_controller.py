@@ -41,6 +41,9 @@ PARAMETERS = (
         "Largest torque that a trajectory may need, as a multiple of the torque limit: rigid arm with weight and"
         " friction, payload of the arm file; what needs more is refused. 0.0: not judged."
     ),
+    parameter("allow_partial_joints_goal", False).described(
+        "Whether a trajectory may leave out joints: they stay where they are held. While the arm moves it may not."
+    ),
     parameter("join_late_trajectories", False).described(
         "Whether a trajectory whose stamp is past, and whose end is not, is joined midway, as"
         " joint_trajectory_controller does; it is refused otherwise."
@@ -266,6 +269,14 @@ class ArmController:
     def refuse(self, reason, name=""):
         """Note a trajectory that was refused before it could be offered."""
         self._trajectory_reason, self.judged = reason, (name, reason)
+
+    @property
+    def held(self):
+        """Where joints stay that a trajectory leaves out, (n,) [rad]; None: it has to name all. Any thread may ask."""
+        if not self.supervisor.settings["allow_partial_joints_goal"]:
+            return None
+        resting = self.reference.resting
+        return None if resting is None else resting[0]
 
     @property
     def plans(self):

@@ -16,8 +16,11 @@ from .. import trajectory
 MAX_POINTS = 10_000
 
 
-def read(raw, arm):
-    """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be."""
+def read(raw, arm, held=None):
+    """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be.
+
+    `held` as of `validate`.
+    """
     try:
         count = trajectory_points(raw)
         if count > MAX_POINTS:
@@ -40,6 +43,7 @@ def read(raw, arm):
             points,
             *arm.position_limits.T,
             arm.velocity_limits,
+            held,
         )
     except TrajectoryError:
         raise
@@ -76,7 +80,7 @@ class TrajectoryInbox:
         """In a thread: make a message ready to be offered."""
         name = trajectory_name(raw)
         try:
-            data = read(raw, self._core.model.arm)
+            data = read(raw, self._core.model.arm, self._core.held)
             self._judge_torque(data)
         except TrajectoryError as error:
             self._node.hand_over(self._refuse, str(error), name)

@@ -15,7 +15,7 @@ The first segment leads from the reference at the start to the first point, at i
 acceleration), so that a new trajectory takes over smoothly. After the last point the reference
 holds its position.
 
-This package is stricter than the joint_trajectory_controller: it refuses partial joint goals,
+This package is stricter than the joint_trajectory_controller: it refuses partial joint goals (unless allowed),
 velocities without positions, fields that some points lack, a start in the past (unless late ones are joined), and
 what needs more torque than the joints have.
 

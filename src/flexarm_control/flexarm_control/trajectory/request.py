@@ -66,6 +66,7 @@ def validate(
     position_low=None,
     position_high=None,
     velocity_max=None,
+    held=None,
 ) -> JointTrajectoryData:
     """Check an untrusted trajectory, and bring it to the arm's joint order.
 
@@ -86,6 +87,8 @@ def validate(
     velocity_max : (n,) array_like, optional
         Limit of the speeds in the arm's order [rad/s]. It applies to the given velocities and to
         the mean speed between two points, which no curve through both can stay below.
+    held : (n,) array_like, optional
+        Where the joints are that the message may leave out: they stay there [rad]. Not given: it may leave out none.
 
     Raises
     ------
@@ -93,12 +96,12 @@ def validate(
         With the point, field and joint, the value, the limit, and what to do.
     """
     arm_joint_names = tuple(arm_joint_names)
-    order = _column_order(joint_names, arm_joint_names)
+    order = _column_order(joint_names, arm_joint_names, held is not None)
     columns = _columns(points)
     stamp_ns = _stamp(stamp_ns)
     times_ns = _times(columns[0], stamp_ns)
     fields = [
-        _field(name, column, arm_joint_names, order)
+        _field(name, column, arm_joint_names, order, held)
         for name, column in zip(_FIELDS[1:4], columns[1:4], strict=True)
     ]
     filled = np.flatnonzero(_lengths("effort", columns[4]))
@@ -124,8 +127,8 @@ def validate(
     return trajectory
 
 
-def _column_order(joint_names, arm_joint_names):
-    """Return for each of the arm's joints its column in the message, as a list of int."""
+def _column_order(joint_names, arm_joint_names, partial):
+    """Return for each of the arm's joints its column in the message, a list of int; -1 where it is left out."""
     field = "joint_names"
     try:
         if isinstance(joint_names, Mapping | Set):  # they have no order
@@ -147,9 +150,9 @@ def _column_order(joint_names, arm_joint_names):
                 hint="give each joint once",
             )
     for name in arm_joint_names:
-        if name not in names:
+        if name not in names and not (partial and names):
             raise TrajectoryError("is missing", field=field, value=name, hint=f"give {known}")
-    return [names.index(name) for name in arm_joint_names]
+    return [names.index(name) if name in names else -1 for name in arm_joint_names]
 
 
 def _columns(points):
@@ -226,10 +229,11 @@ def _times(column, stamp_ns):
     return times
 
 
-def _field(name, column, arm_joint_names, order):
+def _field(name, column, arm_joint_names, order, held):
     """Return a field of all points as a read-only (k, n) array in the arm's order, or None."""
     lengths = _lengths(name, column)
-    n = len(order)
+    given = np.array(order) >= 0
+    n = int(given.sum())
     bad = np.flatnonzero((lengths != n) & (lengths != 0))
     if bad.size:
         index = int(bad[0])
@@ -251,7 +255,10 @@ def _field(name, column, arm_joint_names, order):
         )
     if lengths[0] == 0:
         return None
-    values = _numbers(name, column, n).reshape(len(column), n)[:, order]
+    numbers = _numbers(name, column, n).reshape(len(column), n)
+    values = numbers[:, order]  # a copy
+    if n < len(order):
+        values[:, ~given] = np.asarray(held, float)[~given] if name == "positions" else 0.0
     wild = ~(np.abs(values) <= MAX_MAGNITUDE)  # so written, it finds nan too
     problem = f"{UNITS[name]} is not finite or too large"
     refuse_joint(name, wild, values, arm_joint_names, problem, MAX_MAGNITUDE)
