@@ -812,6 +812,11 @@ def stepped_accelerations(chain, states, torques, **options):
 
 LOOPS = {level: (random_arm(73, MIXED, level), False) for level in LEVELS}
 CODES = {**LOOPS, **{name: (arm, True) for name, arm in STRUCTURES.items()}}
+CODES |= {f"generated, {level}": (at_level(SIMPLE, level), True) for level in LEVELS[1:]}
+CODES["generated, both ways"] = (
+    random_arm(74, [{"y": (2, "loaded"), "z": (1, "loaded")}, {}], LEVELS[2]),
+    True,
+)
 
 
 @pytest.mark.parametrize("name", CODES)
@@ -872,10 +877,22 @@ def test_arms_of_one_structure_share_their_code_and_keep_their_own_constants():
             close(found, expected, 1e-12)
 
 
-def test_long_equations_and_finite_deflections_stay_in_loops():
+def test_long_equations_stay_in_loops():
     assert Chain(random_arm(78, [FULL] * 5)).straight_line is None
-    for level in LEVELS[1:]:
-        assert Chain(at_level(SIMPLE, level)).straight_line is None
+
+
+@pytest.mark.parametrize("level", LEVELS[1:])
+def test_arms_of_one_structure_share_their_code_at_every_level(level):
+    arm = at_level(SIMPLE, level)
+    longer = replace(arm, links=tuple(replace(link, length=1.3) for link in arm.links))
+    (code, ones), (same, others) = (
+        Chain(a).straight_line for a in (arm, replace(arm, name="same"))
+    )
+    assert code is same and np.array_equal(ones, others)
+    state, torques = np.concatenate(random_state(77, arm)), np.array([[1.0, 2.0]])
+    for chain in (Chain(arm), Chain(longer), Chain(arm)):
+        for found, expected in stepped_accelerations(chain, [state], torques):
+            close(found, expected, 1e-12)
 
 
 # --- foreshortening and finite slopes ----------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Transmission
-from flexarm_dynamics.models import model
+from flexarm_dynamics.models import levels, model
 
 from .integrators import METHODS
 from .plant import Plant
@@ -54,10 +54,12 @@ def loops(geared):
 
 
 def arms():
-    """The straight-line code of the shipped arms."""
+    """The straight-line code of the shipped arms, at the level of their file and at that of their simulation."""
     for name in ARMS:
-        plant = Plant(model.build(arm_file.load(name)), 1e-3)
-        plant.advance(np.zeros(plant.model.n_joints))
+        arm = arm_file.load(name)
+        for each in {levels.level_of(a): a for a in (arm, levels.simulated(arm))}.values():
+            plant = Plant(model.build(each), 1e-3)
+            plant.advance(np.zeros(plant.model.n_joints))
 
 
 def evaluate(arm_model):

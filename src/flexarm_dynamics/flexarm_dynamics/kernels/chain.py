@@ -144,6 +144,7 @@ WORK = {
     "of_link": ("N", 5),  # see `integrals`: SHORT, SHORT_DD ...
     "of_mode": ("N", "K", 11),  # P, XP ...
     "of_modes": ("N", "K", "K"),  # int P_j P_k dm for k <= j
+    "bent": ("N", "K"),  # elastic force of bending at finite slopes
     "node": (4, "G+1"),  # integrands at the nodes and what they integrate to
     "node_partial": (2, "K", "G+1"),
 }
@@ -473,13 +474,20 @@ def elastic_force(d, w, i, delta):
     """Gradient of link i's elastic energy with respect to its modal amplitudes."""
     K, first = d.count[i], d.first[i]
     for j in range(K):
+        if d.level == FINITE_SLOPE and d.direction[i, j] != TWIST:
+            w.elastic[i, j] = w.bent[i, j]
+            continue
         acc = 0.0
         for k in range(K):
-            if d.level != FINITE_SLOPE or d.direction[i, j] == TWIST:
-                acc += d.stiffness[i, j, k] * delta[first + k]
+            acc += d.stiffness[i, j, k] * delta[first + k]
         w.elastic[i, j] = acc
-    if d.level != FINITE_SLOPE:
-        return
+
+
+def bend(d, w, i, delta):
+    """Elastic force of link i's bending at finite slopes, into `WORK`'s `bent`."""
+    K = d.count[i]
+    for j in range(K):
+        w.bent[i, j] = 0.0
     for g in range(d.nodes):
         sy, sz, by, bz = slopes_and_bends(d, i, g, delta)
         # EI_y k_y^2 / 2 + EI_z k_z^2 / 2 with k_z = z''/sqrt(1 - z'^2), k_y = (y'' + y' z' z''/c)/root.
@@ -500,11 +508,42 @@ def elastic_force(d, w, i, delta):
         for j in range(K):
             phi1, phi2 = d.node_slope[i, g, j], d.node_bend[i, g, j]
             if d.direction[i, j] == Y:
-                w.elastic[i, j] += wy * ky * (ky_sy * phi1 + ky_by * phi2)
+                w.bent[i, j] += wy * ky * (ky_sy * phi1 + ky_by * phi2)
             elif d.direction[i, j] == Z:
-                w.elastic[i, j] += wy * ky * (ky_sz * phi1 + ky_bz * phi2) + wz * (
+                w.bent[i, j] += wy * ky * (ky_sz * phi1 + ky_bz * phi2) + wz * (
                     kz2 * phi2 + kz2 * kz2 * sz * phi1
                 )
+
+
+def at_nodes(d, w, delta, delta_d):
+    """What is summed at the nodes of the links: functions of deflections and their rates alone."""
+    for i in range(d.links):
+        if d.count[i] > 0:
+            integrals(d, w, i, delta, delta_d)
+            if d.level == FINITE_SLOPE:
+                bend(d, w, i, delta)
+
+
+def sums_at_nodes(data, work, state, out):
+    """`at_nodes` of a state, link by link into the vector `out`: for generated code, which `given_sums` describes."""
+    d, w = data[0], work[0]
+    half, place = state.size // 2, 0
+    at_nodes(d, w, state[d.links : half], state[half + d.links :])
+    for i in range(d.links):
+        if d.count[i] == 0:
+            continue
+        for c in range(5):
+            out[place] = w.of_link[i, c]
+            place += 1
+        for j in range(d.count[i]):
+            for c in range(11):
+                out[place] = w.of_mode[i, j, c]
+                place += 1
+            for k in range(j + 1):
+                out[place] = w.of_modes[i, j, k]
+                place += 1
+            out[place] = w.bent[i, j]
+            place += 1
 
 
 def slopes_and_bends(d, i, g, delta):
@@ -701,6 +740,8 @@ def prepare(d, w, q, delta, qd, delta_d):
         w.carrier[0, k] = 0.0
         for m in range(3):
             w.frame[0, k, m] = d.turn[0, k, m]
+    if d.level != FIRST_ORDER and d.nodes > 0:  # without nodes their sums are given
+        at_nodes(d, w, delta, delta_d)
     for i in range(N):
         angle, rate = q[i], qd[i]
         if JOINT_PARTS:
@@ -714,7 +755,6 @@ def prepare(d, w, q, delta, qd, delta_d):
         if d.level == FIRST_ORDER or d.count[i] == 0:
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
-            integrals(d, w, i, delta, delta_d)
             body_foreshortened(d, w, i, delta, delta_d, w.omega[i])
         elastic_force(d, w, i, delta)
         tip(d, w, i, delta, delta_d, w.omega[i])

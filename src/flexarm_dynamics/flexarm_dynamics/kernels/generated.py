@@ -14,7 +14,7 @@ import numpy as np
 
 
 def derivative(x, u, c, out):
-{body}
+{begin}{body}
 '''
 
 #: `integrators.low_storage` with the state in local variables and the right-hand side written out in its loop.
@@ -23,18 +23,22 @@ def low_storage(
     state, torque, change, step, substeps, below, weights, nodes, work, net, friction, c
 ):
     p, share = weights.size, 1.0 / substeps
-{read}
+{begin_all}{read}
     for k in range(substeps):
 {begin}
         for i in range(p):
             now, gain = (k + nodes[i]) * share, step * weights[i]
             ahead = step * below[i + 1] if i + 1 < p else 0.0
 {torque}
-{body}
+{sums}{body}
 {move}
 {end}
 {write}
 """
+
+
+#: What generated code is given where links are foreshortened, in the place of its constants alone.
+UNPACK = ("c, data, scratch, m = c",)
 
 
 def right_hand_side(data, work):
@@ -49,8 +53,8 @@ def right_hand_side(data, work):
     Returns
     -------
     sources : tuple of str
-        What `load.joined` makes a module of. They depend on which constants are zero, one, negative, or equal to
-        one another, not on their values.
+        What `load.joined` makes a module of, with `chain.sums_at_nodes` where links are foreshortened. They depend on
+        which constants are zero, one, negative, or equal to one another, not on their values.
     constants : ndarray
     operations : int
     """
@@ -69,15 +73,61 @@ def right_hand_side(data, work):
     zeros = np.zeros((n, K, K), dtype=object)
     none = np.zeros((n, 2), dtype=object)
     packed = ((exact,), (work,), none, zeros, np.zeros(n, int), np.zeros(m, dtype=object))
+    if data.level != chain.FIRST_ORDER:
+        exact = packed[0][0]._replace(nodes=0)
+        given_sums(data, work, graph)
+        packed = ((exact,), *packed[1:])
     chain.derivative(state, torque, packed, out)
     lines, words, constants, operations = symbols.emit(graph, out)
     lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]
-    source = DERIVATIVE.format(body=_indented(lines, 1))
-    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m))
+    summed = data.level != chain.FIRST_ORDER
+    begin = _indented([*UNPACK, "sums_at_nodes(data, scratch, x, m)"], 1) + "\n" if summed else ""
+    source = DERIVATIVE.format(begin=begin, body=_indented(lines, 1))
+    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m, summed))
     return parts, np.array(constants or [0.0]), operations
 
 
-def _low_storage(graph, out, n, half):
+def given_sums(data, work, graph):
+    """Put symbols ``m[0]``, ``m[1]`` ... for what `chain.sums_at_nodes` gives into the work space.
+
+    Symbols are of the `graph`; `data` has the structure.
+    What is zero for any deflection stays so: integrals of y where no mode bends along y, and so on.
+    """
+    place = 0
+
+    def put(array, index, zero):
+        nonlocal place
+        array[index] = 0.0 if zero else graph.symbol(f"m[{place}]")
+        place += 1
+
+    for i in range(data.links):
+        kinds = data.direction[i, : data.count[i]]
+        if not kinds.size:
+            continue
+        straight = (kinds == chain.TWIST).all()
+        missing = set()
+        if chain.Y not in kinds:
+            missing |= {chain.YP, chain.YDP}
+        if chain.Z not in kinds:
+            missing |= {chain.ZP, chain.ZDP}
+        for c in range(5):
+            put(work.of_link, (i, c), straight)
+        for j, kind in enumerate(kinds):
+            twists = kind == chain.TWIST
+            for c in range(11):
+                put(work.of_mode, (i, j, c), twists or c in missing)
+            for k in range(j + 1):
+                put(work.of_modes, (i, j, k), twists or kinds[k] == chain.TWIST)
+            put(work.bent, (i, j), twists or data.level != chain.FINITE_SLOPE)
+    return place
+
+
+def room_for_sums(data):
+    """Number of values that `chain.sums_at_nodes` gives."""
+    return sum(5 + k * 12 + k * (k + 1) // 2 for k in map(int, data.count) if k)
+
+
+def _low_storage(graph, out, n, half, summed):
     lines, words, _, _ = symbols.emit(graph, out, scalars=True)
     # Of each pair of states (z, rate): rate is the derivative of z, and a that of the rate.
     pairs = [(i, half + i) for i in range(half)]
@@ -93,7 +143,11 @@ def _low_storage(graph, out, n, half):
             f"    u{j} -= friction[{j}, 1] * np.tanh(x{half + j} / friction[{j}, 2])",
         ]
     every = range(2 * half)
+    scratch = [f"point[{i}] = x{i}" for i in (*range(n, half), *range(half + n, 2 * half))]
+    sums = [*scratch, "sums_at_nodes(data, scratch, point, m)"]
     return LOW_STORAGE.format(
+        begin_all=_indented([*UNPACK, "point = work[0]"], 1) + "\n" if summed else "",
+        sums=_indented(sums, 3) + "\n" if summed else "",
         read=_indented([f"s{i} = state[{i}]" for i in every], 1),
         begin=_indented([f"x{i} = w{i} = s{i}" for i in every], 2),
         torque=_indented(torque, 3),

@@ -65,7 +65,7 @@ def cache_directory():
     return Path(tempfile.mkdtemp(prefix="flexarm-"))
 
 
-def joined(name, sources, compiled=True, inline=()):
+def joined(name, sources, compiled=True, inline=(), given=None):
     """A module made of several sources.
 
     Parameters
@@ -78,6 +78,8 @@ def joined(name, sources, compiled=True, inline=()):
         Compile every function with numba, on first call.
     inline : sequence of str
         Functions to be written out where they are called.
+    given : module, optional
+        A module made before, whose function `sums_at_nodes` the sources call.
 
     Returns
     -------
@@ -86,6 +88,8 @@ def joined(name, sources, compiled=True, inline=()):
     text = "\n\n".join(sources)
     # How it is compiled is part of what numba's cache must not mix up.
     text += f"\n\n# inline: {', '.join(inline)}\n# symbols: {SYMBOLS}\n"
+    if given is not None:
+        text += f"# with: {given.__name__}\n"
     full = f"flexarm_{name}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     key = full if compiled else f"{full}_plain"
     if key in sys.modules:
@@ -102,6 +106,8 @@ def joined(name, sources, compiled=True, inline=()):
     module = importlib.util.module_from_spec(spec)
     sys.modules[key] = module
     spec.loader.exec_module(module)
+    if given is not None:
+        module.sums_at_nodes = given.sums_at_nodes
     if compiled:
         from numba import njit
 

@@ -168,6 +168,10 @@ class Symbol:
         """The cosine, as numpy asks it of an object."""
         return self.graph.symbol("np.cos", self)
 
+    def arcsin(self):
+        """The arcsine, as numpy asks it of an object."""
+        return self.graph.symbol("np.arcsin", self)
+
     def exp(self):
         """The exponential, as numpy asks it of an object."""
         return self.graph.symbol("np.exp", self)
@@ -192,7 +196,7 @@ def emit(graph, outputs, scalars=False):
     graph : Graph
     outputs : sequence of Symbol or float
     scalars : bool
-        Inputs are ``x0`` instead of ``x[0]``.
+        Inputs are ``x0`` instead of ``x[0]``, except those called m.
 
     Returns
     -------
@@ -237,7 +241,8 @@ def emit(graph, outputs, scalars=False):
         words = [word(o) for o in operands]
         length = 1 + sum(size[o.index] for o in operands if isinstance(o, Symbol))
         if not operands:
-            expression = op.replace("[", "").replace("]", "") if scalars else op
+            written_out = scalars and not op.startswith("m[")
+            expression = op.replace("[", "").replace("]", "") if written_out else op
         elif op == "neg":
             expression = f"(-{words[0]})"
         elif len(op) == 1:

@@ -569,20 +569,24 @@ class Chain(ArmModel):
     @cached_property
     def straight_line(self):
         """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
-        if self.data.level != plain.FIRST_ORDER or not self._compiled:
+        if not self._compiled:
             return None
         sources, constants, operations = generated.right_hand_side(
             self.data, work_space(self.data, object)
         )
         if operations > generated.MAX_OPERATIONS:
             return None
-        return load.joined("generated", sources, inline=INLINE), constants
+        given = None if self.data.level == plain.FIRST_ORDER else self.kernel
+        return load.joined("generated", sources, inline=INLINE, given=given), constants
 
     def stepper(self, method, straight_line=True):
         """As `ArmModel.stepper`; ``straight_line=False`` asks for the recursion in loops."""
         if method is not None and straight_line and self.straight_line is not None:
-            module, constants = self.straight_line
-            return explicit_stepper(module, method, constants, self)
+            module, data = self.straight_line
+            if self.data.level != plain.FIRST_ORDER:
+                room = np.zeros(max(1, generated.room_for_sums(self.data)))
+                data = (data, self._data, self._new_work(), room)
+            return explicit_stepper(module, method, data, self)
         return self._loops(method)
 
     def lockable_stepper(self, method):
