@@ -112,7 +112,7 @@ def test_a_repeated_time_is_a_step_and_the_last_row_is_held(tmp_path, simulated,
         f"payload: {{mass: {p['Mp']}, inertia: [0, 0, {p['Jp']}, 0, 0, 0]}}\n"
     )
     # Steps that do not end where the torque jumps.
-    got = simulated(arm, "--torque", torque, "--step", "0.0007", "--foreshortening")
+    got = simulated(arm, "--torque", torque, "--step", "0.0007")
     truth = np.genfromtxt(DATA / "one_link_pulse.csv", delimiter=",", names=True)
     distance = np.hypot(got["tip_x"] - truth["tip_x"], got["tip_y"] - truth["tip_y"])
     assert distance.max() < 2e-5
