@@ -133,6 +133,7 @@ def identify(options, arm, measured, progress):
     found, result, more = study(
         arm, measured, wanted, fitting, other, run=run, state=state, report=progress.step
     )
+    result |= {"score_file": options.score_file}
     return found, result | summary(found, measured, options.recording), more
 
 
@@ -287,7 +288,7 @@ def for_file(found):
 
 
 def draw(found, run, predicted, result, path):
-    """Draw measured, predicted and residual strains; the path.
+    """Draw measured, predicted and residual strains of the part that was not fitted, or of all; the path.
 
     `run` is the recording of the prediction; `found`, `predicted` (s, g) and `result` are of `identify`.
     """
@@ -298,23 +299,27 @@ def draw(found, run, predicted, result, path):
     figure, axes = plt.subplots(
         len(names), 2, figsize=(12.0, 2.0 * len(names) + 0.8), squeeze=False, sharex=True, layout="constrained"
     )  # fmt: skip
-    time = run.start + run.time
+    shown = "score" if result["score_s"] and other_part(result) else "fit"
+    time, (start, end) = run.start + run.time, result[f"{shown}_s"]
+    shows = (time >= start) & (time <= end)
     for c, (name, (left, right)) in enumerate(zip(names, axes, strict=True)):
-        left.plot(time, MICRO * run.strain[:, c], lw=1.4, color="0.6", label="measured")
-        left.plot(time, MICRO * predicted[:, c], lw=0.7, label="predicted")
-        right.plot(time, MICRO * (run.strain - predicted)[:, c], lw=0.5, color="tab:red")
+        left.plot(time[shows], MICRO * run.strain[shows, c], lw=1.4, color="0.6", label="measured")
+        left.plot(time[shows], MICRO * predicted[shows, c], lw=0.7, label="predicted")
+        right.plot(time[shows], MICRO * (run.strain - predicted)[shows, c], lw=0.5, color="tab:red")
         left.set_ylabel(f"{name} [microstrain]")
         right.set_ylabel("residual [microstrain]")
-        for ax in (left, right):
-            if result["score_s"] and result["parts"].get("score"):
-                ax.axvspan(*result["score_s"], color="tab:green", alpha=0.1, lw=0)
     axes[0, 0].legend(fontsize=8)
     for ax in axes[-1]:
-        ax.set_xlabel("time [s]; green: not fitted")
+        ax.set_xlabel("time [s]" + ("" if shown == "fit" else ", not fitted"))
     figure.suptitle(
         f"{found.arm.name}: strains measured and predicted from the motion of the joints"
     )
     return str(save(figure, path, dpi=120))
+
+
+def other_part(result):
+    """Whether a part of the same recording was scored: what there is a prediction to draw of."""
+    return "score" in result["parts"] and not result.get("score_file")
 
 
 def arm_text(path):
