@@ -268,7 +268,7 @@ def test_commands_of_your_own_arm_move_it(monkeypatch):
 
 
 def test_own_law_example_is_found_by_name_and_runs(tmp_path):
-    (law,) = [text for kind, text in BLOCKS if kind == "python"]
+    (law,) = [text for kind, text in BLOCKS if kind == "python" and "class " in text]
     point = re.search(r'\["(pd = [\w.:]+)"\]', README).group(1)
     module = point.split("= ")[1].split(":")[0]
     (tmp_path / f"{module}.py").write_text(law)

@@ -128,7 +128,7 @@ REFUSED = {
         "one_sample.csv one_link": "1 samples are no motion (at least 20",
         "no_position.csv one_link": "no column joint1_position (wanted: t, joint1_position",
         "text.csv one_link": "text.csv:2: joint1_position: 'x' is not a number",
-        "no_torque.csv one_link": "joint_torque: is unknown (NaN) in every sample",
+        "no_torque.csv one_link": "joint_position: does not change",
     },
 }
 LINES = {

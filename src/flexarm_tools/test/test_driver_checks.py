@@ -2,6 +2,7 @@
 """The checks of a driver on simulated samples: a good one passes, each broken one fails with the right sentence."""
 
 import json
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -192,7 +193,9 @@ def test_an_arm_under_its_weight_is_pushed_from_rest():
     assert "FAIL" not in verdicts(found).values(), found
     assert verdicts(found)["response"] == "PASS"
     # Gauges across the push are not judged: it hardly bends them.
-    assert "upper_root_z 1.00" in found["strain response"].text
+    # The arm is simulated with its stiffening, of which the check's model knows nothing.
+    ratio = re.search(r"upper_root_z (\d\.\d+)", found["strain response"].text)[1]
+    assert 0.9 < float(ratio) < 1.02
     assert "upper_root_y" not in found["strain response"].text
 
 

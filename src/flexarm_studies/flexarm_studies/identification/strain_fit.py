@@ -166,7 +166,8 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     Raises
     ------
     FlexarmError
-        For a pattern that matches nothing, an arm without gauges, and where no start can follow the motion.
+        For a pattern that matches nothing, an arm without gauges, joints that do not move, and where no start can
+        follow the motion.
     """
     options = options or Options()
     report = report or (lambda label: None)
@@ -222,6 +223,11 @@ class StrainProblem:
     def __init__(self, arm, recording, options, found=None):
         if not arm.gauges:
             raise FlexarmError("has no gauges", field=arm.name, hint="strains are fitted: add them")
+        if not np.ptp(recording.position, axis=0).max() > 0.0:
+            raise FlexarmError(
+                "does not change", field="joint_position",
+                hint="without torque, strains are fitted to the joints' motion: record one",
+            )  # fmt: skip
         self.options, self.recording = options, recording
         self.predictor = MotionPredictor(arm, recording, options.corner)
         self.setup = Setup.of(arm)
