@@ -69,7 +69,7 @@ class Run:
 
 #: Of a stop's step of torque over the motion's own, where it is more than twice: links with finite slopes swing
 #: otherwise than the controller's model of first order, and the fast control answers.
-MOST_STEP = {"long_reach": 2.3}
+MAX_STEP = {"long_reach": 2.3}
 
 
 class Bench:
@@ -137,7 +137,7 @@ def test_a_stop_takes_little_more_torque_and_strain_than_the_motion_itself(name,
         run = bench.run(STOPS[row])
         assert run.state == State.HOLDING, (row, run.reason)
         assert run.speed <= AT_REST, row
-        assert run.steps.max() <= MOST_STEP.get(name.strip("`"), 2.0) * step, row
+        assert run.steps.max() <= MAX_STEP.get(name.strip("`"), 2.0) * step, row
         assert run.strain <= 1.5 * strain, row
         cells[row] = f"{run.steps.max() / step:.1f}, {run.strain / strain:.1f}"
     measured[name] = cells

@@ -33,8 +33,8 @@ from flexarm_studies.loop.arm import Arrival, BaseArm, MotionError, Reading, Rec
 from .recording.recorder import Recorder, keep_for_recording, to_record
 from .running.processes import Processes, own_domain
 
-#: A loop that runs is found within this time [s].
-JOIN = 2.0
+#: A loop that runs is found within this time, and where it must run within the second [s].
+JOIN, MUST_JOIN = 2.0, 15.0
 #: A goal without an answer is sent again after this time; the arm has this long to stop after Ctrl-C [s].
 AGAIN, STOPPING = 3.0, 10.0
 #: Longer than any motion: a motion's end is waited for as long as the nodes are there [s].
@@ -90,7 +90,7 @@ class Arm(BaseArm):
         try:
             if join is not False:
                 self._connect(Session("flexarm_arm", namespace=namespace))
-                found = self.session.serve(JOIN, self._look)
+                found = self.session.serve(MUST_JOIN if join else JOIN, self._look)
                 if not found and join:
                     hint = "start them, or leave out join=True"
                     raise WaitError("there is no controller/state to join", hint=hint)
