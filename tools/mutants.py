@@ -665,10 +665,34 @@ LIMITS = [
         "trajectory",
         TESTS + "test_trajectory.py",
         (
+            "request",
+            "joints that are left out: at zero",
+            "np.asarray(held, float)[~given] if name",
+            "0.0 * np.asarray(held, float)[~given] if name",
+        ),
+        (
             "reference",
             "a motion under way that is joined: from its first point on",
             "times_ns = trajectory.times_ns - (now_ns - trajectory.stamp_ns)",
             "times_ns = trajectory.times_ns",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "trajectory",
+        TESTS + "test_goal.py",
+        (
+            "goal",
+            "a goal: the tip's swing along the axis with the least",
+            "axis=0).max())",
+            "axis=0).min())",
+        ),
+        ("goal", "a goal: before its motion's end", "if stamp_ns < self._end_ns:", "if False:"),
+        (
+            "goal",
+            "a goal: its own tolerance of the parameter's joint",
+            "limits[row, names.index(name)] = value",
+            "limits[row] = value",
         ),
     ),
     *of(

@@ -79,7 +79,7 @@ def test_estimates_are_those_of_a_bent_beam(two_link):
     chain = Chain(levels.at_level(arm, "stiffening"))
     delta = np.array([0.0, 0.0, 0.03, -0.004])
     short, angle, _ = levels.Slopes(chain).neglected(delta)
-    length = sum(link.length for link in arm.links)
+    length = arm.reach
     origins = sum(j.origin_xyz[0] for j in arm.joints)
     assert short == pytest.approx(
         length + origins - chain.tip_position(np.zeros(2), delta)[0], rel=1e-6

@@ -137,7 +137,7 @@ def test_the_urdf_tip_of_the_first_order_model_is_off_by_second_order_in_the_def
 ):
     m = shipped(name)
     q, delta = pose(m)
-    length = sum(link.length for link in m.arm.links)
+    length = m.arm.reach
     whole, half = tip_errors(m, 16, [(q, delta), (q, 0.5 * delta)])
     assert 3.2 < whole / half < 4.8
     # 1/2 int y'^2 dx with slopes up to some 0.2 rad.

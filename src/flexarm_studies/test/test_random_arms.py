@@ -68,7 +68,7 @@ def test_arms_survive_yaml(drawn):
 def test_arms_are_within_the_bounds(drawn):
     for case in drawn:
         arm, data = case.read(), case.arm
-        reach = sum(link.length for link in arm.links)
+        reach = arm.reach
         assert 0.999 * generator.REACH[0] < reach < 1.001 * generator.REACH[1]
         mass = sum(link.mass for link in arm.links)
         assert 0.0 < arm.payload.mass < 1.01 * generator.PAYLOAD[1] * mass

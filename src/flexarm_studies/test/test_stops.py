@@ -88,7 +88,7 @@ class Bench:
         for _ in range(round(BEFORE / (1e-9 * loop.simulator.period_ns))):
             loop.step()
         if self.plan is None:
-            self.plan = loop._prepared(trajectory)
+            self.plan = loop.prepared(trajectory)
             assert not loop.unprepared
         assert loop.controller.offer(trajectory, self.plan).accepted
         return loop

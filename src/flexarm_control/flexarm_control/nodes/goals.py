@@ -86,12 +86,8 @@ class Goal:
     """
 
     def __init__(self, server, handle, tolerances, message):
-        self.server, self.handle, self.tolerances, self.message = (
-            server,
-            handle,
-            tolerances,
-            message,
-        )
+        self.server, self.handle = server, handle
+        self.tolerances, self.message = tolerances, message
         self.name = message.header.frame_id
         self.check = self.trajectory_id = self.stopping = None
         self.stopped = False
@@ -162,11 +158,10 @@ class GoalsNode(ArmNode):
             [(t.name, t.position, t.velocity) for t in own]
             for own in (request.path_tolerance, request.goal_tolerance)
         )
-        reach = sum(link.length for link in self.arm.links)
         wait = request.goal_time_tolerance
         return goal.tolerances(
             names,
-            reach,
+            self.arm.reach,
             self.parameters.values(),
             *rows,
             wait.sec + 1e-9 * wait.nanosec,

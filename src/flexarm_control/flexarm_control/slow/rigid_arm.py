@@ -34,7 +34,7 @@ class Tip:
         self._chain = rigid_arm(arm)
         self._axes = self._chain.data.axis
         #: Distance from the first joint that the tip can't exceed [m].
-        self.reach = sum(link.length for link in arm.links) + sum(
+        self.reach = arm.reach + sum(
             float(np.linalg.norm(joint.origin_xyz)) for joint in arm.joints[1:]
         )
 

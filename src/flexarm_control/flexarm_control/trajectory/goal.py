@@ -33,8 +33,8 @@ PARAMETERS = (
         "Largest speed of a joint for the goal to succeed. 0.0: not judged."
     ),
     parameter("constraints.tip", 0.0, "m", -1.0, 100.0).described(
-        "How far the tip may still swing to either side for the goal to succeed; 0.0: a thousandth of the arm's reach;"
-        " negative: not judged."
+        "How far the tip may have moved in the last half period of the lowest mode, once to twice its amplitude, for a"
+        " goal to succeed; 0.0: a thousandth of the arm's reach; negative: not judged."
     ),
     parameter("constraints.goal_time", 0.0, "s", 0.0, 1e4).described(
         "A goal that has not succeeded so long after the end of its trajectory is aborted. 0.0: never."

@@ -293,6 +293,11 @@ class Arm:
         return np.array([j.limits.position for j in self.joints], float)
 
     @property
+    def reach(self):
+        """Length of all links together [m]."""
+        return sum(link.length for link in self.links)
+
+    @property
     def velocity_limits(self):
         """Largest speed of each joint, (n,) [rad/s]; infinite where the file has none."""
         return np.array([j.limits.velocity for j in self.joints], float)

@@ -159,7 +159,7 @@ class _Writer:
 
     def __init__(self, chain):
         self.chain, self.arm = chain, chain.arm
-        self.radius = THICKNESS * sum(link.length for link in self.arm.links)
+        self.radius = THICKNESS * self.arm.reach
         self.root = ET.Element("robot", name=self.arm.name)
         for name, colour in (("beam", "0.16 0.44 0.70 1"), ("hub", "0.25 0.25 0.28 1")):
             ET.SubElement(ET.SubElement(self.root, "material", name=name), "color", rgba=colour)

@@ -199,7 +199,7 @@ class Slopes:
                     shapes = model.mode_shapes(link.name, direction)
                     self._slope[axis, i][:, of] = shapes(stations, 1) / link.length
                     self._tip[axis, i, of] = shapes(1.0)
-        self.reach = sum(link.length for link in arm.links)
+        self.reach = arm.reach
         beyond, self._lever = float(np.linalg.norm(arm.payload.offset)), {}
         for joint, link in zip(arm.joints[::-1], arm.links[::-1], strict=True):
             self._lever[link.name] = beyond

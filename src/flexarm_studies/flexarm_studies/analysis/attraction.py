@@ -33,7 +33,7 @@ def directions(case):
         yield name, offset, np.zeros(m), MAX_TURN, "rad"
     shape = lowest_shape(case)
     if shape is not None:
-        reach = sum(link.length for link in case.arm.links)
+        reach = case.arm.reach
         yield "lowest fast mode", np.zeros(n), shape, MAX_BEND * reach, "m"
 
 

@@ -18,7 +18,7 @@ def draw(arm_model, q, path):
     omega, shapes = arm_model.normal_modes(q, locked=True)
     shown = min(MAX_MODES, omega.size)
     straight = axis_points(chain, q, np.zeros(chain.n_modes))
-    reach = max(np.abs(straight).max(), sum(link.length for link in arm.links))
+    reach = max(np.abs(straight).max(), arm.reach)
     long = np.argmax(np.ptp(np.concatenate(straight), axis=0))
     figure, axes = plt.subplots(
         1, shown + 1, figsize=(3.2 * (shown + 1), 3.4), squeeze=False, layout="constrained"

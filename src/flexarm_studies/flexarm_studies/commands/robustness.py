@@ -195,7 +195,7 @@ class Judge:
         self._reference = record
         motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
         self._end = 1e-9 * int(motion.times_ns[-1])
-        self._reach = sum(link.length for link in loop.model.arm.links)
+        self._reach = loop.model.arm.reach
         self.undisturbed = self._sizes(record, loop)
 
     def run(self, **disturbance):

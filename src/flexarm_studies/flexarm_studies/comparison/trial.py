@@ -60,7 +60,7 @@ def _run(case, setup, noisy, seed):
         plant = loop.simulator.plant_model
         # The vibration right after the motion counts, too: the cost, which has a term for settling, was tuned so.
         found = tracking_metrics(record, loop.model, plant, end, case.window, settle=0.0)
-    return row_of(found, case, sum(link.length for link in arm.links))
+    return row_of(found, case, arm.reach)
 
 
 def row_of(found, case, length):

@@ -225,7 +225,7 @@ class BaseArm(ABC):
     def _check(self, data, start_ns):
         """The `GoalCheck` of a motion that starts at a stamp, with the tolerances that nodes have by default."""
         values = {p.name: p.default for p in goal.PARAMETERS}
-        reach = sum(link.length for link in self.arm.links)
+        reach = self.arm.reach
         names = self.model.joint_names
         limits = goal.tolerances(names, reach, values)
         end = start_ns + int(data.times_ns[-1])
@@ -298,10 +298,7 @@ class SimulatedArm(BaseArm):
         loop, controller = self.loop, self.loop.controller
         if controller.plans:
             data = replace(data, stamp_ns=loop.simulator.stamp_ns + loop.simulator.period_ns)
-            plan = controller.prepare(data)
-        else:
-            plan = None
-        verdict = controller.offer(data, plan)
+        verdict = controller.offer(data, loop.prepared(data))
         if not verdict.accepted:
             raise MotionError(verdict.reason)
         begin = loop.simulator.stamp_ns

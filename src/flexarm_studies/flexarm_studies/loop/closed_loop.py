@@ -97,7 +97,7 @@ class ClosedLoop:
         self._publish_velocity = settings["publish_joint_velocity"]
         self._publish_amplitude = settings["publish_modal_amplitude"]
         self._set_delay(delay)
-        self._reach = sum(link.length for link in model.arm.links)
+        self._reach = model.arm.reach
         self.lost = self.unprepared = ""
         self.bag = self.designed = None
 
@@ -242,7 +242,7 @@ class ClosedLoop:
         """
         self.lost, self._failure = "", None
         self._answer()
-        verdict = self.controller.offer(trajectory, self._prepared(trajectory))
+        verdict = self.controller.offer(trajectory, self.prepared(trajectory))
         if not verdict.accepted:
             raise MessageError(f"trajectory refused: {verdict.reason}")
         simulator, length = self.simulator, round(duration * 1e9)
@@ -263,7 +263,7 @@ class ClosedLoop:
         time = 1e-9 * (np.array(stamps) - (stamps[0] if start is None else start))
         return self._record(np.column_stack([time, rows]))
 
-    def _prepared(self, trajectory):
+    def prepared(self, trajectory):
         """What the feed-forward makes of the trajectory before it is offered; None where it can't."""
         controller = self.controller
         self.unprepared = ""

@@ -338,7 +338,7 @@ def _peak_strain(whole, profile):
     None where the arm bends too far, at rest or in motion.
     """
     rows, n = gauge_rows(whole, whole.arm.gauges), whole.n_joints
-    reach = sum(link.length for link in whole.arm.links)
+    reach = whole.arm.reach
     strains = []
     for t in np.linspace(0.0, profile.duration, 21):
         q, qd, qdd = (profile.derivative(k, t) for k in range(3))

@@ -128,7 +128,7 @@ class Task:
         self.profile = specs.motion(family, settings, self.model, still)
         self.ends = self.profile.position(0.0), self.profile.position(self.profile.duration)
         self.omega = 2.0 * np.pi / case.period
-        self.reach = sum(link.length for link in self.model.arm.links)
+        self.reach = self.model.arm.reach
         self.places = tuple(
             self.profile.position(x * self.profile.duration) for x in (0.0, 0.5, 1.0)
         )

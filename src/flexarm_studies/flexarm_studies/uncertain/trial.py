@@ -185,7 +185,7 @@ def judged(case, plant, record, end):
     }
     if record.time[-1] < end + window_of(case) - 0.01:
         return found  # lost on the way
-    reach = sum(link.length for link in plant.arm.links)
+    reach = plant.arm.reach
     after = record.time >= end - 1e-9
     time, target = record.time[after] - end, record.reference[-1]
     tip = tip_path(plant, record.plant_position[after], record.plant_amplitude[after])

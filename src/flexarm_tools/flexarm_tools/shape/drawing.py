@@ -50,7 +50,7 @@ class Drawer:
 
     def __init__(self, model, count=12):
         self.arm, self._model, self._count = model.arm, model, count
-        self.reach = sum(link.length for link in self.arm.links)
+        self.reach = self.arm.reach
         self._sections, self._ends = Sections(model, count), Sections(model, 1)
         self._linear = None
         self._axes = np.array([joint.axis for joint in self.arm.joints])

@@ -75,9 +75,13 @@ class SourceAmplitudes:
             Whether amplitudes and strains contradict each other.
         """
         c, g, now = self._channels, self._channels.g, self._now
-        strain = value[c.strain]
+        strain, amplitude = value[c.strain], value[c.amplitude]
+        if amplitude[0] != amplitude[0]:  # NaN, as most sources have it
+            if self._count:
+                self.reset()
+            return False
         np.dot(self._project, strain, out=now[:g])
-        np.dot(self._rows, value[c.amplitude], out=now[g:])
+        np.dot(self._rows, amplitude, out=now[g:])
         if not np.isfinite(now).all() or c.at_end(strain).any():
             self.reset()
             return False
