@@ -241,6 +241,20 @@ TESTS = "flexarm_control/test/"
 LAWS = [
     *of(
         "flexarm_control",
+        "motions",
+        TESTS + "test_shapers.py",
+        (
+            "shapers",
+            "damped period: natural",
+            "return np.pi / (omega * root), ",
+            "return np.pi / omega, ",
+        ),
+        ("shapers", "MZV: decay of half a period", "k = K**MZV_SPACING", "k = K"),
+        ("shapers", "two-hump EI: its zeros", "c = 3.0 - 3.0 / x0**2", "c = 3.0 - 2.9 / x0**2"),
+        ("shapers", "ZVDD: an impulse", "3.0 * K**2, K**3", "3.0 * K, K**3"),
+    ),
+    *of(
+        "flexarm_control",
         "slow",
         TESTS + "test_slow_laws.py",
         (

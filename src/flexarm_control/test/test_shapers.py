@@ -91,6 +91,69 @@ def test_ei_leaves_five_percent_at_the_design_frequency_and_nothing_beside_it():
     )
 
 
+@pytest.mark.parametrize("kind", shapers.SHAPERS)
+@pytest.mark.parametrize("damping", [0.0, 0.01, 0.08, 0.2])
+def test_every_shaper_keeps_the_end_of_a_motion_and_is_as_good_as_its_name(kind, damping):
+    times, amplitudes = train = shapers.impulses(kind, 3.1, damping)
+    assert amplitudes.sum() == pytest.approx(1.0, abs=1e-14) and (amplitudes > 0.0).all()
+    assert times[0] == 0.0 and (np.diff(times) > 0.0).all()
+    period = 1.0 / (3.1 * np.sqrt(1.0 - damping**2))
+    periods = {"zv": 0.5, "mzv": 0.75, "zvd": 1.0, "ei": 1.0, "2hump_ei": 1.5, "zvdd": 1.5}
+    assert train.duration == pytest.approx(periods[kind] * period, rel=1e-14)
+    left = train.residual(2.0 * np.pi * 3.1, damping)
+    assert left == pytest.approx(shapers.EI_RESIDUAL if kind == "ei" else 0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "order"), [("zv", 1), ("mzv", 1), ("zvd", 2), ("zvdd", 3)])
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_the_residual_of_a_zero_of_higher_order_is_that_flat(kind, order, damping):
+    """V goes as the distance from the design pole to the power of 1, 2, 3: half the distance, so much less."""
+    train, omega = shapers.impulses(kind, 1.0, damping), 2.0 * np.pi
+    near, nearer = (train.residual(omega * (1.0 + off), damping) for off in (2e-3, 1e-3))
+    assert np.log2(near / nearer) == pytest.approx(order, abs=0.01)
+
+
+def test_two_hump_ei_has_humps_of_its_tolerance_and_the_published_amplitudes():
+    """Singhose et al. (1997): A1 = (3X^2 + 2X + 3V^2) / (16X), X = (V^2 (sqrt(1 - V^2) + 1))^(1/3), A2 = 1/2 - A1."""
+    V = shapers.EI_RESIDUAL
+    train = shapers.impulses("2hump_ei", 1.0, 0.0)
+    X = np.cbrt(V**2 * (np.sqrt(1.0 - V**2) + 1.0))
+    first = (3.0 * X**2 + 2.0 * X + 3.0 * V**2) / (16.0 * X)
+    np.testing.assert_allclose(
+        train.amplitudes, [first, 0.5 - first, 0.5 - first, first], rtol=1e-12
+    )
+    ratio = np.linspace(0.72, 1.28, 20001)
+    inside = train.residual(2.0 * np.pi * ratio, 0.0)
+    assert inside.max() == pytest.approx(V, rel=1e-6)
+    assert ((inside[1:-1] > inside[:-2]) & (inside[1:-1] > inside[2:])).sum() == 2
+    # With damping the humps are nearly as high.
+    damped = shapers.impulses("2hump_ei", 1.0, 0.05).residual(2.0 * np.pi * ratio, 0.05)
+    assert damped.max() == pytest.approx(V, rel=0.35)
+
+
+def test_mzv_is_that_of_klipper():
+    """At 0, 3/8 and 3/4 of a period: 1 - 1/sqrt 2, sqrt 2 - 1 and 1 - 1/sqrt 2 without damping."""
+    times, amplitudes = shapers.impulses("mzv", 2.0, 0.0)
+    np.testing.assert_allclose(times, [0.0, 0.1875, 0.375], rtol=1e-14)
+    side = 1.0 - np.sqrt(0.5)
+    np.testing.assert_allclose(amplitudes, [side, np.sqrt(2.0) - 1.0, side], rtol=1e-14)
+    k = np.exp(-0.75 * 0.1 * np.pi / np.sqrt(0.99))
+    raw = np.array([side, (np.sqrt(2.0) - 1.0) * k, side * k**2])
+    damped = shapers.impulses("mzv", 2.0, 0.1).amplitudes
+    np.testing.assert_allclose(damped, raw / raw.sum(), rtol=1e-14)
+
+
+def test_convolved_trains_unpack_and_none_changes_nothing():
+    pairs = [tuple(shapers.impulses("zv", f, 0.02)) for f in (3.0, 9.0)]
+    both = shapers.convolve(pairs)
+    expected = shapers.for_modes("zv", 2.0 * np.pi * np.array([3.0, 9.0]), [0.02, 0.02])
+    np.testing.assert_array_equal(both.times, expected.times)
+    np.testing.assert_array_equal(both.amplitudes, expected.amplitudes)
+    alone = shapers.convolve([shapers.impulses("none", 3.0, 0.0), both])
+    np.testing.assert_array_equal(alone.times, both.times)
+    assert shapers.impulses("none", 3.0, 0.0).duration == 0.0
+
+
 @pytest.mark.parametrize("kind", ["zv", "zvd"])
 @pytest.mark.parametrize("off", [0.8, 1.0, 1.15])
 def test_an_integrated_oscillator_keeps_what_the_formula_says(kind, off):
@@ -156,6 +219,8 @@ def test_on_the_papers_arm_the_fast_subsystem_is_left_at_rest(arm_r):
         (lambda arm: shapers.zvd(3.0, 1.0), "shaper damping ratio", 1.0),
         (lambda arm: shapers.zv(3.0, -0.1), "shaper damping ratio", -0.1),
         (lambda arm: shapers.for_modes("si", [1.0], [0.0]), "shaper", "si"),
+        (lambda arm: shapers.impulses("zvddd", 1.0, 0.0), "shaper", "zvddd"),
+        (lambda arm: shapers.impulses("mzv", np.inf, 0.0), "shaper frequency", np.inf),
         (lambda arm: shapers.for_modes("zv", [], []), "shaper modes", NOT_GIVEN),
         (lambda arm: shapers.for_modes("zvd", [1.0] * 7, [0.0] * 7), "shaper impulses", 2187),
         (lambda arm: shapers.for_arm(arm, [0.0], "zv", 3), "shaper modes", 3),

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 
+from flexarm_control.motions import shapers
 from flexarm_control.trajectory import files, specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
@@ -53,7 +54,7 @@ def add_arguments(parser):
         "--velocity-limit",
         help=f"least-exciting: largest speed, {each} [rad/s] (default: the arm file's)",
     )
-    add("--shaper", choices=("zv", "zvd", "ei"), help="shape the motion; it gets longer")
+    add("--shaper", choices=tuple(shapers.SHAPERS), help="shape the motion; it gets longer")
     add(
         "--shape-modes",
         type=int,

@@ -18,7 +18,16 @@ Any motion convolved with the train leaves the same fraction of its own vibratio
   zero at one frequency on either side. In ZV, -K is the zero of the train's polynomial; here the two zeros
   :math:`-Ke^{\pm j\varphi}` make A proportional to (1, 2K cos phi, K^2), with
   :math:`\cos\varphi = (2K^2 - V(1+K^2))/(2K^2 + 2KV)`. Without damping these are the published
-  ((1 + V)/4, (1 - V)/2, (1 + V)/4).
+  ((1 + V)/4, (1 - V)/2, (1 + V)/4);
+- MZV (Klipper's input shaper), 3/4 of a period: three impulses 3/8 of a period apart, with k the decay from one to
+  the next, A proportional to (1, sqrt 2 k, k^2). V = 0 at the design frequency, at less delay than ZVD and EI;
+- ZVDD (two derivatives), 3/2 periods: A = (1, 3K, 3K^2, K^3) / (1 + K)^3, ZV convolved with itself twice;
+- two-hump EI (Singhose, Porter, Tuttle & Singer 1997), 3/2 periods: V = 0 at the design frequency and at one on
+  either side; between them two humps as high as `EI_RESIDUAL`. Zeros at -K and :math:`-Ke^{\pm j\varphi}` make A
+  proportional to (1, cK, cK^2, K^3), :math:`c = 1 + 2\cos\varphi`. Without damping
+  :math:`V = |T_3(x_0\cos\frac{\omega T}{4})| / T_3(x_0)`, with T_3 the Chebyshev polynomial and T the design period,
+  which gives :math:`x_0 = \cosh(\frac13 \mathrm{arcosh}\frac1V)` and :math:`\cos\varphi = 1 - 3/(2x_0^2)`, that is, the
+  published amplitudes. With damping the humps are as high as that only nearly.
 
 For several modes the trains are convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
 subsystem (11), whose input is the slow torque of the motion. While mass matrix and configuration do not change,
@@ -40,6 +49,8 @@ from .profiles import Motion
 MAX_IMPULSES = 1000
 #: Fraction of the vibration that EI leaves at the design frequency [-].
 EI_RESIDUAL = 0.05
+#: Time between two impulses of MZV over half the damped period [-].
+MZV_SPACING = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +59,10 @@ class Shaper:
 
     times: np.ndarray  # from 0, ascending, (k,) [s]
     amplitudes: np.ndarray  # above 0, with sum 1, (k,) [-]
+
+    def __iter__(self):
+        """``times, amplitudes = shaper``."""
+        return iter((self.times, self.amplitudes))
 
     @property
     def duration(self):
@@ -118,6 +133,48 @@ def zv(omega, zeta) -> Shaper:
     DesignError
         If the mode does not vibrate, or grows.
     """
+    half, K = _half_period(omega, zeta)
+    return _spaced(half, [1.0, K])
+
+
+def zvd(omega, zeta) -> Shaper:
+    """Return the zero-vibration-and-derivative shaper of a mode; parameters as for `zv`."""
+    half, K = _half_period(omega, zeta)
+    return _spaced(half, [1.0, 2.0 * K, K**2])
+
+
+def zvdd(omega, zeta) -> Shaper:
+    """Return the shaper of a mode with two derivatives that are zero; parameters as for `zv`."""
+    half, K = _half_period(omega, zeta)
+    return _spaced(half, [1.0, 3.0 * K, 3.0 * K**2, K**3])
+
+
+def mzv(omega, zeta) -> Shaper:
+    """Return the modified zero-vibration shaper of a mode; parameters as for `zv`."""
+    half, K = _half_period(omega, zeta)
+    k = K**MZV_SPACING
+    return _spaced(MZV_SPACING * half, [1.0, np.sqrt(2.0) * k, k**2])
+
+
+def ei(omega, zeta) -> Shaper:
+    """Return the extra-insensitive shaper of a mode; parameters as for `zv`."""
+    half, K = _half_period(omega, zeta)
+    V = EI_RESIDUAL
+    # Where so much damping leaves less than V by itself, the middle impulse vanishes.
+    cosine = max((2.0 * K**2 - V * (1.0 + K**2)) / (2.0 * K**2 + 2.0 * K * V), 0.0)
+    return _spaced(half, [1.0, 2.0 * K * cosine, K**2])
+
+
+def two_hump_ei(omega, zeta) -> Shaper:
+    """Return the two-hump extra-insensitive shaper of a mode; parameters as for `zv`."""
+    half, K = _half_period(omega, zeta)
+    x0 = np.cosh(np.arccosh(1.0 / EI_RESIDUAL) / 3.0)
+    c = 3.0 - 3.0 / x0**2
+    return _spaced(half, [1.0, c * K, c * K**2, K**3])
+
+
+def _half_period(omega, zeta):
+    """Half the damped period of a mode [s], and K, its decay in that time [-]."""
     omega, zeta = float(omega), float(zeta)
     if not 0.0 < omega < np.inf:
         raise DesignError(
@@ -132,32 +189,82 @@ def zv(omega, zeta) -> Shaper:
             hint="shape fewer modes",
         )
     root = np.sqrt(1.0 - zeta**2)
-    K = np.exp(-zeta * np.pi / root)
-    return Shaper(np.array([0.0, np.pi / (omega * root)]), np.array([1.0, K]) / (1.0 + K))
+    return np.pi / (omega * root), np.exp(-zeta * np.pi / root)
 
 
-def zvd(omega, zeta) -> Shaper:
-    """Return the zero-vibration-and-derivative shaper of a mode; parameters as for `zv`."""
-    single = zv(omega, zeta)
-    first, last = single.amplitudes
-    half = single.duration
-    return Shaper(
-        np.array([0.0, half, 2.0 * half]), np.array([first**2, 2.0 * first * last, last**2])
-    )
-
-
-def ei(omega, zeta) -> Shaper:
-    """Return the extra-insensitive shaper of a mode; parameters as for `zv`."""
-    single = zv(omega, zeta)
-    K, V, half = single.amplitudes[1] / single.amplitudes[0], EI_RESIDUAL, single.duration
-    # Where so much damping leaves less than V by itself, the middle impulse vanishes.
-    cosine = max((2.0 * K**2 - V * (1.0 + K**2)) / (2.0 * K**2 + 2.0 * K * V), 0.0)
-    train = np.array([1.0, 2.0 * K * cosine, K**2])
+def _spaced(spacing, train):
+    """The shaper of a train of equal spacing; impulses of 0 are left out."""
+    train = np.array(train)
     kept = train > 0.0
-    return Shaper(half * np.arange(3.0)[kept], train[kept] / train.sum())
+    return Shaper(spacing * np.arange(train.size)[kept], train[kept] / train.sum())
 
 
-SHAPERS = {"zv": zv, "zvd": zvd, "ei": ei}
+#: By how much each mode's motion gets longer: half a period (ZV), 3/4, 1 (ZVD, EI), 3/2 (2hump_ei, ZVDD).
+SHAPERS = {
+    "zv": zv,
+    "mzv": mzv,
+    "zvd": zvd,
+    "ei": ei,
+    "2hump_ei": two_hump_ei,
+    "zvdd": zvdd,
+}
+#: Leaves a motion as it is.
+NONE = "none"
+
+
+def impulses(kind, frequency, damping) -> Shaper:
+    """Return the shaper of one mode; ``times, amplitudes = impulses(...)`` gives its train.
+
+    Parameters
+    ----------
+    kind : str
+        One of `SHAPERS`, or ``none``: a single impulse, whatever the mode.
+    frequency : float
+        Natural (undamped) frequency, above 0 [Hz].
+    damping : float
+        Damping ratio, at least 0 and below 1 [-].
+
+    Raises
+    ------
+    DesignError
+        If there is no such shaper, or the mode does not vibrate, or grows.
+    """
+    if kind == NONE:
+        return Shaper(np.zeros(1), np.ones(1))
+    if kind not in SHAPERS:
+        limit = ", ".join([*SHAPERS, NONE])
+        raise DesignError("is unknown", field="shaper", value=kind, limit=limit)
+    return SHAPERS[kind](2.0 * np.pi * float(frequency), damping)
+
+
+def convolve(trains) -> Shaper:
+    """Return the convolution of shapers: each takes out its mode, and the delays add up.
+
+    Parameters
+    ----------
+    trains : sequence of Shaper or of (times, amplitudes)
+
+    Raises
+    ------
+    DesignError
+        If there is none, or they have more impulses than `MAX_IMPULSES` together.
+    """
+    trains = [
+        train if isinstance(train, Shaper) else Shaper(*(np.asarray(part, float) for part in train))
+        for train in trains
+    ]
+    if not trains:
+        raise DesignError("no modes", field="shaper modes", hint="give at least one")
+    count = int(np.prod([float(train.times.size) for train in trains]))
+    if count > MAX_IMPULSES:
+        raise DesignError(
+            f"of {len(trains)} modes are too many",
+            field="shaper impulses",
+            value=count,
+            limit=MAX_IMPULSES,
+            hint="shape fewer modes",
+        )
+    return reduce(matmul, trains)
 
 
 def for_modes(kind, omega, zeta) -> Shaper:
@@ -166,30 +273,17 @@ def for_modes(kind, omega, zeta) -> Shaper:
     Parameters
     ----------
     kind : str
-        ``zv``, ``zvd`` or ``ei``.
+        One of `SHAPERS`, or ``none``.
     omega, zeta : (k,) array_like
         Natural frequencies [rad/s] and damping ratios [-].
 
     Raises
     ------
     DesignError
-        If there is no such shaper, no mode, more impulses than `MAX_IMPULSES`, and as for `zv`.
+        As for `impulses` and `convolve`.
     """
-    if kind not in SHAPERS:
-        raise DesignError("is unknown", field="shaper", value=kind, limit=", ".join(SHAPERS))
-    trains = [SHAPERS[kind](w, z) for w, z in zip(omega, zeta, strict=True)]
-    if not trains:
-        raise DesignError("no modes", field="shaper modes", hint="give at least one")
-    impulses = int(np.prod([train.times.size for train in trains]))
-    if impulses > MAX_IMPULSES:
-        raise DesignError(
-            f"of {kind} for {len(trains)} modes are too many",
-            field="shaper impulses",
-            value=impulses,
-            limit=MAX_IMPULSES,
-            hint="shape fewer modes",
-        )
-    return reduce(matmul, trains)
+    hertz = 2.0 * np.pi
+    return convolve([impulses(kind, w / hertz, z) for w, z in zip(omega, zeta, strict=True)])
 
 
 def modes_at(model, q):
@@ -212,7 +306,7 @@ def for_arm(model, q, kind, modes=2) -> Shaper:
     q : (n,) array_like
         Where the motion ends: the vibration that is left is the one there [rad].
     kind : str
-        ``zv``, ``zvd`` or ``ei``.
+        One of `SHAPERS`, or ``none``.
     modes : int
         How many of the lowest; at most as many as the arm has.
 

@@ -16,8 +16,8 @@ line           tip, duration, smoothness      the tip on a straight line, `tip_p
 arc            tip, via, duration, smoothness the tip on a circle through a point on the way
 ============== ============================== ==========================================================
 
-All families take ``from`` (joint angles at the start), ``shaper`` (zv, zvd, ei), ``shape-modes`` (for how many of the
-arm's lowest modes) and ``points``.
+All families take ``from`` (joint angles at the start), ``shaper`` (zv, mzv, zvd, ei, 2hump_ei, zvdd), ``shape-modes``
+(for how many of the arm's lowest modes) and ``points``.
 """
 
 import math
