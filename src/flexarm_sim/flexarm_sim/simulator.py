@@ -173,6 +173,14 @@ class Simulator:
             else:
                 self.plant.advance(torque, fraction)
                 self.torque += fraction * np.asarray(torque)
+        self._next_sample()
+
+    def advance_with(self, drive):
+        """Advance by one period by ``drive(plant, time)``, which moves the plant and returns the mean torque (n,)."""
+        self.torque[:] = drive(self.plant, self.time)
+        self._next_sample()
+
+    def _next_sample(self):
         self.sequence = (self.sequence + 1) % 2**32  # a uint32 on the topic
         self.stamp_ns += self.period_ns
         if self.sequence % self._samples_per_check == 0:
