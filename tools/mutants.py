@@ -50,7 +50,9 @@ class Mutant:
 def of(package, folder, tests, *rows):
     """Mutants of modules in one folder: rows of (module, name, old, new), or with tests of their own at the end."""
     return [
-        Mutant(name, f"{package}/{package}/{folder}/{module}.py", old, new, *(own or [tests]))
+        Mutant(
+            name, str(Path(package, package, folder, f"{module}.py")), old, new, *(own or [tests])
+        )
         for module, name, old, new, *own in rows
     ]
 
@@ -730,6 +732,23 @@ LIMITS = [
             "torque of a trajectory: the hold at its end",
             "    hold[0, 0] = path.end\n",
             "    pass\n",
+        ),
+    ),
+    *of(
+        "flexarm_dynamics",
+        "",
+        "flexarm_dynamics/test/test_sampling.py",
+        (
+            "sampling",
+            "any period: both sides of the noise's series",
+            "noise = noise + noise.T",
+            "noise = 2.0 * noise",
+        ),
+        (
+            "sampling",
+            "any period: transitions add up",
+            "Gamma = first.Gamma + first.Phi @ Gamma",
+            "Gamma = first.Gamma + Gamma",
         ),
     ),
     *of(

@@ -12,12 +12,13 @@ from scipy.stats import chi2
 
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import design_observer, observe
-from flexarm_control.observers.motion import Motion, discretise
+from flexarm_control.observers.motion import Motion
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Friction
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models import model
+from flexarm_dynamics.sampling import discretise
 from flexarm_sim.integrators import integrate
 
 MS = 10**6  # [ns]

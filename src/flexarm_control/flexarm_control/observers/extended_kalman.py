@@ -27,9 +27,10 @@ import numpy as np
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import jacobian
 from flexarm_dynamics.parameters import Parameter, parameter
+from flexarm_dynamics.sampling import discretise
 
 from .kalman import NOISE, Kalman
-from .motion import DIFFERENCE, discretise, force_density, mass_matrix
+from .motion import DIFFERENCE, force_density, mass_matrix
 
 
 def _flag(name, default, what):

@@ -27,8 +27,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexarm_dynamics.linear import sampled
 from flexarm_dynamics.parameters import parameter
+from flexarm_dynamics.sampling import Sampling
 from flexarm_dynamics.singular_perturbation import fast_subsystem
 
 from .base import Observer, need_torque
@@ -51,7 +51,8 @@ class Luenberger(Observer):
         super().__init__(model, parameters)
         self.pole = self.parameters["pole"]
         # One design per time step and configuration rounded to 0.1 rad, so that it does not depend on the past.
-        self._kept = lru_cache(self.KEPT)(lambda dt, *q: self.design(dt, np.array(q)))
+        self._kept = lru_cache(self.KEPT)(lambda dt, *q: self.design(dt, q))
+        self._linear = lru_cache(self.KEPT)(self._linearised)
         self.innovation = np.zeros(model.n_modes)
         # Beyond a quarter period of the fastest mode its rate can't be found from the amplitudes: Phi12 gets singular.
         self._max_step = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
@@ -66,16 +67,23 @@ class Luenberger(Observer):
             Columns for u - f1 and for f2 of (2).
         L : ndarray, shape (m, m)
         """
-        m, n = self.model.n_modes, self.model.n_joints
-        terms = self.model.terms(q, np.zeros(n))
-        _, _, H21, H22 = terms.partition()
-        forces = np.vstack([np.zeros((m, n + m)), np.hstack([H21, -H22])])
-        Phi, Gamma = sampled(fast_subsystem(terms)[0], forces, dt)
+        m = self.model.n_modes
+        fast, forces = self._linear(*np.asarray(q, float).tolist())
+        step = fast.step(dt)
+        Phi, Gamma = step.Phi, step.Gamma @ forces
         decay = np.exp(-self.pole * dt)
         if dt > self._max_step:
             return Phi, Gamma, np.zeros((m, m))
         L = np.linalg.solve(Phi[:m, m:].T, (Phi[m:, m:] - decay * np.eye(m)).T).T
         return Phi, Gamma, L
+
+    def _linearised(self, *q):
+        """Of a configuration: the `Sampling` of (11), and its forces (2m, n + m)."""
+        m, n = self.model.n_modes, self.model.n_joints
+        terms = self.model.terms(np.array(q), np.zeros(n))
+        _, _, H21, H22 = terms.partition()
+        forces = np.vstack([np.zeros((m, n + m)), np.hstack([H21, -H22])])
+        return Sampling(fast_subsystem(terms)[0].copy()), forces
 
     def update(self, sample, dt):
         if self._elapsed < 0.0:

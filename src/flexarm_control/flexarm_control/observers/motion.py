@@ -15,32 +15,25 @@ gravity's curvature) are held over the step. Forces of spectral density S on joi
 to the covariance (Van Loan 1978). A and B are taken at the straight arm at rest, with viscous friction only: the
 gradient of Coulomb friction at rest is wrong for a moving joint.
 
-Designs are kept per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
-the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion.
+Designs are made per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
+the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion. Linearisations
+are kept per configuration; a new time step there costs a short series (`flexarm_dynamics.sampling`) in place of two
+matrix exponentials, as at every sample of a source whose stamps jitter or whose samples get lost.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from flexarm_dynamics.linear import sampled, sampled_noise, state_matrix
+from flexarm_dynamics.linear import state_matrix
+from flexarm_dynamics.sampling import Sampling
 
 #: Steps of the central differences: sizes of a joint angle, a deflection and their rates [rad, m, rad/s, m/s].
 DIFFERENCE = 1e-5
-#: Time steps and configurations that designs are kept for; a new one costs a millisecond or so.
+#: Time steps that designs are kept for; a new one costs some 20 us.
 KEPT = 256
-
-
-@dataclass(frozen=True)
-class Step:
-    """A linearised step; matrices of shape (N, N)."""
-
-    length: float  # h [s]
-    A: np.ndarray  # linearisation
-    Phi: np.ndarray  # transition, e^(Ah)
-    Gamma: np.ndarray  # its integral
-    Q: np.ndarray | None  # covariance that the noise adds
+#: Configurations that linearisations are kept for; a new one costs a millisecond or so.
+CONFIGURATIONS = 64
 
 
 def mass_matrix(model, q, delta):
@@ -59,13 +52,6 @@ def force_density(model, x, density):
     return out
 
 
-def discretise(A, length, density=None):
-    """The `Step` of a linearisation over `length`; `density` (N, N) of the noise on the state's rates."""
-    Phi, Gamma = sampled(A, np.eye(len(A)), length)
-    Q = None if density is None else sampled_noise(A, density, length)
-    return Step(length, A, Phi, Gamma, Q)
-
-
 class Motion:
     """Predicts an arm's state; designs are kept.
 
@@ -79,16 +65,23 @@ class Motion:
     def __init__(self, model, density=None):
         self.model, self.density = model, density
         self._n, self._size = model.n_joints, model.n_joints + model.n_modes
-        self._kept = lru_cache(KEPT)(lambda dt, *q: self.design(dt, np.array(q)))
+        self._kept = lru_cache(KEPT)(self._design)
+        self._linear = lru_cache(CONFIGURATIONS)(lambda *q: Sampling(*self.linearise(np.array(q))))
+
+    def linearise(self, q):
+        """A at rest in configuration q (n,) [rad], and the density of the noise on the state's rates, or None."""
+        rest = np.concatenate([q, np.zeros(2 * self._size - self._n)])
+        A = state_matrix(self.model, rest, coulomb=False, step=DIFFERENCE)
+        if self.density is None:
+            return A, None
+        return A, force_density(self.model, rest, self.density)
 
     def design(self, dt, q):
         """The `Step` over dt [s] at rest in configuration q (n,) [rad]."""
-        rest = np.concatenate([q, np.zeros(2 * self._size - self._n)])
-        A = state_matrix(self.model, rest, coulomb=False, step=DIFFERENCE)
-        density = self.density
-        if density is not None:
-            density = force_density(self.model, rest, density)
-        return discretise(A, dt, density)
+        return self._design(dt, *np.asarray(q, float).tolist())
+
+    def _design(self, dt, *q):
+        return self._linear(*q).step(dt)
 
     def step_for(self, dt, position):
         """The kept `Step` for a time step and configuration like these."""

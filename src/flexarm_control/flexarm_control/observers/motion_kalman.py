@@ -23,6 +23,8 @@ A bias and a slow deflection differ only by what the motion makes of them: at re
 beyond ``bias_deviation``.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
@@ -31,7 +33,7 @@ from flexarm_dynamics.linear import jacobian
 from flexarm_dynamics.parameters import parameter
 
 from .kalman import NOISE, UNSTATED_STRAIN, Kalman, position_uncertainty
-from .motion import DIFFERENCE, Motion, discretise, mass_matrix
+from .motion import DIFFERENCE, Motion, mass_matrix
 
 _OF_STRAINS = {p.name: p for p in NOISE if p.name in ("strain_noise", "position_noise")}
 #: Variance of a reading that is none, over that of the gauge's noise.
@@ -270,7 +272,7 @@ class PrescribedMotion(Motion):
         bent = -np.linalg.solve(M[n:, n:], force)
         return np.concatenate([qd, delta_d, a, bent, -a / self._values["acceleration_time"]])
 
-    def design(self, dt, q):
+    def linearise(self, q):
         n, p, moving, values = self._n, self._size, self._moving, self._values
         rest = np.zeros(moving)
         rest[:n] = q
@@ -283,12 +285,16 @@ class PrescribedMotion(Motion):
         S[jerk, jerk] = np.square(values["jerk_noise"])
         bias = np.arange(moving, moving + self._gauges)
         S[bias, bias] = self._bias_walk
-        step = discretise(A, dt, S)
+        return A, S
+
+    def _design(self, dt, *q):
+        step = super()._design(dt, *q)
         # The shared noise goes from sample to sample, however long that takes.
-        last = slice(moving + self._gauges, self.size)
-        step.Phi[last, last] = self._companion
-        step.Q[last.start, last.start] = self._fresh
-        return step
+        last = slice(self._moving + self._gauges, self.size)
+        Phi, Q = step.Phi.copy(), step.Q.copy()
+        Phi[last, last] = self._companion
+        Q[last.start, last.start] = self._fresh
+        return replace(step, Phi=Phi, Q=Q)
 
     def advance(self, x, torque, dt, step):
         """The state after dt, shape (N,); the `torque` is not used."""

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Exact sampling of one linear system over periods that differ from sample to sample, without exponentials.
+
+A loop whose samples get lost, or whose stamps jitter, asks for another period at every sample. With :math:`\Phi(h) =
+e^{Ah}`, :math:`\Gamma(h) = \int_0^h e^{As}ds` and :math:`Q(h) = \int_0^h e^{As}Se^{A^Ts}ds`, steps add up,
+
+.. math::
+    \Phi(h_0 + e) = \Phi(e)\Phi(h_0), \quad \Gamma(h_0 + e) = \Gamma(h_0) + \Phi(h_0)\Gamma(e), \quad
+    Q(h_0 + e) = \Phi(e)Q(h_0)\Phi(e)^T + Q(e),
+
+so that only multiples :math:`h_0` of a short period g need the exponential, and are kept. The rest e, below g,
+is a Taylor series whose terms do not depend on e:
+
+.. math::
+    \Phi(e) = \sum_k \frac{e^k}{k!}A^k, \quad \Gamma(e) = \sum_k \frac{e^{k+1}}{(k+1)!}A^k, \quad
+    Q(e) = \sum_k \frac{e^{k+1}}{(k+1)!}L^kS, \quad L X = AX + XA^T.
+
+With x = :math:`\|A\|g`, the norm taken after balancing, the remainder of the first series after K terms is below
+:math:`x^K/K!\cdot e^x` in the balanced norm, that of the others below :math:`(2x)^K/K!\cdot e^{2x}` of their size. g is
+chosen for x below `REACH`, and K so that both are below `ERROR`. A positive rest only ever adds covariances, so nothing
+cancels.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import matrix_balance
+
+from .linear import sampled, sampled_noise
+
+#: Largest norm of A times the short period [-]; and the relative remainder of the series [-].
+REACH, ERROR = 0.5, 1e-17
+#: The short period is one of these [us]: common sampling periods are multiples of them.
+PERIODS = (500, 250, 100, 50, 25, 10, 5, 2, 1)
+#: Multiples of the short period that are kept.
+KEPT = 24
+
+
+@dataclass(frozen=True)
+class Step:
+    """A linear system over one period; matrices of shape (N, N)."""
+
+    length: float  # h [s]
+    A: np.ndarray  # of the system
+    Phi: np.ndarray  # transition, e^(Ah)
+    Gamma: np.ndarray  # its integral
+    Q: np.ndarray | None  # covariance that the noise adds
+
+
+def discretise(A, length, density=None):
+    """The `Step` over `length`, by the matrix exponential; `density` (N, N) of the noise on the state's rates."""
+    Phi, Gamma = sampled(A, np.eye(len(A)), length)
+    Q = None if density is None else sampled_noise(A, density, length)
+    return Step(length, A, Phi, Gamma, Q)
+
+
+class Sampling:
+    """Steps of one linear system, cheap for any period.
+
+    Parameters
+    ----------
+    A : ndarray, shape (N, N)
+    density : ndarray, shape (N, N), optional
+        Spectral density S of the noise on the state's rates.
+
+    Attributes
+    ----------
+    grid : float
+        The short period g [s]. A multiple of it has the very step of `discretise`.
+    """
+
+    def __init__(self, A, density=None):
+        self._A, self._density, N = A, density, len(A)
+        norm = np.linalg.norm(matrix_balance(A, permute=False)[0], 2)
+        micros = next((p for p in PERIODS if 1e-6 * p * norm <= REACH), PERIODS[-1])
+        self.grid, x = 1e-6 * micros, 1e-6 * micros * norm
+        self._per_second = 1e6 / micros
+        term, count = 1.0, 0
+        while term * np.exp(2.0 * x) > ERROR:
+            count += 1
+            term *= 2.0 * x / count
+        self._powers = np.arange(count + 2)
+        self._terms = self._series(count + 1, N)
+        self._kept = lru_cache(KEPT)(self._multiple)
+
+    def _series(self, count, N):
+        """Coefficients of e^k of Phi, Gamma and Q, flat: shape (count + 1, 2 N^2 or 3 N^2)."""
+        A, S = self._A, self._density
+        out = np.zeros((count + 1, 2 if S is None else 3, N, N))
+        power, noise = np.eye(N), S
+        for k in range(count):
+            out[k, 0] = power
+            out[k + 1, 1] = power / (k + 1)
+            if S is not None:
+                out[k + 1, 2] = noise = noise / (k + 1)
+                noise = A @ noise
+                noise = noise + noise.T
+            power = A @ power / (k + 1)
+        out[count, 0] = power
+        return out.reshape(count + 1, -1)
+
+    def _multiple(self, k):
+        return discretise(self._A, k * self.grid, self._density)
+
+    def step(self, length):
+        """The `Step` over a `length` [s] that is not negative."""
+        whole = int(length * self._per_second + 1e-6)
+        rest = length - whole * self.grid
+        first = self._kept(whole) if whole else None
+        if first is not None and abs(rest) < 1e-12:
+            return first
+        N, A = len(self._A), self._A
+        parts = (max(rest, 0.0) ** self._powers @ self._terms).reshape(-1, N, N)
+        Phi, Gamma, Q = parts[0], parts[1], parts[2] if len(parts) == 3 else None
+        if first is not None:
+            Gamma = first.Gamma + first.Phi @ Gamma
+            if Q is not None:
+                Q = Phi @ first.Q @ Phi.T + Q
+                Q = 0.5 * (Q + Q.T)
+            Phi = Phi @ first.Phi
+        return Step(length, A, Phi, Gamma, Q)
