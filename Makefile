@@ -21,7 +21,7 @@ endif
 export FLEXARM_ROOT := $(CURDIR)
 CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 
-.PHONY: help build demo check test mutants docs bench compare arms latency fuzz soak attack lint release-check clean distclean
+.PHONY: help build demo check test wheel mutants docs bench compare arms latency fuzz soak attack lint release-check clean distclean
 .DEFAULT_GOAL := help
 
 help:
@@ -30,6 +30,7 @@ help:
 	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
 	@echo 'make check      build, then style, imports and the quick unit tests: about a minute'
 	@echo 'make mutants    build, then put in errors one at a time: a test must fail for each; MUTANTS_ARGS="-k chain"'
+	@echo 'make wheel      build, then a wheel of what needs no ROS, for pip, in results/wheel'
 	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
@@ -69,6 +70,10 @@ check: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; ruff check && ruff format --check -q && \
 	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
+
+# For environments without ROS: pip install results/wheel/*.whl
+wheel: build
+	@. tools/env.sh && python tools/build_wheel.py
 
 # Wrong signs, factors and limits, put in one at a time: a test must fail for each.
 mutants: build

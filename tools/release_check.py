@@ -4,8 +4,8 @@
 
 - one version: every package.xml and setup.py, CITATION.cff, and the newest section of every changelog;
 - style, licence headers and links;
-- the packages without ROS install into a new environment, and all their modules but the nodes import, on every
-  Python at hand that they are for (PATH and pyenv).
+- the wheel of what needs no ROS installs into a new environment with all that it depends on, its modules import, and
+  it designs a control, on every Python at hand that it is for (PATH and pyenv).
 
 The documents (`make docs`) and the tests (`make test`) are Make's business. Standard library alone.
 """
@@ -20,19 +20,15 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-WITHOUT_ROS = ("flexarm_dynamics", "flexarm_control", "flexarm_sim", "flexarm_studies")
 OLDEST = (3, 10)
 IMPORT_ALL = """
-import importlib, pkgutil, sys
-for top in sys.argv[1:]:
-    package = importlib.import_module(top)
-    for found in pkgutil.walk_packages(package.__path__, top + "."):
-        if ".nodes" not in found.name:
-            importlib.import_module(found.name)
+import importlib, sys
+for name in sys.argv[1:]:
+    importlib.import_module(name)
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models import model
 from flexarm_control.composite.design import design
-arm = model.build(arm_file.load(sys.path[0] + "/R.yaml"))
+arm = model.build(arm_file.load("R"))
 design(arm, {"type": "linear_model_following"}, {"type": "lqr"})
 """
 
@@ -85,23 +81,16 @@ def pythons():
     return [found[version] for version in sorted(found)]
 
 
-def install(python):
-    """Install and import the packages without ROS with one interpreter; what went wrong, or nothing."""
+def install(python, built, modules):
+    """Install the wheel with one interpreter and import what is in it; what went wrong, or nothing."""
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
-        shutil.copy(ROOT / "config" / "arms" / "R.yaml", folder)
         (folder / "all.py").write_text(IMPORT_ALL, encoding="utf-8")
         inside = str(folder / "env" / "bin" / "python")
-        quiet = ["-m", "pip", "install", "-q", "--disable-pip-version-check"]
-        packages = []
-        for name in WITHOUT_ROS:  # copies: a build writes beside the sources
-            packages.append(str(shutil.copytree(ROOT / "src" / name, folder / name)))
         for command in (
             [python, "-m", "venv", str(folder / "env")],
-            [inside, *quiet, "setuptools==79.0.1", "wheel"],
-            [inside, *quiet, "-r", str(ROOT / "requirements" / "python.txt")],
-            [inside, *quiet, "--no-build-isolation", "--no-deps", *packages],
-            [inside, str(folder / "all.py"), *WITHOUT_ROS],
+            [inside, "-m", "pip", "install", "-q", "--disable-pip-version-check", str(built)],
+            [inside, str(folder / "all.py"), *modules],
         ):
             done = subprocess.run(
                 command, capture_output=True, text=True, cwd=folder, env=_clean(), check=False
@@ -132,10 +121,17 @@ def main():
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode:
             wrong.append(f"{' '.join(command)}\n{done.stdout}{done.stderr}".strip())
-    for python in () if options.no_install else pythons():
-        error = install(python)
-        print(f"{python}: {'not installed' if error else 'installs, imports, designs'}", flush=True)
-        wrong += [f"{python}: {error}"] if error else []
+    if not options.no_install:
+        import build_wheel  # beside this file
+
+        modules = build_wheel.without_ros(build_wheel.modules())
+        with tempfile.TemporaryDirectory() as folder:
+            built = build_wheel.build(Path(folder))
+            for python in pythons():
+                error = install(python, built, modules)
+                end = "not installed" if error else "installs, imports, designs"
+                print(f"{python}: {end}", flush=True)
+                wrong += [f"{python}: {error}"] if error else []
     for text in wrong:
         print(text)
     print("ready for a release" if not wrong else f"{len(wrong)} things to fix first")

@@ -246,6 +246,14 @@ def bind_angles(words):
     return out
 
 
+def _has_ros():
+    try:
+        importlib.import_module("rclpy")
+    except ImportError:
+        return False
+    return True
+
+
 def main(argv=None):
     """Entry point; exit code 0, 1 for an error that has been reported, 2 for wrong usage."""
     words = bind_angles(sys.argv[1:] if argv is None else argv)
@@ -261,6 +269,14 @@ def main(argv=None):
         sys.exit(141)
     except (FlexarmError, OSError) as error:
         print(f"flexarm {name}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except ImportError as error:
+        if _has_ros():
+            raise
+        print(
+            f"flexarm {name}: needs ROS 2, which is not installed here ({error})", file=sys.stderr
+        )
+        print("a checkout of flexarm sets it up: there, type ./flexarm " + name, file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print("\nstopped", file=sys.stderr)
