@@ -189,3 +189,27 @@ def test_every_python_file_begins_with_its_licence():
     assert tool.lacks('"""Text."""\n') and not tool.lacks(tool.headed('"""Text."""\n'))
     shell = tool.headed('#!/usr/bin/env python3\n"""Text."""\n')
     assert shell.startswith("#!") and not tool.lacks(shell)
+
+
+def test_every_package_that_is_installed_has_a_hash():
+    tool = _tool("bootstrap")
+    for name in ("python.txt", "low-watermark.txt", "dev.txt", "ros-wheels.txt"):
+        path = str(ROOT / "requirements" / name)
+        lines = [line for pinned in tool.pins(path).values() for line in pinned]
+        locked = tool.locked(lines, [tool.lock_of(path)])  # it raises where a hash is missing
+        assert len(locked) == len(lines) > 10
+        assert all(re.search(r" --hash=sha256:[0-9a-f]{64}( |$)", line) for line in locked), name
+        # Nothing is left of versions that are no longer asked for.
+        asked = {re.match(r"([\w.-]+?)(\[.*\])?==([^\s;]+)", line).group(1, 3) for line in lines}
+        asked = {(tool.normal(package), version) for package, version in asked}
+        assert set(tool.hashes(tool.lock_of(path))) == asked, f"{name}: run `make lock`"
+
+
+def test_a_package_without_a_hash_is_not_installed(tmp_path):
+    tool = _tool("bootstrap")
+    lock = tmp_path / "lock.txt"
+    lock.write_text("a-b==1.0 \\\n    --hash=sha256:12 \\\n    --hash=sha256:34\n")
+    asked = 'A_b[x]==1.0; python_version < "3.11"'
+    assert tool.locked([asked], [str(lock)]) == [f"{asked} --hash=sha256:12 --hash=sha256:34"]
+    with pytest.raises(tool.SetupError, match=r"no hash of a-b 1\.1: run `make lock`"):
+        tool.locked(["a-b==1.1"], [str(lock)])

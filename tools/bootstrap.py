@@ -90,6 +90,11 @@ def requirement_files(mode, version):
     return [os.path.join(ROOT, "requirements", name) for name in names]
 
 
+def lock_of(path):
+    """Return the path of the hashes that belong to a requirements file; `make lock` writes them."""
+    return os.path.join(os.path.dirname(path), "locked", os.path.basename(path))
+
+
 def sha256(*parts):
     digest = hashlib.sha256()
     for part in parts:
@@ -116,6 +121,7 @@ def write(path, text):
 def install_key(mode, version):
     # ROOT is in it because a virtual environment holds absolute paths and does not survive a move.
     files = requirement_files(mode, version)
+    files += [lock_of(f) for f in files]
     return sha256(mode, ROOT, "%d.%d" % version, *files, *[read(f) for f in files])
 
 
@@ -434,6 +440,34 @@ def pins(path):
     return found
 
 
+def hashes(path):
+    """Return {(name, version): hashes} of a lock, names normalised; a pin may stand there once for each Python."""
+    found = {}
+    for line in read(path).decode().replace("\\\n", " ").splitlines():
+        match = re.match(r"([A-Za-z0-9][\w.-]*)(?:\[[^]]*\])?==([^\s;]+)", line)
+        if match:
+            key = normal(match.group(1)), match.group(2)
+            found.setdefault(key, set()).update(re.findall(r"--hash=\S+", line))
+    return found
+
+
+def locked(lines, locks):
+    """Return the lines of a requirements file with the hashes that their files must have."""
+    known = {}
+    for path in locks:
+        known.update(hashes(path))
+    out = []
+    for line in lines:
+        name, version = re.match(r"([\w.-]+)(?:\[[^]]*\])?==([^\s;]+)", line).groups()
+        wanted = known.get((normal(name), version))
+        if not wanted:
+            raise SetupError(
+                "requirements/locked has no hash of %s %s: run `make lock`" % (name, version)
+            )
+        out.append(" ".join([line, *sorted(wanted)]))
+    return out
+
+
 def system_packages(python):
     """Return {name: version} of what the system's interpreter sees."""
     script = (
@@ -450,7 +484,7 @@ def system_packages(python):
 
 
 def ros_requirements(python):
-    """Return (lines to install, lines to keep) beside a system's ROS."""
+    """Return the lines to install beside a system's ROS: what the system lacks."""
     third_party, dev, wheels = requirement_files("ros", python["version"])
     wanted = dict(pins(third_party), **pins(dev))
     have = system_packages(python["path"])
@@ -462,9 +496,7 @@ def ros_requirements(python):
     if numpy < (1, 26):
         # Older than any tested version: replace SciPy, too, and all else that is compiled against it.
         have = {name: v for name, v in have.items() if name not in pins(third_party)}
-    lines = [line for name in wanted if name not in have for line in wanted[name]]
-    kept = ["%s==%s" % (name, have[name]) for name in wanted if name in have]
-    return lines, kept
+    return [line for name in wanted if name not in have for line in wanted[name]]
 
 
 def install(mode, python, lock):
@@ -476,25 +508,28 @@ def install(mode, python, lock):
     pip = [VENV_PYTHON, "-m", "pip", "install", "--no-input", "--prefer-binary"]
     # empy is the one package without a wheel; build it with the pinned setuptools, not with the newest.
     pip += ["--no-build-isolation", "--only-binary", ":all:", "--no-binary", "empy"]
+    # The lists are complete, so pip follows no dependency; it takes only files whose hash is in the lock.
+    pip += ["--no-deps", "--require-hashes"]
+    files = requirement_files(mode, python["version"])
     if mode == "wheels":
-        files = requirement_files(mode, python["version"])
-        lines, kept = [line for f in files for name in pins(f) for line in pins(f)[name]], []
+        lines = [line for f in files for name in pins(f) for line in pins(f)[name]]
     else:
-        lines, kept = ros_requirements(python)
+        lines = ros_requirements(python)
+    lines = locked(lines, [lock_of(f) for f in files])
     wanted = os.path.join(VENV, "requirements.txt")
-    constraints = os.path.join(VENV, "constraints.txt")
     write(wanted, "\n".join(lines) + "\n")
-    write(constraints, "\n".join(kept) + "\n")
     names = {normal(re.match(r"[\w.-]+", line).group()) for line in lines}
     about = "a minute" if mode == "wheels" else "half a minute"
     step(3, "installing %d packages from PyPI (about %s)" % (len(names), about))
     tools = [line for line in lines if re.match(r"(setuptools|wheel)\b", line)]
     log = os.path.join(LOGS, "pip.log")
-    if tools and run_logged(pip + tools, env, log, lock):
-        raise SetupError(explain_pip(log))
+    if tools:  # hashes can't be given on pip's command line
+        first = os.path.join(VENV, "first.txt")
+        write(first, "\n".join(tools) + "\n")
+        if run_logged([*pip, "-r", first], env, log, lock):
+            raise SetupError(explain_pip(log))
     seen = rb"(?m)^(?:Collecting|Requirement already satisfied:) [\w.-]+(?:\[\w+\])?=="
-    everything = [*pip, "-r", wanted, "-c", constraints]
-    if lines and run_logged(everything, env, log, lock, (seen, len(names))):
+    if lines and run_logged([*pip, "-r", wanted], env, log, lock, (seen, len(names))):
         raise SetupError(explain_pip(log))
 
 
@@ -531,8 +566,9 @@ PIP_ERRORS = (
         "PyPI (or the mirror in use) cannot be reached, or lacks a pinned package",
     ),
     (
-        r"ResolutionImpossible|conflicting dependencies",
-        "the pinned packages are incompatible with the system's",
+        r"DO NOT MATCH THE HASHES",
+        "a downloaded file has another hash than requirements/locked, and was not installed: the file under this"
+        " version has changed on PyPI, on its mirror, or in a cache (`pip cache purge`)",
     ),
     (
         r"Python\.h: No such file",
