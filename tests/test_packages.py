@@ -49,7 +49,7 @@ JAZZY |= {
 #: Needed and not imported.
 USED_OTHERWISE = {("flexarm_bringup", "ros2launch"), ("flexarm_bringup", "flexarm_tools")}
 #: Options that only their own commands need, without a key.
-WITHOUT = {"distributed", "viser"}
+WITHOUT = {"distributed", "foxglove", "viser", "websockets"}
 #: Tests of a package below that look at one above: a key would make a circle, which colcon refuses.
 CIRCLES = {
     ("flexarm_ros", "flexarm_control"),

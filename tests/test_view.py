@@ -181,21 +181,21 @@ def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(bench, arm, scr
 
     # A gain: taken where it can be, refused with the reason and put back where it can't.
     def turn(value):
-        screen.field("fast.alpha").fill(value)
-        screen.field("fast.alpha").dispatch_event("blur")
+        screen.field("fast.alpha [1/s]").fill(value)
+        screen.field("fast.alpha [1/s]").dispatch_event("blur")
 
     assert bench.get("controller", "fast.alpha") == 5.0
-    screen.wait_for_value("fast.alpha", "5")
+    screen.wait_for_value("fast.alpha [1/s]", "5")
     turn("6")
     screen.wait_for("message", "set: fast.alpha = 6")
     assert bench.get("controller", "fast.alpha") == 6.0
     turn("20")
     screen.wait_for("message", "sampled at 100 Hz", "lower the gains")
-    screen.wait_for_value("fast.alpha", "6")
+    screen.wait_for_value("fast.alpha [1/s]", "6")
     assert bench.get("controller", "fast.alpha") == 6.0
     # What somebody else sets is shown.
     assert bench.set("controller", slow__kp=[9.0])[0].successful
-    screen.wait_for_value("slow.kp[0]", "9")
+    screen.wait_for_value("slow.kp joint1 [1/s^2]", "9")
 
     # A fault, in red with its reason; recover leaves it.
     screen.click("Recover")

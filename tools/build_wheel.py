@@ -28,7 +28,7 @@ ROS = re.compile(r"(rclpy|rcl_interfaces|.*_msgs|builtin_interfaces|launch.*|ame
 #: Files that go with the wheel, and where they are looked for (`flexarm_dynamics.arm.arm_file.arms_directories`).
 CONFIG, CONFIG_TO = ("arms", "controllers", "recordings"), "flexarm_dynamics/config"
 #: Needed by the nodes or the page of ``flexarm view`` alone.
-NOT_NEEDED = ("viser",)
+NOT_NEEDED = ("viser", "foxglove-sdk")
 PROJECT = """\
 [build-system]
 requires = ["setuptools>=70.1"]

@@ -109,17 +109,21 @@ class Latest:
     kind : type
         Of the messages.
     topic : str
+    raw : bool
+        Leave the messages serialised, as bytes.
     """
 
-    def __init__(self, create, kind, topic):
+    def __init__(self, create, kind, topic, raw=False):
+        self._raw = raw
+        more = {"raw": True} if raw else {}
         self._subscription = create(
-            kind, topic, lambda message: None, LOOKING_ON, callback_group=Unserved()
+            kind, topic, lambda message: None, LOOKING_ON, callback_group=Unserved(), **more
         )
 
     def take(self):
         """The newest message since the last call; None without one."""
         newest = None
-        for newest in taken(self._subscription):  # noqa: B007
+        for newest in taken(self._subscription, self._raw):  # noqa: B007
             pass
         return newest
 

@@ -94,6 +94,15 @@ class Drawer:
             fast=np.stack((middle, middle + other[:, None] * axes), axis=1),
         )
 
+    def plan(self, points):
+        """The straight arm at the last of some joint positions (k, n) [rad], and the tip's way along them.
+
+        Both are points, (., 3) [m].
+        """
+        points = np.asarray(points, float)
+        way = np.array([self._model.tip_position(q, self._rest) for q in points])
+        return np.concatenate(self._ends.points(points[-1])), way
+
     def tip_error(self, q, delta, reference):
         """Distance of the tip from that of the rigid arm at the reference (n,) [m]."""
         tip = self._model.tip_position(np.asarray(q, float), np.asarray(delta, float))

@@ -14,6 +14,8 @@ from flexarm_dynamics.models import model
 from flexarm_dynamics.processes import step_back
 from flexarm_studies.loop import parameter_files
 
+from .pair import Pair
+
 #: Default and largest number of pictures per second.
 RATE, MAX_RATE = 30.0, 100.0
 #: Points of the tip's path.
@@ -22,6 +24,10 @@ TRAIL = 300
 NICENESS = 10
 #: How far the first target is from where the arm is [rad].
 STEP = 1.0
+#: Where Foxglove looks by itself.
+FOXGLOVE = 8765
+#: Joint positions of a planned motion between two points.
+PIECES = 24
 #: After this long without a state the page says so [s].
 SILENCE = 2.0
 
@@ -64,6 +70,12 @@ def add_arguments(parser):
     )
     add("--rate", type=float, default=RATE, help=f"pictures per second (default {RATE:g}) [Hz]")
     add("--no-open", action="store_true", help="open no browser, only say where the page is")
+    add(
+        "--foxglove",
+        type=int,
+        metavar="PORT",
+        help=f"of the topics for Foxglove, on 127.0.0.1 (default {FOXGLOVE}, or a free one; 0: a free one)",
+    )
 
 
 def view(options):
@@ -149,8 +161,10 @@ class View:
     def __init__(self, link, options, stack):
         self.link, self.options, self.stack = link, options, stack
         self.page = None
+        self.foxglove, self.pair = None, None
         self.home = None
         self._received_at = 0.0
+        self._aimed = None
 
     def run(self):
         """Serve until it is interrupted."""
@@ -174,17 +188,49 @@ class View:
         try:
             from .page import Page
 
-            self.page = page = Page(arm_model.arm, self.drawer.reach, self.options.port)
+            self.foxglove = self._serve_foxglove(arm_model.arm)
+            address = self.foxglove.url if self.foxglove else ""
+            self.page = page = Page(arm_model.arm, self.drawer.reach, self.options.port, address)
         except ModuleNotFoundError as error:
             hint = "pip install viser, or make build"
             raise FlexarmError("is missing", field=error.name, hint=hint) from None
         self.stack.callback(page.close)
         self.link.say, self.link.on_values = page.say, page.take_values
         print(f"flexarm view: {arm_model.arm.name} at {page.url}, until Ctrl-C", flush=True)
+        if self.foxglove:
+            print(f"flexarm view: in Foxglove: {self.foxglove.url}", flush=True)
         if not self.options.no_open:
             import webbrowser
 
             webbrowser.open(page.url)
+
+    def _serve_foxglove(self, arm):
+        """The server of the topics; None where foxglove-sdk is not installed."""
+        from ..recording.types import typestore
+        from .foxglove import Foxglove
+
+        def definition(kind):
+            return typestore().generate_msgdef(kind, ros_version=2)[0]
+
+        wanted = self.options.foxglove
+        ports = (FOXGLOVE, 0) if wanted is None else (wanted,)
+        for port in ports:
+            try:
+                server = Foxglove(
+                    f"flexarm {arm.name}", port, self.link.sources, definition, arm.reach
+                )
+            except ModuleNotFoundError:
+                return None
+            except RuntimeError as error:  # the port is taken
+                if port == ports[-1]:
+                    hint = "--foxglove 0 takes a free one"
+                    raise FlexarmError(
+                        f"can't be used: {error}", field="--foxglove", value=port, hint=hint
+                    ) from None
+                continue
+            self.stack.callback(server.close)
+            return server
+        return None
 
     def _turn(self):
         """Carry out what was done on the page; show what has arrived since the last turn."""
@@ -214,6 +260,40 @@ class View:
         error = self.drawer.tip_error(snapshot.q, snapshot.delta, snapshot.reference)
         page.show(snapshot, picture, self.trail.points, error)
         page.plot(now)
+        self._show_plan(snapshot)
+        if self.pair is not None:
+            self._go_on_with_pair(snapshot, error)
+        if self.foxglove is not None:
+            self.foxglove.forward()
+            self.foxglove.draw(
+                round(1e9 * snapshot.time), picture.beam, picture.ghost, self.trail.points
+            )
+
+    def _show_plan(self, snapshot):
+        """A motion that was published, while it lasts; else the one that the sliders ask for."""
+        points = self.link.take_planned()
+        if points is not None and len(points):
+            self._aimed = self.page.target()
+            self.page.draw_plan(self.drawer.plan(between(snapshot.reference, points)))
+        resting = snapshot.state in ("HOLDING", "READY")
+        if resting and self.page.target() != self._aimed:
+            self._aimed = self.page.target()
+            self.page.draw_plan(self.drawer.plan(between(snapshot.reference, [self._aimed])))
+
+    def _go_on_with_pair(self, snapshot, error):
+        self.pair.turn(snapshot, error)
+        if self.pair.ended:
+            if len(self.pair.curves) == 2:
+                self.page.show_pair(self.pair.curves)
+            self.page.say(self.pair.ended, "given up" in self.pair.ended)
+            self.pair = None
+
+    def _do_pair(self, target, duration):
+        if self.pair is not None or self.home is None:
+            self.page.say("wait until the present motions are over", True)
+            return
+        self.pair = Pair(self.link, self.home, target, duration)
+        self.page.say("the same motion twice: with the fast control, then without it", False)
 
     def _do_back(self, duration):
         if self.home is not None:
@@ -221,6 +301,13 @@ class View:
 
     def _do_clear_trail(self):
         self.trail.clear()
+
+
+def between(start, points):
+    """Joint positions on the way from a start (n,) through points (k, n), straight in joint angles, (., n) [rad]."""
+    rows = np.vstack([start, points])
+    knots = np.linspace(0.0, len(rows) - 1.0, min(PIECES * (len(rows) - 1), 200) + 1)
+    return np.array([np.interp(knots, np.arange(len(rows)), column) for column in rows.T]).T
 
 
 def first_target(arm, q):

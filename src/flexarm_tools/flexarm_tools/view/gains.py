@@ -27,6 +27,10 @@ class Gain:
         Of the slider, in the parameter's unit.
     hint : str
         What it does.
+    owner : str
+        Joint or mode that it belongs to; empty: its number is shown.
+    unit : str
+        Empty: none.
     """
 
     name: str
@@ -36,14 +40,17 @@ class Gain:
     high: float
     step: float
     hint: str
+    owner: str = ""
+    unit: str = ""
 
     @property
     def label(self):
-        """As it is shown, such as ``slow.kp[0]``."""
-        return self.name if self.index is None else f"{self.name}[{self.index}]"
+        """As it is shown, such as ``slow.kp elbow [1/s^2]``."""
+        which = "" if self.index is None else f" {self.owner}" if self.owner else f"[{self.index}]"
+        return f"{self.name}{which}" + (f" [{self.unit}]" if self.unit else "")
 
 
-def of_parameters(values, ranges, hints, laws=None):
+def of_parameters(values, ranges, hints, laws=None, owners=None):
     """Gains of a controller's parameters.
 
     Parameters
@@ -54,6 +61,8 @@ def of_parameters(values, ranges, hints, laws=None):
     hints : mapping of str to str
     laws : mapping of str to set of str, optional
         Prefix to the names that the law in use declares; others are left out. All of a prefix that is not in it stay.
+    owners : mapping of str to sequence of str, optional
+        Parameter to the joints or modes that its numbers belong to.
 
     Returns
     -------
@@ -72,8 +81,24 @@ def of_parameters(values, ranges, hints, laws=None):
             if isinstance(number, float):
                 low, high = span(number, *ranges[name])
                 gain = Gain(name, i if many else None, number, low, high, 0.0, hints.get(name, ""))
-                out.append(replace(gain, step=(high - low) / STEPS))
+                whose = (owners or {}).get(name, ())
+                owner = whose[i] if many and len(whose) == len(value) else ""
+                unit = unit_of(gain.hint)
+                out.append(replace(gain, step=(high - low) / STEPS, owner=owner, unit=unit))
     return out
+
+
+def unit_of(description):
+    """The unit with which a parameter's description ends; empty without one."""
+    found = re.search(r"\[([^][]+)\]$", description)
+    return found[1] if found else ""
+
+
+def owners_of(constraints, arm):
+    """Joints or modes that the numbers of an array belong to, from a descriptor's text, as ``length joints``."""
+    found = re.search(r"length (\w+)", constraints)
+    names = {"joints": arm.joint_names, "modes": arm.mode_names}
+    return tuple(names.get(found[1], ())) if found else ()
 
 
 def span(value, low, high):

@@ -5,6 +5,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import sensor_msgs.msg
 from rcl_interfaces.msg import Log, ParameterEvent
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -15,6 +16,7 @@ from rcl_interfaces.srv import (
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+import flexarm_msgs.msg
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.loop.supervisor import State
 from flexarm_dynamics import registry
@@ -24,7 +26,7 @@ from flexarm_ros.messages import set_stamp, stamp_ns
 from flexarm_ros.session import Latest, Session, parameter_messages, plain
 
 from ..shape.amplitudes import Amplitudes
-from . import gains
+from . import foxglove, gains
 
 #: A gain that was turned is sent when its slider has rested for this long [s].
 REST = 0.25
@@ -73,6 +75,7 @@ class Link:
         self._states = Latest(create, ArmState, "arm_state_estimate")
         self._controls = Latest(create, CompositeState, "controller/state")
         self._trajectories = self.session.publisher(JointTrajectory, "joint_trajectory")
+        self._planned = Latest(create, JointTrajectory, "joint_trajectory")
         self._controller = node.resolve_service_name("controller")
         create(ParameterEvent, "/parameter_events", self._on_event, 100)
         create(Log, "/rosout", self._on_log, 100)
@@ -123,6 +126,30 @@ class Link:
             slow=np.array(c.slow_torque),
             fast=np.array(c.fast_torque),
         )
+
+    def take_planned(self):
+        """Joint positions of the newest trajectory on the topic, (k, n) in the arm's order [rad].
+
+        None without a new one. What does not name the arm's joints is the controller's to refuse, and none here.
+        """
+        message = self._planned.take()
+        names = list(self._arm.joint_names)
+        if message is None or sorted(message.joint_names) != sorted(names) or not message.points:
+            return None
+        order = [list(message.joint_names).index(name) for name in names]
+        rows = [p.positions for p in message.points if len(p.positions) == len(names)]
+        return np.array(rows, float).reshape(-1, len(names))[:, order]
+
+    def sources(self):
+        """The loop's topics as they are published, for Foxglove."""
+        create, found = self.session.node.create_subscription, []
+        for topic, kind in foxglove.TOPICS.items():
+            package, _, name = kind.split("/")
+            message = getattr({"sensor_msgs": sensor_msgs.msg}.get(package, flexarm_msgs.msg), name)
+            found.append(
+                foxglove.Source(topic, kind, Latest(create, message, topic, raw=True).take)
+            )
+        return found
 
     def serve(self, seconds):
         """Serve services and slow topics for so long; send what has been turned."""
@@ -232,16 +259,17 @@ class Link:
 
     def _gains(self, names, descriptors, values, then):
         given = dict(zip(names, map(plain, values), strict=True))
-        ranges, hints = {}, {}
+        ranges, hints, owners = {}, {}, {}
         for d in descriptors:
             hints[d.name] = d.description
+            owners[d.name] = gains.owners_of(d.additional_constraints, self._arm)
             found = gains.range_of(d.additional_constraints)
             if d.floating_point_range:
                 r = d.floating_point_range[0]
                 found = r.from_value, r.to_value
             if found and not d.read_only:
                 ranges[d.name] = found
-        out = gains.of_parameters(given, ranges, hints, laws_in_use(given))
+        out = gains.of_parameters(given, ranges, hints, laws_in_use(given), owners)
         self.values = {gain.name: given[gain.name] for gain in out}
         then(out)
 

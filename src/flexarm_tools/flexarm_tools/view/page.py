@@ -18,9 +18,11 @@ STATES = {
 }
 COLOURS = ("#1c7ed6", "#e8590c", "#2b8a3e", "#ae3ec9", "#c92a2a", "#0c8599", "#e67700", "#495057")
 BEAM, GHOST, TRAIL, TIP = (28, 126, 214), (173, 181, 189), (224, 49, 49), (224, 49, 49)
-SLOW, FAST, HUB = (247, 103, 7), (47, 158, 68), (52, 58, 64)
+SLOW, FAST, HUB, PLAN = (247, 103, 7), (47, 158, 68), (52, 58, 64), (250, 176, 5)
 #: Span of the plots [s], and how often they are drawn [Hz].
 WINDOW, PLOT_RATE = 10.0, 6.0
+#: A plot shows at least this much, whatever is in it [mm; mm, mrad; N m]: zero is a line, not an axis from 0 to 100.
+LEAST = {"tip": 0.2, "modes": 0.2, "torques": 0.2, "pair": 0.2}
 #: Number of messages that are shown.
 MESSAGES = 3
 #: Largest factor of the deflections.
@@ -62,6 +64,8 @@ class Page:
         Length of the arm [m].
     port : int
         On 127.0.0.1; another one where it is taken.
+    link : str
+        Address that opens the topics in Foxglove; empty: none.
 
     Attributes
     ----------
@@ -70,7 +74,7 @@ class Page:
     exaggeration : float
     """
 
-    def __init__(self, arm, reach, port):
+    def __init__(self, arm, reach, port, link=""):
         import viser
 
         self.arm, self.reach = arm, reach
@@ -80,7 +84,8 @@ class Page:
             "127.0.0.1", port, label=f"flexarm {arm.name}", verbose=False
         )
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
-        self._gains, self._plotted = {}, 0.0
+        self._gains, self._plotted, self._spans = {}, 0.0, {}
+        self._foxglove = link
         self._messages = deque(maxlen=MESSAGES)
         modes = len(arm.mode_names)
         self._histories = {
@@ -123,6 +128,8 @@ class Page:
         self._beam = scene.add_line_segments("/beam", line, BEAM, thickness=0.018 * r)
         self._ghost = scene.add_line_segments("/ghost", line, GHOST, thickness=0.006 * r)
         self._trail = scene.add_line_segments("/trail", line, TRAIL, thickness=0.005 * r)
+        self._plan = scene.add_line_segments("/plan", line, PLAN, thickness=0.005 * r)
+        self._plan.visible = False
         self._joints = self._dots("/joints", len(self.arm.joints), HUB, 0.036)
         self._tip = self._dots("/tip", 1, TIP, 0.03)
         self._slow = scene.add_line_segments("/slow", line, SLOW, thickness=0.014 * r)
@@ -137,6 +144,13 @@ class Page:
             point_shape="circle",
             precision="float32",
         )
+
+    def draw_plan(self, lines):
+        """Draw what is planned: the straight arm where the motion ends and the tip's way there, each (k, 3) [m]."""
+        pieces = [segments(points) for points in lines if len(points) > 1]
+        self._plan.visible = bool(pieces)
+        if pieces:
+            self._plan.points = np.concatenate(pieces)
 
     def _draw(self, picture, trail):
         self._beam.points = segments(picture.beam)
@@ -178,12 +192,18 @@ class Page:
             )
             self._button("Move there", lambda: ("move", self.target(), self._duration.value))
             self._button("Move back", lambda: ("back", self._duration.value), "gray")
+            self._button(
+                "With and without fast control",
+                lambda: ("pair", self.target(), self._duration.value),
+                "gray",
+            )
             fast = gui.add_checkbox(
                 "fast control", True, hint="off: slow control alone, the arm rings"
             )
             fast.on_update(self._by_hand(lambda: ("enable_fast", fast.value)))
         plots = gui.add_panel()
-        with plots.add_tab("Plots"):
+        self._tab_of_plots, self._pair = plots.add_tab("Plots"), None
+        with self._tab_of_plots:
             self._plots = self._make_plots()
         plots.dock_left()
         plots.set_width(340)
@@ -200,6 +220,11 @@ class Page:
             trail = gui.add_checkbox("trail", True)
             trail.on_update(lambda _: self._look(larger.value, trail.value))
         self._folder = gui.add_folder("Gains")
+        if self._foxglove:
+            gui.add_html(
+                f'<div style="margin:0.6em 0.8em;font-size:0.8em"><a id="foxglove" target="_blank" '
+                f'href="{html.escape(self._foxglove)}">Open the topics in Foxglove</a></div>'
+            )
 
     def _look(self, exaggeration, trail):
         if exaggeration != self.exaggeration:
@@ -228,17 +253,21 @@ class Page:
             "torques": self._plot("torques", "torques [N m]", torques, len(joints)),
         }
 
-    def _plot(self, name, title, labels, solid=100):
-        """A plot of a history; lines from number `solid` on are dashed."""
+    def _plot(self, name, title, labels, solid=100, columns=None):
+        """A plot of a history, or of given columns; lines from number `solid` on are dashed."""
         series = [{"label": "t"}]
         for i, label in enumerate(labels):
             line = {"label": label, "stroke": COLOURS[i % solid % len(COLOURS)], "width": 1.5}
             series.append(line | ({"dash": (4.0, 3.0)} if i >= solid else {}))
+        columns, ends = columns or self._histories[name].columns(), (-WINDOW, 0.0)
+        if name not in self._histories:
+            ends = (0.0, float(columns[0][-1]))
+        self._spans[name] = span(columns[1:], LEAST[name])
         plot = self.server.gui.add_uplot(
-            self._histories[name].columns(),
+            columns,
             tuple(series),
             title=title,
-            scales={"x": {"time": False, "range": (-WINDOW, 0.0)}},
+            scales=scales(ends, self._spans[name]),
             axes=({"size": 26}, {"size": 46}),
             legend={"show": False},
             height=190,
@@ -298,6 +327,24 @@ class Page:
         self._plotted = now
         for name, plot in self._plots.items():
             plot.data = self._histories[name].columns()
+            wanted = span(plot.data[1:], LEAST[name], self._spans[name])
+            if wanted != self._spans[name]:
+                self._spans[name] = wanted
+                plot.scales = scales((-WINDOW, 0.0), wanted)
+
+    def show_pair(self, curves):
+        """Show the tip's error of two motions: name to time [s] and error [m], as `pair.Pair` keeps them."""
+        if self._pair is not None:
+            for handle in self._pair:
+                handle.remove()
+        names = list(curves)
+        time = np.unique(np.concatenate([curves[name][0] for name in names]))
+        columns = (time, *(1e3 * np.interp(time, *curves[name]) for name in names))
+        with self._tab_of_plots:
+            plot = self._plot(
+                "pair", "the same motion twice: tip error [mm]", names, columns=columns
+            )
+            self._pair = (plot,)
 
     def silence(self, seconds):
         """Show that nothing has been received for so many seconds."""
@@ -345,6 +392,38 @@ def put(handle, content):
     """Change an element if it says something else."""
     if handle.content != content:
         handle.content = content
+
+
+def span(columns, least, now=None):
+    """Ends of a plot's axis.
+
+    Parameters
+    ----------
+    columns : sequence of ndarray
+        What is drawn; NaN is not.
+    least : float
+        The axis is at least this long.
+    now : (low, high), optional
+        Ends that are kept while what is drawn fits, and takes more than a third of them.
+
+    Returns
+    -------
+    (low, high)
+        A tenth beyond what is drawn.
+    """
+    values = np.concatenate([np.ravel(column) for column in columns])
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    size = max(high - low, least / 1.2)
+    if now and now[0] <= low and high <= now[1] and now[1] - now[0] <= 3.0 * 1.2 * size:
+        return now
+    middle = 0.5 * (low + high)
+    return middle - 0.6 * size, middle + 0.6 * size
+
+
+def scales(x, y):
+    """Both axes of a plot, for viser."""
+    return {"x": {"time": False, "range": tuple(x)}, "y": {"range": tuple(y)}}
 
 
 def segments(points):

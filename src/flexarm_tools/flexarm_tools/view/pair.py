@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One motion twice, with the fast control and without it: what a person asks of the page, step by step. No ROS."""
+
+import numpy as np
+
+#: After a motion's end the tip is watched for so long, and before the next motion so long passes at least [s].
+WATCHED, PAUSE = 4.0, 1.0
+#: A motion that has not ended so long after it should have is given up [s].
+PATIENCE = 10.0
+WITH, WITHOUT = "with fast control", "without"
+
+
+class Pair:
+    """Moves to a target and back with the fast control, then without it, and keeps the tip's error of both ways there.
+
+    Parameters
+    ----------
+    link : object
+        With ``move(target, duration)`` and ``enable_fast(on)``.
+    home, target : (n,) array_like
+        Joint angles [rad].
+    duration : float
+        Of each motion [s].
+
+    Attributes
+    ----------
+    curves : dict
+        `WITH` and `WITHOUT`: time since the motion began [s] and the tip's error [m], two arrays, once they are there.
+    ended : str
+        How it ended; empty while it goes on.
+    """
+
+    def __init__(self, link, home, target, duration):
+        self._link, self._duration = link, float(duration)
+        self._steps = [
+            (True, target, WITH),
+            (True, home, ""),
+            (False, target, WITHOUT),
+            (True, home, ""),
+        ]
+        self._began = None
+        self._before, self._sent_at = None, 0.0
+        self._rows = []
+        self.curves, self.ended = {}, ""
+
+    def turn(self, snapshot, error):
+        """Look at a state, and do what comes next.
+
+        Parameters
+        ----------
+        snapshot : link.Snapshot
+        error : float
+            Distance of the tip from the rigid arm's at the reference [m].
+        """
+        if self.ended:
+            return
+        if snapshot.state in ("FAULT", "STOPPING", "INACTIVE"):
+            self._end(f"given up, the controller is {snapshot.state}: {snapshot.reason}")
+        elif self._before is None:
+            self._send(snapshot)
+        elif self._began is None:
+            if snapshot.trajectory != self._before:
+                self._began = snapshot.time
+            elif snapshot.time > self._sent_at + PATIENCE:
+                self._end(f"given up, the motion was not taken: {snapshot.reason}")
+        else:
+            self._watch(snapshot, error)
+
+    def _send(self, snapshot):
+        fast, target, _ = self._steps[0]
+        self._link.enable_fast(fast)
+        self._link.move(target, self._duration)
+        self._before, self._sent_at, self._rows = snapshot.trajectory, snapshot.time, []
+
+    def _watch(self, snapshot, error):
+        after, name = snapshot.time - self._began, self._steps[0][2]
+        self._rows.append((after, error))
+        if after < self._duration + (WATCHED if name else PAUSE):
+            return
+        if snapshot.state != "HOLDING":
+            if after > self._duration + WATCHED + PATIENCE:
+                self._end("given up, the motion does not end")
+            return
+        if name:
+            self.curves[name] = np.array(self._rows).T
+        self._steps.pop(0)
+        self._before = self._began = None
+        if not self._steps:
+            self._end(self._result())
+
+    def _result(self):
+        """Both, in words: how far the tip still swings in the last second that was watched, from crest to trough."""
+        swings = []
+        for name in (WITH, WITHOUT):
+            time, error = self.curves[name]
+            late = error[time > time[-1] - 1.0]
+            swings.append(f"{1e3 * np.ptp(late):.3g} mm {name}")
+        return (
+            f"{self._duration + WATCHED:g} s after it began the tip's error changes by "
+            + ", ".join(swings)
+        )
+
+    def _end(self, text):
+        self._link.enable_fast(True)
+        self.ended = text
