@@ -60,13 +60,16 @@ def arms():
         for each in {levels.level_of(a): a for a in (arm, levels.simulated(arm))}.values():
             plant = Plant(model.build(each), 1e-3)
             plant.advance(np.zeros(plant.model.n_joints))
+            evaluate(plant.model)
 
 
 def evaluate(arm_model):
     """Equations of motion, energy and kinematics at rest."""
     n, m = arm_model.n_joints, arm_model.n_modes
     q, delta = np.zeros(n), np.zeros(m)
-    arm_model.mass_matrix(q)
+    if hasattr(arm_model, "mass_matrix"):
+        arm_model.mass_matrix(q)
+    arm_model.terms(q, q)
     arm_model.derivative(np.zeros(2 * (n + m)), q)
     arm_model.energy(np.zeros(2 * (n + m)))
     arm_model.tip_position(q, delta)

@@ -15,6 +15,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from threading import Lock
 
+import numpy as np
+
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models import model as models
 from flexarm_dynamics.models.model import ArmModel
@@ -55,7 +57,9 @@ class _Unpickler(pickle.Unpickler):
     def persistent_load(self, name):
         _, scale = name
         if scale not in self._models:
-            self._models[scale] = self._models[1.0].with_payload(scale)
+            model = self._models[scale] = self._models[1.0].with_payload(scale)
+            rest = np.zeros(model.n_joints)
+            model.terms(rest, rest)  # what they are computed from is made here, not on the control path
         return self._models[scale]
 
 

@@ -40,6 +40,11 @@ def _is(value, number):
     return not isinstance(value, Symbol) and value == number
 
 
+def is_zero(value):
+    """Whether a scalar is the number zero."""
+    return _is(value, 0.0)
+
+
 class Symbol:
     """A scalar of a `Graph`."""
 

@@ -24,7 +24,7 @@ import numpy as np
 from ..arm.description import scaled
 from ..errors import ModelError, check_shape
 from ..kernels import chain as plain
-from ..kernels import generated, integrators, load
+from ..kernels import generated, integrators, load, straight_arm
 from .assembly import (
     assemble,
     bishop_integrals,
@@ -260,38 +260,36 @@ class Chain(ArmModel):
         """
         n = self.n_joints
         q, qd = self._joint(q, "q"), self._joint(qd, "qd")
-        if delta is None:
-            K, C, f = self._straight_arm(q, qd)
-        else:
-            K, C = self.linearisation(q, qd)
+        f, K, C, M = self._straight_arm(q, qd)
+        if delta is not None:
             delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
             f = self.forces(q, qd, delta, delta_d) - K @ delta - C @ delta_d
-        f[:n] += self.friction(qd, delta, delta_d)
-        return Terms(
-            M=self.mass_matrix(q, delta), f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:]
-        )
-
-    @cached_property
-    def _straight(self):
-        """What `_straight_arm` works in: position, velocity, then zeros, and room for the forces; all complex."""
-        n, m = self.n_joints, self.n_modes
-        return tuple(np.zeros(size, complex) for size in (n, n, m, m, n, m, n + m))
+            f[:n] += self.friction(qd, delta, delta_d)
+            M = self.mass_matrix(q, delta)
+        return Terms(M=M, f1=f[:n], f2=f[n:], C1=C[:n], C2=C[n:], K1=K[:n], K2=K[n:])
 
     def _straight_arm(self, q, qd):
-        """K, C and forces without deflections: control laws ask for them at every sample."""
-        n, m = self.n_joints, self.n_modes
-        K, C = np.zeros((n + m, m)), np.zeros((n + m, m))
-        if not m:
-            return K, C, self.forces(q, qd)
-        position, velocity, delta, delta_d, zero, modal_zero, out = self._straight
-        position[:], velocity[:] = q, qd
-        self.complex_kernel.linearise(
-            self._data, self._complex_work, position, delta, velocity, delta_d, STEP, zero, modal_zero, out,
-            K, C,
-        )  # fmt: skip
+        """Forces with the joints' friction, K, C and M without deflections."""
+        n = self.n_joints
+        if self._tape is None:
+            K, C = self.linearisation(q, qd)
+            f = self.forces(q, qd)
+            f[:n] += self.friction(qd)
+            return f, K, C, self.mass_matrix(q)
+        f, K, C, M = self._tape(q, qd)
         self._close_play(K, C)
-        # The last derivative's real part: an imaginary step does not change it.
-        return K, C, out.real.copy()
+        for i in self._slips:
+            f[i] += self._slip_torque(i, qd[i])
+        return f, K, C, M
+
+    @cached_property
+    def _tape(self):
+        """Terms of the straight arm, recorded: control laws ask for them at every sample; None where there is none."""
+        if not self._compiled or self.data.level != plain.FIRST_ORDER:
+            return None
+        return straight_arm.Tape(
+            self.data, lambda dtype: work_space(self.data, dtype), self.friction_table()
+        )
 
     def derivative(self, state, torque):
         n, m = self.n_joints, self.n_modes
@@ -310,11 +308,15 @@ class Chain(ArmModel):
 
     def friction(self, qd, delta=None, delta_d=None):
         out = super().friction(qd)
-        delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
         for i in self._slips:
-            level = plain.slip_level(self.data, i, delta, delta_d, qd[i])
-            out[i] += level * np.tanh(qd[i] / self.data.slip[i, 3])
+            out[i] += self._slip_torque(i, qd[i], delta, delta_d)
         return out
+
+    def _slip_torque(self, i, rate, delta=None, delta_d=None):
+        """Friction of joint i beyond Coulomb's [N m]."""
+        delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
+        level = plain.slip_level(self.data, i, delta, delta_d, rate)
+        return level * np.tanh(rate / self.data.slip[i, 3])
 
     def stiffness_matrix(self):
         m = self.n_modes

@@ -11,6 +11,7 @@ r"""What every model of an arm offers, and the terms of the equations of motion 
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import eigh
@@ -125,6 +126,10 @@ class ArmModel(ABC):
 
         Stribeck's part, and that of the transmitted torque, are in the equations of motion.
         """
+        return self._friction.copy()
+
+    @cached_property
+    def _friction(self):
         frictions = [joint.friction for joint in self.arm.joints]
         return np.array([[f.viscous, f.coulomb, f.smoothing] for f in frictions])
 
@@ -195,7 +200,7 @@ class ArmModel(ABC):
 
         Without the deflections `delta` and `delta_d`, without the part that grows with the transmitted torque.
         """
-        viscous, coulomb, smoothing = self.friction_table().T
+        viscous, coulomb, smoothing = self._friction.T
         return viscous * qd + coulomb * np.tanh(qd / smoothing)
 
     def derivative(self, state, torque):

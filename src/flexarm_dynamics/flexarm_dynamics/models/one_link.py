@@ -26,15 +26,18 @@ its length would stiffen. Keep the joint's speed well below the first bending fr
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ..arm.description import scaled
-from ..errors import ModelError
+from ..errors import ModelError, check_shape
 from ..kernels import integrators, load
 from ..kernels import one_link as kernel
 from .assembly import outboard, shapes_of
 from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
+
+SOURCES = (load.source(kernel), load.source(integrators))
 
 #: Cosine and sine of an angle that is no number, as numpy has them.
 NOWHERE = (math.nan, math.nan)
@@ -179,6 +182,23 @@ class OneLinkEquations(ArmModel):
         )
         return self._rotation @ local
 
+    def derivative(self, state, torque):
+        state, m = np.asarray(state, float), self.n_modes
+        check_shape(state, (2 + 2 * m,), "state")
+        out = np.empty_like(state)
+        net = np.asarray(torque, float) - self.friction(state[1 + m : 2 + m])
+        self._kernel.derivative(state, net, self._constants, out)
+        return out
+
+    @cached_property
+    def _constants(self):
+        return self._data()
+
+    @property
+    def _kernel(self):
+        """The compiled equations and integrators."""
+        return load.joined("one_link", SOURCES, inline=("derivative", "net_torque", "low_storage"))
+
     def stepper(self, method):
         return self._stepper(method, self._data())
 
@@ -207,11 +227,7 @@ class OneLinkEquations(ArmModel):
                 field=f"model {self.arm.model}",
                 hint="take an explicit one, or model chain",
             )
-        sources = (load.source(kernel), load.source(integrators))
-        module = load.joined(
-            "one_link", sources, inline=("derivative", "net_torque", "low_storage")
-        )
-        return explicit_stepper(module, method, data, self, lock)
+        return explicit_stepper(self._kernel, method, data, self, lock)
 
 
 class OneLink(OneLinkEquations):
