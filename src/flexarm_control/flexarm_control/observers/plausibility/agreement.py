@@ -18,6 +18,9 @@ s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a
 
 import numpy as np
 
+from ... import kernels
+from ...kernels import readings
+
 #: Lengths of the windows in samples; the short one is quick, the long one sees slow motion and coarse encoders.
 WINDOWS = (20, 200)
 #: Samples in a row beyond the bound.
@@ -54,21 +57,20 @@ class Agreement:
         rates = np.concatenate([index[c.velocity], index[c.rate]])
         self.pairs = np.stack([values, rates])
         self._count = np.concatenate([c.count, np.zeros(c.m)])
-        self._noise = DEVIATIONS * np.sqrt(2.0) * c.noise[values] + self._count
-        self._rate_noise = DEVIATIONS * c.noise[rates]
+        difference = DEVIATIONS * np.sqrt(2.0) * c.noise[values] + self._count
+        self._noise = np.stack([difference, DEVIATIONS * c.noise[rates]])
         size = values.size
-        self._gain = c.gain[values]
-        self.changed, self.driven, self._missed, self._between = np.zeros((4, len(WINDOWS), size))
-        self._start, self._first = np.zeros((2, len(WINDOWS), size))
+        self._gain, self._kernels = np.ascontiguousarray(c.gain[values]), kernels.compiled()
+        self._windows = np.zeros((6, len(WINDOWS), size))
+        self.changed, self.driven = self._windows[readings.CHANGED], self._windows[readings.DRIVEN]
+        self._ages, self._evidence = np.zeros((2, len(WINDOWS))), np.zeros((2, len(WINDOWS), size))
+        self._rate = np.zeros(size)
         self.reset()
 
     def reset(self):
         """Forget the past."""
-        size = self.pairs.shape[1]
-        self._last = None
-        self._rate = np.full(size, np.nan)
-        self._age, self._time = np.zeros(len(WINDOWS), int), np.zeros(len(WINDOWS))
-        self._run = np.zeros(size, int)
+        self._begun = False
+        self._run = np.zeros(self.pairs.shape[1], int)
 
     def update(self, value, dt, jitter, change):
         """Take a new sample.
@@ -89,59 +91,23 @@ class Agreement:
         ndarray of int or None
             Pairs for which there is evidence; None in nearly all samples.
         """
-        rate = value[self.pairs[1]]
-        if not np.isfinite(rate).any():  # none is given
-            self._last = None
+        if not np.isfinite(value[self.pairs[1]]).any():  # none is given
+            self._begun = False
             return None
-        at = value[self.pairs[0]]
-        if self._last is None:
-            self._last = at
-            self._start[:], self._first[:] = at, rate
-            self.driven[:] = self._missed[:] = self._between[:] = 0.0
-            self._age[:], self._time[:] = 0, 0.0
-            self._rate = rate
+        if not self._begun:
+            self._begun = True
+            self._kernels.begin_agreement(value, self.pairs, self._rate, self._windows, self._ages)
             return None
-        mean = 0.5 * dt * (rate + self._rate)
-        self.driven += mean
-        self._missed += np.abs(rate - self._rate) * (0.5 * dt)
-        self._between += self._gain @ change * (0.25 * dt * dt)
-        np.subtract(at, self._start, out=self.changed)
-        self._last, self._rate = at, rate
-        bound = np.maximum(np.abs(self.changed), np.abs(self.driven))
         fast = self.channels.fastest * dt > 1.0
-        bound *= FAST_SCALE if fast else SCALE
-        bound += FAST_MISSED * self._missed if fast else self._missed
-        bound += self._between
-        bound += LATE * np.abs(rate - self._first)
-        bound += self._noise
-        if jitter > 0.0:
-            bound += 2.0 * jitter * np.abs(rate)
-        for i in range(len(WINDOWS)):
-            self._time[i] += dt
-            bound[i] += self._rate_noise * np.sqrt(self._time[i] * dt)
-        wrong = (np.abs(self.changed - self.driven) > bound).any(axis=0)
-        self._run[~wrong] = 0
-        self._run[wrong] += 1
-        found = None
-        if wrong.any():
-            found = np.flatnonzero(self._run >= PERSISTENT)
-            self._evidence = self.changed.copy(), self.driven.copy()
-        self._renew(at, rate)
-        return found if found is not None and found.size else None
-
-    def _renew(self, at, rate):
-        # A rate that comes again starts anew: its window began with NaN. The other pairs' windows go on.
-        unknown = np.isnan(self.driven[0])
-        if unknown.any():
-            self._start[:, unknown], self._first[:, unknown] = at[unknown], rate[unknown]
-            self.driven[:, unknown] = self._missed[:, unknown] = 0.0
-            self._between[:, unknown] = 0.0
-        for i, length in enumerate(WINDOWS):
-            self._age[i] += 1
-            if self._age[i] >= length:
-                self._age[i], self._time[i] = 0, 0.0
-                self._start[i], self._first[i] = at, rate
-                self.driven[i] = self._missed[i] = self._between[i] = 0.0
+        factors = (FAST_SCALE, FAST_MISSED, LATE) if fast else (SCALE, 1.0, LATE)
+        wrong = self._kernels.agree(
+            value, self.pairs, dt, jitter, change, self._gain, factors, self._noise, WINDOWS, self._rate,
+            self._windows, self._ages, self._run, self._evidence,
+        )  # fmt: skip
+        if not wrong:
+            return None
+        found = np.flatnonzero(self._run >= PERSISTENT)
+        return found if found.size else None
 
     def stands(self, j):
         """Whether it is the value of pair j that does not change at all."""

@@ -17,7 +17,12 @@ what `channels` has and the rms of r so far. The first `LEARNT` samples are not 
 A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump is real.
 """
 
+from math import exp, sqrt
+
 import numpy as np
+
+from ... import kernels
+from ...kernels import readings
 
 #: Samples in a row whose reading is replaced; at the next one the jump is taken for lasting.
 BRIDGED = 3
@@ -59,11 +64,15 @@ class Jumps:
         self._far[c.position] = self._far[c.velocity] = True
         # The torque of lost samples is unknown; it moves the links soon, the joints later.
         strength = np.where(np.isfinite(c.strength), c.strength, 0.0)
-        self._unreported = (c.gain @ strength) * np.where(self._far, UNREPORTED, 1.0)
-        self._value, self._line, self._bound, self._residual = np.zeros((4, c.size))
-        self._count = np.zeros(c.size)
-        self._count[c.position] = c.count
-        self._any_count = bool(c.count.any())
+        lost = (c.gain @ strength) * np.where(self._far, UNREPORTED, 1.0)
+        counts = np.zeros((2, c.size))
+        counts[0, c.position] = counts[1, c.velocity] = c.count
+        self._fixed = np.vstack([c.noise, c.push, c.is_rate, lost, counts])
+        self._value, self._rows = np.zeros(c.size), np.zeros((8, c.size))
+        self._line, self._bound = self._rows[readings.LINE], self._rows[readings.BOUND]
+        self._residual, self._square = self._rows[readings.RESIDUAL], self._rows[readings.SQUARE]
+        self._excess = self._rows[readings.EXCESS]
+        self._replaced, self._kernels = np.zeros(c.size, bool), kernels.compiled()
         self.reset()
 
     def reset(self):
@@ -71,7 +80,7 @@ class Jumps:
         size = self.channels.size
         self._past = np.full((self.span + 1, size), np.nan)
         self._times = np.zeros(self.span + 1)
-        self._square, self._excess, self._often = np.zeros((3, size))
+        self._rows[:], self._often = 0.0, np.zeros(size)
         self._run, self._grace = np.zeros(size, int), np.zeros(size, int)
         self._seen, self.period, self.jitter = 0, 0.0, 0.0
         self._unseen = 0.0
@@ -114,39 +123,17 @@ class Jumps:
         self._new_unseen = 0.0
         if self._seen < 2:
             return None, None
-        first = max(self.span - self._seen + 1, 0)
-        span = times[-1] - times[first]
-        slope = (past[-1] - past[first]) / span
-        rho = dt / span
-        line = np.multiply(slope, dt, out=self._line)
-        line += past[-1]
-        residual = np.subtract(value, line, out=self._residual)
-        np.abs(residual, out=residual)
-        self._scale = scale = np.where(c.is_rate, 0.5 * (dt + span), 0.5 * dt * (dt + span))
-        self._spread = np.sqrt(1.0 + (1.0 + rho) ** 2 + rho * rho)
-        noise = np.sqrt(self._square)
-        np.maximum(noise, c.noise, out=noise)
-        noise *= DEVIATIONS * self._spread
-        bound = np.dot(c.gain, self._new_change, out=self._bound)
         self._new_unseen = 1.0 if steps > 1 else 0.5 * self._unseen
-        if self._new_unseen > 0.01:
-            bound += self._new_unseen * self._unreported
-        bound += c.push
-        bound += GROWTH * self._excess
-        bound *= scale
-        bound += noise
-        self._noise = noise
-        # What the residual may be without any acceleration.
-        floor = np.abs(slope, out=slope)
-        floor *= 2.0 * max(self.jitter, self._late) * (1.0 + rho)
-        if self._any_count:
-            floor += (1.0 + rho) * self._count
-            floor[c.velocity] += (1.0 + rho) / dt * c.count
-        bound += floor
-        self._floor = floor
-        if not (residual > bound).any() or self._seen < LEARNT:
+        first = max(self.span - self._seen + 1, 0)
+        rho = dt / (times[-1] - times[first])
+        self._spread = sqrt(1.0 + (1.0 + rho) ** 2 + rho * rho)
+        beyond = self._kernels.judge_jumps(
+            value, past, times, first, (dt, self._new_unseen), max(self.jitter, self._late), self._new_change,
+            self._fixed, c.gain, GROWTH, DEVIATIONS, self._rows,
+        )  # fmt: skip
+        if not beyond or self._seen < LEARNT:
             return None, None
-        return self._sort_out(value, residual > bound)
+        return self._sort_out(value, self._residual > self._bound)
 
     @property
     def _gap(self):
@@ -179,10 +166,7 @@ class Jumps:
         dt = self._dt
         if self._seen >= 2:
             self._learn(dt)
-        self._past[:-1] = self._past[1:]
-        self._past[-1] = value
-        self._times[:-1] = self._times[1:]
-        self._times[-1] = stamp
+        self._kernels.remember(value, stamp, self._past, self._times)
         if self._lasting is not None and self._lasting.size:
             # The new level is where it goes on from; its slope shows in the next samples.
             self._past[:, self._lasting] = value[self._lasting]
@@ -208,25 +192,15 @@ class Jumps:
 
     def _learn(self, dt):
         """Follow noise and excess, from the residuals of readings that were believed."""
-        residual, noise = self._residual, self._noise
-        residual[np.isnan(residual)] = 0.0
-        rms = residual / self._spread
-        if self._seen >= LEARNT:
-            np.minimum(rms, 0.5 * noise / self._spread, out=rms)  # 3 standard deviations
+        replaced = self._replaced
         if self._outliers is not None:
-            rms[self._outliers] = 0.0
-        rms *= rms
-        rms -= self._square
-        rms *= 1.0 / min(self._seen, 1000)
-        self._square += rms
-        noise *= 0.5
-        noise += self._floor
-        residual -= noise
-        residual /= self._scale
+            replaced[self._outliers] = True
+        self._kernels.learn_jumps(
+            self._rows, replaced, self._spread, self._seen < LEARNT, 1.0 / min(self._seen, 1000),
+            exp(-dt / EXCESS_TIME),
+        )  # fmt: skip
         if self._outliers is not None:
-            residual[self._outliers] = 0.0
-        self._excess *= np.exp(-dt / EXCESS_TIME)
-        np.maximum(self._excess, residual, out=self._excess)
+            replaced[:] = False
         if self._grace.any():
             self._grace[self._grace > 0] -= 1
         if self._often.any():

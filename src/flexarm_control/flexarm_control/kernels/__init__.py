@@ -1,0 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is computed of every sample: plain Python on arrays, which `load.joined` compiles with numba.
+
+The equations are in the modules whose arrays these functions work on.
+"""
+
+from flexarm_dynamics.kernels import load
+
+from . import readings
+
+
+def compiled():
+    """The compiled functions of `readings`."""
+    return load.joined("readings", (load.source(readings),), inline=("larger",))
