@@ -411,5 +411,9 @@ def test_terms_of_the_straight_arm_hold_the_forces_and_their_derivatives():
         np.testing.assert_allclose(found, forces, rtol=1e-13, atol=1e-12)
         # Not to the last bit: K and C are of complex steps there, of recorded derivatives here.
         scale = np.abs(K).max(), np.abs(C).max()
-        np.testing.assert_allclose(np.vstack([terms.K1, terms.K2]), K, rtol=0, atol=1e-14 * scale[0])
-        np.testing.assert_allclose(np.vstack([terms.C1, terms.C2]), C, rtol=0, atol=1e-14 * scale[1])
+        np.testing.assert_allclose(
+            np.vstack([terms.K1, terms.K2]), K, rtol=0, atol=1e-14 * scale[0]
+        )
+        np.testing.assert_allclose(
+            np.vstack([terms.C1, terms.C2]), C, rtol=0, atol=1e-14 * scale[1]
+        )

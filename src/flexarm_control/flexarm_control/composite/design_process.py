@@ -59,7 +59,9 @@ class _Unpickler(pickle.Unpickler):
         if scale not in self._models:
             model = self._models[scale] = self._models[1.0].with_payload(scale)
             rest = np.zeros(model.n_joints)
-            model.terms(rest, rest)  # what they are computed from is made here, not on the control path
+            model.terms(
+                rest, rest
+            )  # what they are computed from is made here, not on the control path
         return self._models[scale]
 
 

@@ -17,7 +17,9 @@ def larger(a, b):
     return a if a >= b or a != a else b
 
 
-def judge_jumps(value, past, times, first, steps, late, change, fixed, gain, growth, deviations, rows):
+def judge_jumps(
+    value, past, times, first, steps, late, change, fixed, gain, growth, deviations, rows
+):
     """Compare readings with the line through their past; whether one is beyond its bound.
 
     Parameters
@@ -118,7 +120,22 @@ def begin_agreement(value, pairs, rate, windows, ages):
             restart(value, pairs, rate, windows, w, j)
 
 
-def agree(value, pairs, dt, late, change, gain, factors, noise, lengths, rate, windows, ages, run, evidence):
+def agree(
+    value,
+    pairs,
+    dt,
+    late,
+    change,
+    gain,
+    factors,
+    noise,
+    lengths,
+    rate,
+    windows,
+    ages,
+    run,
+    evidence,
+):
     """Compare the rates with their values over all windows; whether a pair is beyond its bound.
 
     Parameters

@@ -8,7 +8,7 @@ leaves no operation. The constants of an arm are symbols as well: arms of one st
 depends on constants alone is computed once for each arm.
 """
 
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,16 @@ from .duals import Dual
 
 #: Constants that the forces of a straight arm at the first order do not depend on.
 UNUSED = {
-    *("node_x", "node_mass", "node_phi", "node_slope", "node_bend", "node_ei", "cumulate", "bishop"),
+    *(
+        "node_x",
+        "node_mass",
+        "node_phi",
+        "node_slope",
+        "node_bend",
+        "node_ei",
+        "cumulate",
+        "bishop",
+    ),
     *("transmission", "slip"),
 }
 #: Numbers that are part of the structure.
@@ -28,7 +37,7 @@ ZERO, ONE = 0, 1
 
 
 class Record(NamedTuple):
-    """What `tape.evaluate` replays; indices into its work space, which begins with 0, 1, the constants and the inputs."""
+    """What `tape.evaluate` replays, by places in its work space: 0, 1, constants, inputs, other numbers, results."""
 
     size: int
     inputs: int
@@ -40,6 +49,7 @@ class Record(NamedTuple):
     outputs: np.ndarray
 
 
+@cache
 def kernel():
     """The compiled `tape`."""
     return load.joined("tape", (load.source(tape),), inline=("run",))
@@ -102,8 +112,8 @@ class _Structure:
 
 def _floats(data):
     """Names of the fields that the forces depend on and that are not whole numbers."""
-    fields = data._asdict().items()
-    return [n for n, v in fields if getattr(v, "dtype", None) == float and n not in UNUSED]
+    arrays = {n: v for n, v in data._asdict().items() if isinstance(v, np.ndarray)}
+    return [n for n, v in arrays.items() if v.dtype.kind == "f" and n not in UNUSED]
 
 
 def _pattern(data):
@@ -176,89 +186,93 @@ def _duals(array):
     return out.reshape(array.shape)
 
 
+#: What is computed of angles, in the order of their numbers in `tape.evaluate`.
+FUNCTIONS = ("np.cos", "np.sin")
 #: When a node can be computed: with the constants, before the functions of angles, or after them.
 _KNOWN, _EARLY, _LATE = 0, 1, 2
 
 
 def _assembled(graph, outputs, constants, joints):
     """The `Record` that computes `outputs` of a graph with so many constants and joints."""
-    seen, uses = _needed(graph, outputs)
-    when = _times(graph, seen)
-    inputs = 2 + constants
-    places = {f"c[{i}]": 2 + i for i in range(constants)}
-    places |= {f"q[{i}]": inputs + i for i in range(joints)}
-    places |= {f"v[{i}]": inputs + joints + i for i in range(joints)}
-    numbers, at = {0.0: ZERO, 1.0: ONE}, {}
-    next_place = inputs + 2 * joints
+    layout = _Layout(graph, outputs, constants, joints)
+    work, angles, place = layout.work, layout.angles, layout.place
+    return Record(
+        size=layout.first + len(work),
+        inputs=layout.inputs,
+        numbers=tuple((place, number) for number, place in layout.numbers.items()),
+        counts=np.array([*layout.counts, layout.first], np.int64),
+        places=np.array([[place(o) for o in parts[:3]] for _, parts in work], np.int32).reshape(-1, 3),
+        signs=np.array([parts[3:] for _, parts in work], float).reshape(-1, 2),
+        functions=np.array([[place(a), place(o), kind] for o, a, kind in angles], np.int32).reshape(-1, 3),
+        outputs=np.array([place(o) for o in outputs], np.int32),
+    )  # fmt: skip
 
-    def operand(o):
-        nonlocal next_place
-        if isinstance(o, symbols.Symbol):
-            return at[o.index]
-        if float(o) not in numbers:
-            numbers[float(o)] = next_place
-            next_place += 1
-        return numbers[float(o)]
 
-    def product(o, time):
-        """Operands of a product that only this operation needs, and that can wait for it."""
-        if not isinstance(o, symbols.Symbol) or uses[o.index] > 1 or when[o.index] < time:
-            return None
-        op, pair = graph.nodes[o.index]
-        return pair if op == "*" else None
+class _Layout:
+    """Where each number of a graph is in the work space, and in what order operations run."""
 
-    def operation(index):
+    def __init__(self, graph, outputs, constants, joints):
+        self._graph = graph
+        seen, self._uses = _needed(graph, outputs)
+        self._when = _times(graph, seen)
+        self.inputs = 2 + constants
+        inputs = {f"c[{i}]": 2 + i for i in range(constants)}
+        inputs |= {f"q[{i}]": self.inputs + i for i in range(joints)}
+        inputs |= {f"v[{i}]": self.inputs + joints + i for i in range(joints)}
+        self.numbers, self._at = {0.0: ZERO, 1.0: ONE}, {}
+        self.first = self.inputs + 2 * joints
+        self.angles, work = [], []
+        for index in seen:
+            op, operands = graph.nodes[index]
+            node = graph.symbol(op, *operands)
+            if op in inputs:
+                self._at[index] = inputs[op]
+            elif op in FUNCTIONS:
+                self.angles.append((node, operands[0], FUNCTIONS.index(op)))
+            else:
+                work.append((node, self._operation(index)))
+        read = [o for _, parts in work for o in parts[:3]] + [a for _, a, _ in self.angles]
+        for number in {float(o) for o in read + outputs if not isinstance(o, symbols.Symbol)}:
+            if number not in self.numbers:
+                self.numbers[number], self.first = self.first, self.first + 1
+        for node, _, _ in self.angles:
+            self._at[node.index], self.first = self.first, self.first + 1
+        # Products that went into a sum have no place.
+        read = {o.index for o in read + outputs if isinstance(o, symbols.Symbol)}
+        self.work = [(o, parts) for o, parts in work if o.index in read]
+        self.work.sort(
+            key=lambda item: self._when[item[0].index]
+        )  # stable: in order within each time
+        for k, (node, _) in enumerate(self.work):
+            self._at[node.index] = self.first + k
+        when = [self._when[node.index] for node, _ in self.work]
+        self.counts = [sum(each <= last for each in when) for last in (_KNOWN, _EARLY)]
+
+    def place(self, operand):
+        """Where a symbol or a number is."""
+        if isinstance(operand, symbols.Symbol):
+            return self._at[operand.index]
+        return self.numbers[float(operand)]
+
+    def _operation(self, index):
         """(a, b, c, s, t) of a node."""
-        op, operands = graph.nodes[index]
-        time = when[index]
+        op, operands = self._graph.nodes[index]
         if op == "*":
             return *operands, 0.0, 1.0, 0.0
         x, y = operands if len(operands) == 2 else (operands[0], 0.0)
-        sx, sy = {"+": (1.0, 1.0), "-": (1.0, -1.0), "neg": (-1.0, 0.0)}[op]
-        if (pair := product(x, time)) is not None:
-            return *pair, y, sx, sy
-        if (pair := product(y, time)) is not None:
-            return *pair, x, sy, sx
-        return x, 1.0, y, sx, sy
+        s, t = {"+": (1.0, 1.0), "-": (1.0, -1.0), "neg": (-1.0, 0.0)}[op]
+        if (pair := self._product(x, self._when[index])) is not None:
+            return *pair, y, s, t
+        if (pair := self._product(y, self._when[index])) is not None:
+            return *pair, x, t, s
+        return x, 1.0, y, s, t
 
-    work, angles, fused = [], [], set()
-    for index in seen:
-        op, operands = graph.nodes[index]
-        if op in places:
-            at[index] = places[op]
-        elif op in ("np.sin", "np.cos"):
-            angles.append(index)
-        else:
-            work.append((index, operation(index)))
-    for _, (a, b, c, _, _) in work:
-        for o in (a, b, c):
-            operand(o) if not isinstance(o, symbols.Symbol) else None
-    for o in outputs:
-        operand(o) if not isinstance(o, symbols.Symbol) else None
-    used = {o.index for _, parts in work for o in parts[:3] if isinstance(o, symbols.Symbol)}
-    used |= {o.index for o in outputs if isinstance(o, symbols.Symbol)}
-    used |= {graph.nodes[i][1][0].index for i in angles}
-    work = [(i, parts) for i, parts in work if i in used]
-    work.sort(key=lambda item: when[item[0]])  # stable: in order within each time
-    for index in angles:
-        at[index], next_place = next_place, next_place + 1
-    first = next_place
-    for k, (index, _) in enumerate(work):
-        at[index] = first + k
-    return Record(
-        size=first + len(work),
-        inputs=inputs,
-        numbers=tuple((place, value) for value, place in numbers.items()),
-        counts=np.array(
-            [sum(when[i] <= t for i, _ in work) for t in (_KNOWN, _EARLY)] + [first], np.int64
-        ),
-        places=np.array([[operand(o) for o in parts[:3]] for _, parts in work], np.int32).reshape(-1, 3),
-        signs=np.array([parts[3:] for _, parts in work], float).reshape(-1, 2),
-        functions=np.array(
-            [[operand(graph.nodes[i][1][0]), at[i], graph.nodes[i][0] == "np.sin"] for i in angles], np.int32
-        ).reshape(-1, 3),
-        outputs=np.array([operand(o) for o in outputs], np.int32),
-    )  # fmt: skip
+    def _product(self, operand, time):
+        """Operands of a product that only one operation needs, and that is not known long before it; else None."""
+        if not isinstance(operand, symbols.Symbol) or self._uses[operand.index] > 1:
+            return None
+        op, pair = self._graph.nodes[operand.index]
+        return pair if op == "*" and self._when[operand.index] >= time else None
 
 
 def _needed(graph, outputs):
@@ -284,7 +298,7 @@ def _times(graph, seen):
     for index in seen:
         op, operands = graph.nodes[index]
         own = [o.index for o in operands if isinstance(o, symbols.Symbol)]
-        if op in ("np.sin", "np.cos"):
+        if op in FUNCTIONS:
             early += own
             when[index] = _LATE
         elif not own:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluates recorded operations one after the other: close to compiled straight-line code, and nothing to compile.
+r"""Evaluates recorded operations one after the other: close to compiled straight-line code, and nothing to compile.
 
-Each operation is one of the same kind, :math:`v_i = s\\,v_a v_b + t\\,v_c`, so that there is no branch to be
+Each operation is one of the same kind, :math:`v_i = s\,v_a v_b + t\,v_c`, so that there is no branch to be
 mispredicted. See `straight_arm`, which records them.
 """
 

@@ -194,7 +194,7 @@ class OneLinkEquations(ArmModel):
     def _constants(self):
         return self._data()
 
-    @property
+    @cached_property
     def _kernel(self):
         """The compiled equations and integrators."""
         return load.joined("one_link", SOURCES, inline=("derivative", "net_torque", "low_storage"))
