@@ -450,6 +450,17 @@ def test_a_gap_beyond_resume_gap_gives_the_motion_up_and_torque_returns_in_a_ram
     assert not core.reference.active
 
 
+def test_a_stamp_far_ahead_of_its_number_is_named(arm_r):
+    core = started(arm_r)
+    feed(core, range(1, 100))
+    new = sample(100)
+    new.stamp_ns += 300_000_000
+    assert core.step(new) is True and core.interruptions == 1
+    assert core.reason.startswith(
+        "header.stamp: 0.301 s after the last state, and 0 states are missing: the source stood still, or its clock"
+    )
+
+
 def test_a_moving_arm_is_taken_over_as_it_moves_and_brought_to_rest(arm_r):
     core = controller(arm_r, return_time=0.065)
     positions, speeds, torques = [], [], []

@@ -140,6 +140,32 @@ def test_a_gap_is_bridged_with_the_true_time_step(arm_r):
     assert_allclose(core.observer.rate, [2.0, -1.0], rtol=1e-12)
 
 
+def test_a_stamp_ahead_of_its_number_is_a_jump_of_the_clock_where_the_joints_have_moved_so_little(
+    arm_r,
+):
+    """A driver whose clock jumps by 0.3 s in the middle of a motion: the arm goes on as fast as it was."""
+    steady, jumped = observed(arm_r, plausibility=True), observed(arm_r, plausibility=True)
+    for k in range(200):
+        given = {"amplitude": [0.002, -0.001], "position": [1e-3 * k], "velocity_known": False}
+        steady.step(sample(k, **given))
+        jumped.step(sample(k, stamp_ns=(k + 300 * (k >= 150)) * MS + MS, **given))
+    assert_allclose(steady.velocity, [1.0], rtol=1e-6)
+    assert_allclose(jumped.velocity, [1.0], rtol=1e-6)
+
+
+def test_a_stamp_ahead_of_its_number_is_a_pause_where_the_joints_have_moved_as_far(arm_r):
+    core = observed(arm_r, plausibility=True)
+    for k in range(200):
+        moved = 1e-3 * (k + 299 * (k >= 150))
+        stamp = (k + 300 * (k >= 150)) * MS + MS
+        core.step(
+            sample(k, stamp_ns=stamp, amplitude=[0.0, 0.0], position=[moved], velocity_known=False)
+        )
+        if k == 150:
+            assert core._step_of(sample(151, stamp_ns=stamp + MS)) == pytest.approx(1e-3)
+            assert_allclose(core.velocity, [1.0], rtol=0.02)
+
+
 # --------------------------------------------------------------------------- refusals
 
 BAD = {

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexarm_control import trajectory
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 from flexarm_sim.fault_injector import FaultInjector
-from flexarm_studies.attack import actions, command, lies, report, run
+from flexarm_studies.attack import actions, command, healthy, lies, report, run
 from flexarm_studies.attack.cases import ARMS, Case, arm_of, chosen, observers
 from flexarm_studies.attack.driver import ALONE, TORQUE_TIMEOUT, Gate
 from flexarm_studies.attack.healthy import healthy_run, plant
@@ -217,6 +218,7 @@ HOLD = [
     ("clock ahead by 10 s", 1.15),
     ("torque spoofed for 20 ms", 1.15),
     ("message repeated for ever", 1.15),
+    ("clock ahead by 0.3 s", 0.5),
 ]
 
 
@@ -235,6 +237,78 @@ def test_a_healthy_run_has_no_alarm_and_its_arm_is_another():
     arms = [plant(case, np.random.default_rng(seed))[0] for seed in (1, 1, 2)]
     assert arms[0] == arms[1] != arms[2]
     assert arms[0].joints[0].friction.coulomb > 0.0
+
+
+@pytest.mark.slow
+def test_short_motions_at_200_hz_with_lost_samples_are_no_alarm(monkeypatch):
+    """A seed whose strains were once taken to jump after lost samples: the second mode turns by 2 rad a sample."""
+    random = np.random.default_rng(8)
+    case = Case("R", "kalman", False)
+    arm, payload = plant(case, random)
+    own = replace(
+        case.scenario(), plant_arm=arm, payload_scale=payload, seed=8, rate=200.0, noise=False
+    )
+    faults = [f"state drop share={random.choice([0.0, 0.2, 0.4])} seed=8"]
+    for _ in range(6):
+        begin, lasts = random.uniform(0.3, 5.0), random.uniform(0.006, 0.045)
+        faults.append(f"state drop from={begin:.4f} for={lasts:.4f}")
+    faults.append(f"state jitter by={random.choice([0.0, 0.4]) / 200.0} seed=8")
+
+    def offer(driver, scenario):
+        time, place, points = 0, driver.loop.simulator.position.copy(), []
+        for _ in range(8):
+            time += int(1e9 * random.uniform(0.1, 0.8))
+            place = place + random.uniform(-0.25, 0.25, 1)
+            points.append((time, place, (), (), ()))
+        motion = trajectory.validate(arm.joint_names, arm.joint_names, 0, points)
+        driver.loop.controller.offer(motion, driver.loop.controller.prepare(motion))
+
+    monkeypatch.setattr(run, "_offer", offer)
+    trace = run.drive(run.driver_of(own, faults, 0.3), until=6.0)
+    assert np.ptp(trace.position) > 0.2
+    assert not [text for _, text in trace.texts if "jumped" in text]
+
+
+def test_healthy_runs_take_turns_and_go_on_where_an_interrupted_study_ended(
+    tmp_path, monkeypatch, capsys
+):
+    calls = []
+
+    def short(case, seed):
+        calls.append((str(case), seed))
+        return 100, "an alarm" if (case.arm, seed) == ("two_link", 1) else ""
+
+    monkeypatch.setattr(healthy, "healthy_run", short)
+    out = tmp_path / "runs.jsonl"
+    words = ("--arms", "R,two_link", "--observers", "kalman", "--workers", "1", "--json", str(out))
+    assert command.attack(options(*words, "--healthy", "600")) == 0
+    assert [name[0] for name, _ in calls] == ["R"] * 6
+    assert command.attack(options(*words, "--healthy", "800")) == 1
+    assert len(calls) == len(set(calls)) == 8
+    assert capsys.readouterr().out.splitlines()[-6:] == [
+        "800 healthy samples in 8 runs, 1 of them with an alarm",
+        "R, kalman, without velocity: 300 samples in 3 runs",
+        "R, kalman, with velocity: 300 samples in 3 runs",
+        "two_link, kalman, without velocity: 100 samples in 1 runs",
+        "two_link, kalman, with velocity: 100 samples in 1 runs",
+        "two_link, kalman, with velocity, seed 1: an alarm",
+    ]
+    with out.open("a") as file:
+        file.write('{"case": "R, kal')  # cut off by the interruption
+    assert len(healthy.stored(out)) == 8
+    out.write_text("[1]\n[2]\n")
+    with pytest.raises(FlexarmError, match="line 1 is not of healthy runs"):
+        healthy.stored(out)
+
+
+def test_some_runs_cover_every_lie_under_every_observer_and_on_every_arm():
+    todo = command.cover(chosen(), lies.LIES)
+    assert set(todo) < set(command.jobs(chosen(), lies.LIES)) and len(todo) < 250
+    for lie in lies.LIES.values():
+        own = [case for case, other, _ in todo if other == lie]
+        assert {case.arm for case in own} == set(ARMS)
+        assert lie.rates or {case.observer for case in own} == set(observers())
+    assert {case.velocity for case, lie, _ in todo if lie.name == "encoder stuck"} == {False, True}
 
 
 # --------------------------------------------------------------------------- the command

@@ -387,7 +387,13 @@ class ArmController:
         gap, away = dt, self._applied.back_after(sample, self.controller_id)
         known, self._period = self._period, dt / self._count
         if gap > self._resume_gap and gap > PERIODS_OF_GAP * known:
-            self._interrupted(sample, f"no state for {gap:.3g} s")
+            what = f"no state for {gap:.3g} s"
+            if gap > PERIODS_OF_GAP * known * self._count > 0.0:
+                what = (
+                    f"header.stamp: {gap:.3g} s after the last state, and {self._count - 1} states are missing: the"
+                    " source stood still, or its clock jumped"
+                )
+            self._interrupted(sample, what)
             dt = 0.0
         elif away > self._resume_gap:
             self._interrupted(sample, f"the driver has applied no torque for {away:.3g} s")

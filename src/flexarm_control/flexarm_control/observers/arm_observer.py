@@ -151,13 +151,13 @@ class ArmObserver:
         # After a jump of the clock or a long silence the past is useless.
         gap = sample.stamp_ns - last_stamp > MAX_GAP_NS
         restart = gap or verdict in (SampleOrder.RESTART, SampleOrder.JUMP)
+        dt = 0.0 if restart else self._step_of(sample)
         judges = self._judges
-        if judges and self._judge(sample, restart):
-            restart = True
+        if judges and self._judge(sample, dt):
+            restart, dt = True, 0.0
         self._map_strain(sample, restart)
         if restart:
             self.observer.reset()
-        dt = 0.0 if restart else 1e-9 * (sample.stamp_ns - last_stamp)
         if self.settings["delay"] and not restart:
             need_torque(sample.torque, "observer.delay", "set observer.delay to 0.0")
         if not sample.velocity_known:
@@ -177,12 +177,29 @@ class ArmObserver:
     def _judges(self):
         return self.settings["plausibility"]
 
-    def _judge(self, sample, restart):
+    def _judge(self, sample, dt):
         """Have the readings of a new sample judged; whether the observer is to start afresh."""
-        order, last = self._order, self.monitor.stamp_ns
-        afresh = restart or last != order.stamp_ns  # it was off until now
-        dt = 0.0 if afresh else 1e-9 * (sample.stamp_ns - last)
+        order = self._order
+        if self.monitor.stamp_ns != order.stamp_ns:  # it was off until now
+            dt = 0.0
         return self.monitor.judge(sample, dt, (sample.sequence - order.sequence) % WRAP)
+
+    def _step_of(self, sample):
+        """Time since the last sample [s]: that of the stamps, or of the numbers where the source's clock has jumped.
+
+        A sample whose stamp is far later than its number says may follow a pause of the source, or a jump of its
+        clock. Which of them shows in the positions: whether the joints have moved as far as in the one time or in the
+        other. Over a jump the old estimate goes on; over a pause nothing is known of the torque.
+        """
+        order = self._order
+        dt = 1e-9 * (sample.stamp_ns - order.stamp_ns)
+        expected = self.monitor.jumps.period * ((sample.sequence - order.sequence) % WRAP)
+        if not (self._judges and 0.0 < JUMP_PERIODS * expected < dt):
+            return dt
+        moved = sample.position - self._measured
+        by_number = np.abs(moved - expected * self._derivative).max()
+        by_stamp = np.abs(moved - dt * self._derivative).max()
+        return expected if by_number < JUMP_FITS * by_stamp else dt
 
     def warm_up(self):
         """Take three samples of an arm at rest, so that compiled code is loaded; discard the observer afterwards."""
@@ -311,6 +328,9 @@ class ArmObserver:
         return difference + (self._derivative - difference) * np.exp(-bandwidth * dt)
 
 
+#: A step by the stamps this many times as long as by the numbers may be a jump of the clock, and is one where the
+#: numbers fit the positions this much better [-].
+JUMP_PERIODS, JUMP_FITS = 20.0, 0.25
 #: After a longer silence an observer starts afresh [ns].
 MAX_GAP_NS = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from flexarm_control.observers.arm_observer import OBSERVERS
+from flexarm_control.robust.default import TYPES
 from flexarm_dynamics import registry
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
@@ -12,16 +13,24 @@ from flexarm_dynamics.errors import FlexarmError
 from ..loop import scenario as scenarios
 from ..uncertain.plants import COUNTS, STRAIN_NOISE
 
-#: Arm to its controller file (empty: the nodes' defaults), motion and rate [Hz].
+#: Arm to its motion.
 ARMS = {
-    "R": ("", "quintic:to=1,duration=2", 1000.0),
-    "two_link": ("two_link", "quintic:to=1.0472,duration=2", 1000.0),
-    "long_reach": (
-        "long_reach",
-        "quintic:from=0;1.2;0.8;-0.8,to=0.4;0.9;1.2;-0.4,duration=2",
-        500.0,
-    ),
+    "R": "quintic:to=1,duration=2",
+    "two_link": "quintic:to=1.0472,duration=2",
+    "long_reach": "quintic:from=0;1.2;0.8;-0.8,to=0.4;0.9;1.2;-0.4,duration=2",
 }
+#: The observer that a design is made with.
+DESIGNED = TYPES["observer.type"]
+#: Arm to its control under `DESIGNED` and under other observers: shipped file (empty: the nodes' defaults), rate [Hz].
+#: The nodes' control without options is the paper's for R; for other arms it is a design, whose gains count on its own
+#: observer. Those of the other file are for observers that have a model.
+CONTROLS = {
+    "R": (("", 1000.0), ("", 1000.0)),
+    "two_link": (("two_link_designed", 500.0), ("two_link", 1000.0)),
+    "long_reach": (("long_reach_designed", 500.0), ("long_reach", 500.0)),
+}
+#: Observers with the noise levels of `kalman`.
+FILTERS = ("kalman", "extended_kalman")
 #: Duration of the motions [s].
 MOTION = 2.0
 #: The motion starts at this time of the session: the observer has converged by then [s].
@@ -57,9 +66,10 @@ class Case:
 
     def scenario(self):
         """The honest `Scenario`."""
-        file, motion, rate = ARMS[self.arm]
+        file, rate = CONTROLS[self.arm][self.observer != DESIGNED]
         values = scenarios.parameters(file) if file else {}
-        if values.get("observer.type") != self.observer:
+        own = values.get("observer.type")
+        if own != self.observer and not {own, self.observer} <= set(FILTERS):
             values = {k: v for k, v in values.items() if not k.startswith("observer.")}
         values |= {
             "observer.type": self.observer,
@@ -68,7 +78,11 @@ class Case:
             "publish_rates": self.rates,
         }
         return scenarios.Scenario(
-            arm_of(self.arm, self.noise), values, trajectory=motion, rate=rate, noise=self.noise
+            arm_of(self.arm, self.noise),
+            values,
+            trajectory=ARMS[self.arm],
+            rate=rate,
+            noise=self.noise,
         )
 
 

@@ -32,11 +32,20 @@ def add_arguments(parser):
     add("--observers", help=f"separated by commas ({','.join(observers())})")
     add("--lies", help="those whose names have one of these texts, separated by commas (all)")
     add("--list", action="store_true", help="list the lies, and do nothing else")
+    add(
+        "--cover",
+        action="store_true",
+        help="a tenth of the runs: every lie under every observer and on every arm once or more, moments in turn",
+    )
     add("--random", type=int, default=0, metavar="N", help="so many random lies beside them (0)")
     add("--healthy", type=int, metavar="SAMPLES", help="no lies: count alarms in healthy samples")
     add("--seed", type=int, default=0, help="of random lies and healthy runs (0)")
     add("--workers", type=int, metavar="N", help="processes (one per core)")
-    add("--json", metavar="FILE", help="write every run")
+    add(
+        "--json",
+        metavar="FILE",
+        help="write every run; with --healthy one a line, and go on where the file ends",
+    )
     add(
         "--from",
         dest="stored",
@@ -64,10 +73,10 @@ def attack(options):
         from .healthy import healthy
 
         return healthy(options, cases)
+    todo = cover(cases, wanted) if options.cover else jobs(cases, wanted)
     # After every few runs, so that an interrupted study loses nothing.
-    return _report(
-        options, study(cases, wanted, options.workers, lambda rows: _store(options, rows))
-    )
+    rows = study(todo, options.workers, lambda rows: _store(options, rows))
+    return _report(options, rows)
 
 
 def _stored(file):
@@ -125,30 +134,65 @@ def jobs(cases, wanted):
     return [job for own in found.values() for job in dict.fromkeys(own)]
 
 
+def cover(cases, wanted):
+    """Some of the `jobs`: each lie once under each observer, with arms, measured velocity and moments in turn.
+
+    With as many observers as arms or more, each lie comes on each arm as well.
+    """
+    arms = tuple(dict.fromkeys(case.arm for case in cases))
+    names = tuple(dict.fromkeys(case.observer for case in cases))
+    chosen = []
+    for i, lie in enumerate(wanted.values()):
+        own = jobs(cases, {lie.name: lie})
+        for j, name in enumerate(names):
+            # What suits best: this observer, this arm, with or without velocity, this moment.
+            turn = (
+                arms[(i + j) % len(arms)],
+                bool((i // 3 + j) % 2),
+                lie.moments[(i + j) % len(lie.moments)],
+            )
+            wish = (name, *turn)
+            chosen.append(max(own, key=lambda job: _alike(job, wish), default=None))
+    found = {}
+    for job in dict.fromkeys(filter(None, chosen)):
+        found.setdefault(job[0], []).append(job)
+    return [job for own in found.values() for job in own]
+
+
+def _alike(job, wish):
+    """What of a wish for observer, arm, velocity and moment a job fulfils, in this order."""
+    case, _, moment = job
+    return tuple(
+        a == b for a, b in zip((case.observer, case.arm, case.velocity, moment), wish, strict=True)
+    )
+
+
 def _case_of(lie, case):
     from .run import case_of
 
     return case_of(lie, case)
 
 
-def study(cases, wanted, workers=None, store=lambda rows: None):
-    """Run the `wanted` lies in all `cases`, in processes, `workers` or one per core; the rows, in the order of `jobs`.
+def study(todo, workers=None, store=lambda rows: None):
+    """Run jobs in processes, `workers` or one per core; the rows, in the order of `todo`, which is that of `jobs`.
 
+    A case whose honest motion fails is reported, and has no rows: there is nothing to compare with.
     Those that there are go to `store` each time some are added.
     """
-    todo, progress = jobs(cases, wanted), Progress()
+    progress = Progress()
     parts = _parts(todo)
     rows = {}
     total = len(todo)
-    progress.step(f"{total} runs of {len(wanted)} lies")
+    progress.step(f"{total} runs of {len({lie.name for _, lie, _ in todo})} lies")
     with processes(workers or os.cpu_count() or 1) as executor:
         running = {executor.submit(run_all, part): part for part in parts}
         for future in as_completed(running):
-            rows |= dict(zip(running[future], future.result(), strict=True))
+            found = future.result()
+            rows |= dict(zip(running[future], found, strict=True))
             progress.step(str(running[future][0][0]), len(rows), total)
-            store([rows[job] for job in todo if job in rows])
+            store([row for job in todo if (row := rows.get(job))])
     progress.done()
-    return [rows[job] for job in todo]
+    return [row for job in todo if (row := rows[job])]
 
 
 #: Runs that go to a process at once: each process runs the honest motion of a case but once.
@@ -173,7 +217,15 @@ def _honest(case):
 
 
 def run_all(part):
-    """Rows of the runs of one case, in a process of its own."""
+    """Rows of the runs of one case, in a process of its own; None each where the honest motion fails."""
     from .run import attack as run
 
-    return [run(_honest(case), lie, moment) for case, lie, moment in part]
+    case = part[0][0]
+    try:
+        honest, problem = _honest(case), _honest(case).problem
+    except FlexarmError as error:
+        problem = str(error)
+    if problem:
+        print(f"not attacked: {case}: the honest motion: {problem}", flush=True)
+        return [None] * len(part)
+    return [run(honest, lie, moment) for _, lie, moment in part]

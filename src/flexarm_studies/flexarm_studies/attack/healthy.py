@@ -5,9 +5,11 @@ In each run the arm moves and holds, with noise and counts, with 20 % of its sam
 of the period; its payload is off by up to 30 %, and its joints have friction that the controller does not know.
 """
 
+import json
 import os
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,8 @@ from .run import drive, driver_of
 LOSS, JITTER, PAYLOAD, COULOMB, VISCOUS = 0.2, 0.4, 0.3, 0.005, 0.005
 #: A run lasts so long [s].
 LASTS = 6.0
+#: Of each round of runs so many are an arm's; one where none is given. A sample of these costs less.
+OFTEN = {"R": 6, "two_link": 2}
 
 
 def plant(case, random):
@@ -62,31 +66,97 @@ def healthy_run(case, seed):
     return trace.time.size, "; ".join(dict.fromkeys(alarms))
 
 
-def healthy(options, cases):
-    """Run `--healthy`; the exit code."""
-    progress, done, alarms = Progress(), 0, []
-    workers = options.workers or os.cpu_count() or 1
-    progress.step(f"{options.healthy} healthy samples")
-    counts = dict.fromkeys(map(str, cases), 0)
+def planned(cases, seed):
+    """Yield (case, seed) without end: rounds in which each arm comes as often as `OFTEN` states, its cases in turn."""
+    arms = {}
+    for case in cases:
+        arms.setdefault(case.arm, []).append(case)
+    turns = dict.fromkeys(arms, 0)
+    for _ in count():
+        for arm, own in arms.items():
+            for _ in range(OFTEN.get(arm, 1)):
+                yield own[turns[arm] % len(own)], seed * 1_000_000 + turns[arm]
+                turns[arm] += 1
+
+
+def _row(case, seed, samples, alarm):
+    return {"case": str(case), "seed": seed, "samples": samples, "alarm": alarm}
+
+
+def stored(file):
+    """Rows of the runs that an earlier study wrote to a file, one a line; none where there is no file.
+
+    Raises
+    ------
+    FlexarmError
+        If something else is in the file. A last line that was cut off is left out.
+    """
+    path = Path(file)
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            rows.append({k: row[k] for k in ("case", "seed", "samples", "alarm")})
+        except (ValueError, LookupError, TypeError) as error:
+            if number < len(lines) or number == 1:
+                problem = f"line {number} is not of healthy runs: {error}"
+                raise FlexarmError(problem, field=str(file), hint="give another file") from None
+    return rows
+
+
+def _results(calls, workers, samples):
+    """Yield a row per run, in processes, until so many `samples` are done."""
+    if workers == 1:
+        while samples > 0:
+            case, seed = next(calls)
+            row = _row(case, seed, *healthy_run(case, seed))
+            samples -= row["samples"]
+            yield row
+        return
     with processes(workers) as executor:
-        number, running = 0, {}
-        while done < options.healthy or running:
-            while done < options.healthy and len(running) < 2 * workers:
-                case, seed = cases[number % len(cases)], options.seed * 1_000_000 + number
+        running = {}
+        while samples > 0 or running:
+            while samples > 0 and len(running) < 2 * workers:
+                case, seed = next(calls)
                 running[executor.submit(healthy_run, case, seed)] = case, seed
-                number += 1
-            future = next(as_completed(running))
-            case, seed = running.pop(future)
-            samples, text = future.result()
-            done, counts[str(case)] = done + samples, counts[str(case)] + samples
-            if text:
-                alarms.append((case, seed, text))
-            progress.fraction(min(1.0, done / options.healthy))
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                row = _row(*running.pop(future), *future.result())
+                samples -= row["samples"]
+                yield row
+
+
+def summary(rows):
+    """Lines on the runs: how many samples of what, and each alarm."""
+    total, alarms = sum(row["samples"] for row in rows), [row for row in rows if row["alarm"]]
+    lines = [f"{total} healthy samples in {len(rows)} runs, {len(alarms)} of them with an alarm"]
+    for case in dict.fromkeys(row["case"] for row in rows):
+        own = [row["samples"] for row in rows if row["case"] == case]
+        lines.append(f"{case}: {sum(own)} samples in {len(own)} runs")
+    return lines + [f"{row['case']}, seed {row['seed']}: {row['alarm']}" for row in alarms]
+
+
+def healthy(options, cases):
+    """Run `--healthy`; the exit code. With `--json` it goes on where the file ends: an interrupted run counts."""
+    rows = stored(options.json) if options.json else []
+    known = {(row["case"], row["seed"]) for row in rows}
+    calls = (call for call in planned(cases, options.seed) if (str(call[0]), call[1]) not in known)
+    done = sum(row["samples"] for row in rows)
+    progress = Progress()
+    progress.step(f"{options.healthy} healthy samples")
+    workers = options.workers or os.cpu_count() or 1
+    for row in _results(calls, workers, options.healthy - done):
+        rows.append(row)
+        done += row["samples"]
+        if options.json:
+            with Path(options.json).open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+        progress.fraction(min(1.0, done / options.healthy))
     progress.done()
-    lines = [f"{done} healthy samples in {number} runs, {len(alarms)} of them with an alarm"]
-    lines += [f"{case}: {count} samples" for case, count in counts.items() if count]
-    lines += [f"{case}, seed {seed}: {text}" for case, seed, text in alarms]
-    print("\n".join(lines))
+    text = "\n".join(summary(rows))
+    print(text)
     if options.note:
-        Path(options.note).write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return int(bool(alarms))
+        Path(options.note).write_text(text + "\n", encoding="utf-8")
+    return int(any(row["alarm"] for row in rows))
