@@ -659,8 +659,8 @@ LAWS = [
         (
             "motion_kalman",
             "motion_kalman: the shared noise is white",
-            "step.Phi[last, last] = self._companion",
-            "step.Phi[last, last] = 0.0",
+            "Phi[last, last] = self._companion",
+            "Phi[last, last] = 0.0",
             TESTS + "test_motion_kalman.py",
         ),
         (
@@ -762,12 +762,6 @@ LIMITS = [
             "np.diag(self._inertia) * unsure",
         ),
         (
-            "agreement",
-            "a velocity beside its position: torque steps between samples",
-            "        bound += self._between\n",
-            "",
-        ),
-        (
             "amplitudes",
             "amplitudes beside strains: as much as they are",
             "+ SHARE * self._large",
@@ -778,6 +772,17 @@ LIMITS = [
             "light joints: in the first configuration alone",
             "light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())",
             "light = light or (np.diag(H)[:n] / np.diag(stiff)).max()",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "kernels",
+        TESTS + "test_reading_checks.py",
+        (
+            "readings",
+            "a velocity beside its position: torque steps between samples",
+            "between *= 0.25 * dt * dt",
+            "between *= 0.0",
         ),
     ),
     *of(

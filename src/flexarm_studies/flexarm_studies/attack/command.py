@@ -137,7 +137,7 @@ def jobs(cases, wanted):
 def cover(cases, wanted):
     """Some of the `jobs`: each lie once under each observer, with arms, measured velocity and moments in turn.
 
-    With as many observers as arms or more, each lie comes on each arm as well.
+    With as many observers as arms or more among ``cases``, each lie of ``wanted`` comes on each arm as well.
     """
     arms = tuple(dict.fromkeys(case.arm for case in cases))
     names = tuple(dict.fromkeys(case.observer for case in cases))
