@@ -112,3 +112,15 @@ def test_commands_work_without_ros_or_say_that_they_need_it(installed):
     code, out, error = run("-m", "flexarm_bringup.cli", "record")
     assert code == 1 and "needs ROS 2" in error and "./flexarm record" in error
     assert "Traceback" not in error
+
+
+@pytest.mark.slow
+def test_a_bag_is_read_without_ros(installed, flexarm):
+    folder, run = installed
+    motion = "quintic:to=0.2,duration=0.5"
+    words = ("simulate", "R", "--controller", "paper_composite", "--duration", 1)
+    code, _, error = flexarm(*words, "--trajectory", motion, "--bag", folder / "bag")
+    assert code == 0, error
+    code, out, error = run("-m", "flexarm_bringup.cli", "report", "bag", "--out", "report.html")
+    assert code == 0 and "Traceback" not in error, error
+    assert "Largest tracking error" in (folder / "report.html").read_text()

@@ -27,6 +27,8 @@ PACKAGES = (
 ROS = re.compile(r"(rclpy|rcl_interfaces|.*_msgs|builtin_interfaces|launch.*|ament_.*|rosidl.*)$")
 #: Files that go with the wheel, and where they are looked for (`flexarm_dynamics.arm.arm_file.arms_directories`).
 CONFIG, CONFIG_TO = ("arms", "controllers", "recordings"), "flexarm_dynamics/config"
+#: Definitions of the messages, which bags are read by (`flexarm_tools.recording.types`).
+MESSAGES, MESSAGES_TO = "src/flexarm_msgs/msg", "flexarm_tools/recording/msg"
 #: Needed by the nodes or the page of ``flexarm view`` alone.
 NOT_NEEDED = ("viser", "foxglove-sdk")
 PROJECT = """\
@@ -55,6 +57,7 @@ include-package-data = false
 
 [tool.setuptools.package-data]
 flexarm_dynamics = ["config/*/*.yaml"]
+flexarm_tools = ["recording/msg/*.msg"]
 """
 
 
@@ -161,6 +164,9 @@ def stage(folder):
         to.mkdir(parents=True)
         for path in sorted((ROOT / "config" / part).glob("*.yaml")):
             shutil.copy(path, to)
+    (folder / MESSAGES_TO).mkdir()
+    for path in sorted((ROOT / MESSAGES).glob("*.msg")):
+        shutil.copy(path, folder / MESSAGES_TO)
     for name in ("README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     (folder / "pyproject.toml").write_text(project(kept), encoding="utf-8")
