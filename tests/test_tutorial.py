@@ -105,7 +105,9 @@ class Desk:
         self.environment = dict(pair.split("=", 1) for pair in pairs if "=" in pair)
 
 
-@pytest.mark.parametrize("lesson", ["first_move", "own_arm", "own_law", "own_driver", "tuning"])
+@pytest.mark.parametrize(
+    "lesson", ["first_move", "own_arm", "two_links", "own_law", "own_driver", "tuning"]
+)
 def test_a_lesson_works_as_it_is_typed(lesson, tmp_path):
     log = tmp_path / "log"
     typed = 0

@@ -121,6 +121,6 @@ def test_a_bag_is_read_without_ros(installed, flexarm):
     words = ("simulate", "R", "--controller", "paper_composite", "--duration", 1)
     code, _, error = flexarm(*words, "--trajectory", motion, "--bag", folder / "bag")
     assert code == 0, error
-    code, out, error = run("-m", "flexarm_bringup.cli", "report", "bag", "--out", "report.html")
+    code, _, error = run("-m", "flexarm_bringup.cli", "report", "bag", "--out", "report.html")
     assert code == 0 and "Traceback" not in error, error
     assert "Largest tracking error" in (folder / "report.html").read_text()
