@@ -55,7 +55,7 @@ class Queue:
 
     def publish(self, kind, topic, message):
         """Put a message at the end of the queue, as bytes: the publisher may write its next one at once."""
-        raw = serialize_message(message)
+        raw = message if isinstance(message, bytes) else serialize_message(message)
         self._waiting.append(lambda: self._deliver(kind, topic, raw))
 
     def _deliver(self, kind, topic, raw):

@@ -13,6 +13,7 @@ from time import perf_counter
 from flexarm_control.composite.law import CompositeControl
 from flexarm_control.loop.arm_controller import ArmController
 from flexarm_control.observers.arm_observer import ArmObserver
+from flexarm_msgs.msg import JointTorque
 from flexarm_sim.nodes import simulator
 
 
@@ -29,13 +30,14 @@ class TimedSimulator(simulator.SimulatorNode):
             self._pending[sample.number] = perf_counter()
         super().publish(sample)
 
-    def _on_torque(self, msg):
+    def _on_torque(self, raw):
         now = perf_counter()
+        msg = self.torques(raw)
         if msg.session == self.gate.session:
             sent = self._pending.pop(msg.sequence, None)
             if sent is not None:
                 self._latencies.append(now - sent)
-                self._latencies_enabled += msg.mode == msg.ENABLED
+                self._latencies_enabled += msg.mode == JointTorque.ENABLED
         super()._on_torque(msg)
 
     def pause(self, paused):

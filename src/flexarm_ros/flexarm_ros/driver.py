@@ -16,11 +16,11 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.parameters import parameter
 from flexarm_msgs.msg import ArmState, JointTorque
 
-from . import qos
+from . import cdr, qos
 from .messages import SECOND, StateWriter, set_stamp
 from .node import ARM, ERROR, OK, WARN, ArmNode
 from .torque_gate import WRAP, TorqueGate
@@ -175,6 +175,7 @@ class Driver(ArmNode):
         self.gate = self.make_gate()
         self.gate.begin(new_session())
         self.writer = StateWriter(self.arm)
+        self.state_bytes, self.torques = cdr.Writer(self.writer.message), cdr.Reader(JointTorque)
         self.state_publisher = self.make_publisher(ArmState, "arm_state")
         self._joint_state = JointState(name=list(self.arm.joint_names))
         rate = parameters.group("").get("joint_states_rate")
@@ -182,7 +183,7 @@ class Driver(ArmNode):
             JointState, "joint_states", 10, qos_overriding_options=qos.overridable()
         )
         self._joints_due = rate and Thinned(rate)
-        self.connect(self.make_subscription(JointTorque, "joint_torque", self._on_torque))
+        self.connect(self.make_subscription(JointTorque, "joint_torque", self._on_torque, raw=True))
 
     def make_gate(self):
         """The rules with this driver's timeout."""
@@ -266,7 +267,7 @@ class Driver(ArmNode):
         """Publish a `Sample`, whose number is its sequence in the session, and note when."""
         with self._lock:
             self.fill(sample, self.gate.sent(sample.number, self.now()))
-            self.state_publisher.publish(self.writer.message)
+            self.state_publisher.publish(self.state_bytes())
         self.publish_joints(sample)
 
     def fill(self, sample, controller_id):
@@ -298,8 +299,14 @@ class Driver(ArmNode):
 
     # Topic to device ---------------------------------------------------------------------------
 
-    def _on_torque(self, message):
+    def _on_torque(self, raw):
         if not self.active:
+            return
+        try:
+            message = self.torques(raw)
+        except MessageError as error:
+            self.gate.refused += 1
+            self.refused(str(error))
             return
         with self._lock:
             refusal = self.gate.offer(message, self.now())

@@ -69,7 +69,7 @@ def spin(nodes, stopped):
 
 def _spin_control_path(node, path, executor, at_once, stopped):
     handle, kind = path.subscription.handle, path.subscription.msg_type
-    callback = path.subscription.callback
+    callback, raw = path.subscription.callback, path.subscription.raw
     waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
     clock = time.monotonic
     others = clock()
@@ -96,6 +96,6 @@ def _spin_control_path(node, path, executor, at_once, stopped):
         with handle:
             waiting.add_subscription(handle)
             waiting.wait(max(0, int((until - clock()) * 1e9)))
-            taken = handle.take_message(kind, False)
+            taken = handle.take_message(kind, raw)
         if taken is not None:
             callback(taken[0])

@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 import rclpy
+from rclpy.serialization import deserialize_message
 
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_msgs.msg import ArmState, JointTorque
@@ -22,7 +23,8 @@ class FakeArm(Driver):
     def connect(self, torques):
         self.state_publisher.publish = self.note
 
-    def note(self, message):
+    def note(self, raw):
+        message = deserialize_message(raw, ArmState)
         self.states.append((message.session, message.sequence))
         self.newest = message
 

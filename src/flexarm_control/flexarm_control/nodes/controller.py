@@ -13,7 +13,7 @@ from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import sizes
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
-from flexarm_ros import qos, scheduling
+from flexarm_ros import cdr, qos, scheduling
 from flexarm_ros.messages import CompositeStateWriter, StateReader, TorqueWriter
 from flexarm_ros.node import ArmNode, run
 from flexarm_ros.start import leave
@@ -64,9 +64,10 @@ class ControllerNode(ArmNode):
         self._inbox = TrajectoryInbox(self, self.core, designer)
         self._designs = Designs(self, self.core, designer)
         self._workers = designer, self._designs, self._inbox
-        self._reader = StateReader(arm)
+        self._states, self._reader = cdr.Reader(ArmState), StateReader(arm)
         self._sample = ArmSample(len(arm.joints), self.model.n_modes)
         self._torque = TorqueWriter(arm)
+        self._torque_bytes = cdr.Writer(self._torque.message)
         self.core.controller_id = self._torque.message.controller_id
         self._state = CompositeStateWriter(self.model)
         self._synchronised = parameters["synchronised_clocks"]
@@ -97,7 +98,7 @@ class ControllerNode(ArmNode):
     def _make_topics(self):
         self._torque_pub = self.make_publisher(JointTorque, "joint_torque")
         self._state_pub = self.make_publisher(CompositeState, "controller/state")
-        states = self.make_subscription(ArmState, "arm_state_estimate", self._on_state)
+        states = self.make_subscription(ArmState, "arm_state_estimate", self._on_state, raw=True)
         self.make_control_path(states)
         # fmt: off
         self.make_subscription(
@@ -112,13 +113,13 @@ class ControllerNode(ArmNode):
 
     # Control path ----------------------------------------------------------------------------
 
-    def _on_state(self, msg):
+    def _on_state(self, raw):
         if not self.active:
             return
         started = perf_counter()
         sample, core = self._sample, self.core
         try:
-            self._reader.read(msg, sample)
+            self._reader.read(self._states(raw), sample)
             now = self.get_clock().now().nanoseconds if self._synchronised else None
             enabled = core.step(sample, now)
         except MessageError as error:
@@ -128,7 +129,7 @@ class ControllerNode(ArmNode):
             return
         if core.alive:
             self._ticks, self._seen = 0, True
-        self._torque_pub.publish(self._torque.answer(sample, enabled, core.torque))
+        self._send(enabled)
         took = perf_counter() - started
         if self._state_pub.get_subscription_count():
             self._state_pub.publish(self._state.fill(sample, core, took))
@@ -152,10 +153,15 @@ class ControllerNode(ArmNode):
         )
         self._answer_again()
 
+    def _send(self, enabled):
+        """Publish the torque, or that there is none, as the answer to the last state."""
+        self._torque.answer(self._sample, enabled, self.core.torque)
+        self._torque_pub.publish(self._torque_bytes())
+
     def _answer_again(self):
         """Publish torque and controller/state as answers to the last state: they have changed since."""
         sample, core = self._sample, self.core
-        self._torque_pub.publish(self._torque.answer(sample, core.enabled, core.torque))
+        self._send(core.enabled)
         self._state_pub.publish(self._state.fill(sample, core, 0.0))
         self._report.log_state()
 
@@ -200,7 +206,7 @@ class ControllerNode(ArmNode):
 
     def stop(self):
         self.core.disable("the controller was stopped")
-        self._torque_pub.publish(self._torque.answer(self._sample, False, self.core.torque))
+        self._send(False)
         # A node that ends takes with it what has not been delivered yet.
         self._torque_pub.wait_for_all_acked(LAST_MESSAGE_TIMEOUT)
 

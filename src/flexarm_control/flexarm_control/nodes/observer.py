@@ -11,6 +11,7 @@ from flexarm_dynamics.errors import FlexarmError, MessageError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import sizes
 from flexarm_msgs.msg import ArmState, ObserverState
+from flexarm_ros import cdr
 from flexarm_ros.messages import ObserverStateWriter, StateReader, StateWriter
 from flexarm_ros.node import ARM, ArmNode, run
 from flexarm_ros.start import leave
@@ -54,14 +55,16 @@ class ObserverNode(ArmNode):
         self.core = self._new_core()
         parameters.on_change(self._changed)
         arm = self.arm
-        self._reader = StateReader(arm)
+        self._states, self._reader = cdr.Reader(ArmState), StateReader(arm)
         self._sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
         self._writer, self._state_writer = StateWriter(arm), ObserverStateWriter(arm)
+        self._estimate = cdr.Writer(self._writer.message)
         self._statistics = ObserverStatistics(self.model.n_modes)
         self._estimate_pub = self.make_publisher(ArmState, "arm_state_estimate")
         self._state_pub = self.make_publisher(ObserverState, "observer/state")
         self.make_service(Trigger, "~/calibrate_gauges", self._on_calibrate)
-        self.make_control_path(self.make_subscription(ArmState, "arm_state", self._on_state))
+        states = self.make_subscription(ArmState, "arm_state", self._on_state, raw=True)
+        self.make_control_path(states)
 
     def _new_core(self):
         return assembly.observer(self.model, assembly.chosen("observer", self.parameters.values()))
@@ -79,19 +82,25 @@ class ObserverNode(ArmNode):
         kind = self.parameters["observer.type"]
         self.get_logger().info(f"arm {self.arm.name}, {designed}observer {kind}")
 
-    def _on_state(self, msg):
+    def _on_state(self, raw):
         if not self.active:
             return
         started = perf_counter()
-        self._statistics.received(msg)
         sample, writer, core = self._sample, self._writer, self.core
+        try:
+            msg = self._states(raw)
+        except MessageError as error:  # not even its number can be read: nothing to pass on
+            self._statistics.refused(error)
+            self.report(f"arm_state: {error}")
+            return
+        self._statistics.received(msg)
         try:
             self._reader.read(msg, sample)
             known = core.step(sample)
         except MessageError as error:
             self._statistics.refused(error)
             self.report(f"arm_state {msg.sequence}: {error}")
-            self._forward_distrusted(msg, str(error))
+            self._forward_distrusted(self._states.message(raw), str(error))
             return
         if known is None:  # older than the last one: useless for the controller
             return
@@ -106,7 +115,7 @@ class ObserverNode(ArmNode):
         writer.write("strain", sample.strain)
         writer.write("modal_amplitude", core.amplitude)
         writer.write("modal_rate", core.rate if known else None)
-        self._estimate_pub.publish(writer.message)
+        self._estimate_pub.publish(self._estimate())
         self._statistics.estimated(core.observer, perf_counter() - started)
         if self._state_pub.get_subscription_count():
             name = self.parameters["observer.type"]

@@ -142,7 +142,8 @@ class SimulatorNode(Driver):
             if self._is_own(message):
                 message.controller_id = self.gate.sent(message.sequence, then)
             message.clock_stopped = again
-            self.state_publisher.publish(message)
+            true = message is self.writer.message
+            self.state_publisher.publish(self.state_bytes() if true else message)
 
     def _is_own(self, message):
         """Whether a state is this driver's, and not that of a second one that a fault plays."""

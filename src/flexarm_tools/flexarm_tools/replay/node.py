@@ -156,10 +156,13 @@ class ReplayNode(Driver):
         if self.active:
             self._answered(message, OBSERVER)
 
-    def _on_torque(self, message):
-        if not self.active or message.session != self.gate.session:
+    def _on_torque(self, raw):
+        if not self.active:
             return
         try:
+            message = self.torques(raw)
+            if message.session != self.gate.session:
+                return
             self.playback.answer(message.sequence, self._reader.read(message))
         except MessageError as error:
             self.report(str(error))
