@@ -21,6 +21,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
+from flexarm_control.nodes.shaper import ShaperNode
 from flexarm_ros.session import WaitError
 from flexarm_sim.nodes.simulator import SimulatorNode
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
@@ -33,6 +34,7 @@ CLASSES = {
     "observer": ObserverNode,
     "controller": ControllerNode,
     "replay": ReplayNode,
+    "shaper": ShaperNode,
 }
 
 
@@ -106,6 +108,11 @@ class Queue:
         """Forget all readers, messages, calls and timers, and with them the nodes."""
         for kept in (self._readers, self._calls, self._waiting, self._timers):
             kept.clear()
+
+    @property
+    def busy(self):
+        """Whether messages or calls wait."""
+        return bool(self._calls or self._waiting)
 
     def serve(self):
         """Serve what is next: a call, a timer that is due, a message, or, while there is none, the next timer."""
@@ -188,6 +195,10 @@ class _Log:
 
     def _add(self, severity, text):
         self.text += f"[{severity}] [0.0] [{self._name}]: {text}\n"
+
+    def get_child(self, name):
+        """The log of a part of the node: the same."""
+        return self
 
     def info(self, text):
         self._add("INFO", text)

@@ -23,6 +23,7 @@ setup(
             "observer_controller = flexarm_control.nodes:start_observer_controller",
             "goals = flexarm_control.nodes:start_goals",
             "excite = flexarm_control.nodes:start_excite",
+            "shaper = flexarm_control.nodes:start_shaper",
         ],
         "flexarm.slow_laws": [
             "none = flexarm_control.slow.none:NoSlowLaw",

@@ -10,7 +10,7 @@ BEGIN, END = "<!-- parameters: begin -->", "<!-- parameters: end -->"
 
 def groups():
     """Node name to its declared parameters by prefix."""
-    from flexarm_control.nodes import controller, excite, goals, observer
+    from flexarm_control.nodes import controller, excite, goals, observer, shaper
     from flexarm_ros.node import ARM, COMMON
     from flexarm_sim import simulator
     from flexarm_sim.nodes import simulator as simulator_node
@@ -23,6 +23,7 @@ def groups():
         "controller": controller.parameter_groups(),
         "goals": {"": (ARM, *goals.PARAMETERS)},
         "excite": excite.parameter_groups(),
+        "shaper": shaper.parameter_groups(),
         "replay": {"": replay.PARAMETERS},
     }
     return {node: {**groups, "": (*COMMON, *groups[""])} for node, groups in given.items()}

@@ -133,32 +133,32 @@ def zv(omega, zeta) -> Shaper:
     DesignError
         If the mode does not vibrate, or grows.
     """
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     return _spaced(half, [1.0, K])
 
 
 def zvd(omega, zeta) -> Shaper:
     """Return the zero-vibration-and-derivative shaper of a mode; parameters as for `zv`."""
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     return _spaced(half, [1.0, 2.0 * K, K**2])
 
 
 def zvdd(omega, zeta) -> Shaper:
     """Return the shaper of a mode with two derivatives that are zero; parameters as for `zv`."""
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     return _spaced(half, [1.0, 3.0 * K, 3.0 * K**2, K**3])
 
 
 def mzv(omega, zeta) -> Shaper:
     """Return the modified zero-vibration shaper of a mode; parameters as for `zv`."""
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     k = K**MZV_SPACING
     return _spaced(MZV_SPACING * half, [1.0, np.sqrt(2.0) * k, k**2])
 
 
 def ei(omega, zeta) -> Shaper:
     """Return the extra-insensitive shaper of a mode; parameters as for `zv`."""
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     V = EI_RESIDUAL
     # Where so much damping leaves less than V by itself, the middle impulse vanishes.
     cosine = max((2.0 * K**2 - V * (1.0 + K**2)) / (2.0 * K**2 + 2.0 * K * V), 0.0)
@@ -167,14 +167,27 @@ def ei(omega, zeta) -> Shaper:
 
 def two_hump_ei(omega, zeta) -> Shaper:
     """Return the two-hump extra-insensitive shaper of a mode; parameters as for `zv`."""
-    half, K = _half_period(omega, zeta)
+    half, K = half_period(omega, zeta)
     x0 = np.cosh(np.arccosh(1.0 / EI_RESIDUAL) / 3.0)
     c = 3.0 - 3.0 / x0**2
     return _spaced(half, [1.0, c * K, c * K**2, K**3])
 
 
-def _half_period(omega, zeta):
-    """Half the damped period of a mode [s], and K, its decay in that time [-]."""
+def half_period(omega, zeta):
+    """Return half the damped period of a mode [s], and K, its decay in that time [-].
+
+    Parameters
+    ----------
+    omega : float
+        Natural frequency [rad/s], above 0.
+    zeta : float
+        Damping ratio, at least 0 and below 1 [-].
+
+    Raises
+    ------
+    DesignError
+        If the mode does not vibrate, or grows.
+    """
     omega, zeta = float(omega), float(zeta)
     if not 0.0 < omega < np.inf:
         raise DesignError(

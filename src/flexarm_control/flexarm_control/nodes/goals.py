@@ -53,12 +53,22 @@ RUNNING = (CompositeState.READY, CompositeState.TRACKING, CompositeState.HOLDING
 
 
 class Server(ActionServer):
-    """An action server whose goals run on after their callback has returned."""
+    """An action server whose goals run on after their callback has returned.
 
-    def __init__(self, node, kind, name):
-        self._taken = node.take
+    Parameters
+    ----------
+    node : Node
+    kind : type
+        Of the action.
+    name : str
+    owner : object
+        Has `may_begin`, `may_cancel` and `take`.
+    """
+
+    def __init__(self, node, kind, name, owner):
+        self._taken = owner.take
         super().__init__(
-            node, kind, name, None, goal_callback=node.may_begin, cancel_callback=node.may_cancel
+            node, kind, name, None, goal_callback=owner.may_begin, cancel_callback=owner.may_cancel
         )
 
     def register_execute_callback(self, execute_callback):
@@ -119,7 +129,9 @@ class GoalsNode(ArmNode):
         )
         self._stop = self._keep(self.destroy_client, self.create_client(Trigger, "controller/stop"))
         for kind, name in kinds():
-            self._keep(lambda server: server.destroy(), Server(self, kind, f"controller/{name}"))
+            self._keep(
+                lambda server: server.destroy(), Server(self, kind, f"controller/{name}", self)
+            )
         self.make_timer(LOOK, self._look)
 
     def stop(self):

@@ -16,6 +16,14 @@ from .. import trajectory
 MAX_POINTS = 10_000
 
 
+def rows(msg):
+    """Points of a `JointTrajectory` as `trajectory.validate` takes them."""
+    return [
+        (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
+        for p in msg.points
+    ]
+
+
 def read(raw, arm, held=None):
     """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be.
 
@@ -32,15 +40,11 @@ def read(raw, arm, held=None):
                 hint="send fewer: a quintic polynomial joins them; or send one trajectory after another",
             )
         msg = deserialize_message(raw, JointTrajectory)
-        points = [
-            (stamp_ns(p.time_from_start), p.positions, p.velocities, p.accelerations, p.effort)
-            for p in msg.points
-        ]
         return trajectory.validate(
             msg.joint_names,
             arm.joint_names,
             stamp_ns(msg.header.stamp),
-            points,
+            rows(msg),
             *arm.position_limits.T,
             arm.velocity_limits,
             held,

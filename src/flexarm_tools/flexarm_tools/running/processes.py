@@ -22,6 +22,7 @@ NODES = {
     "controller": "flexarm_control",
     "observer_controller": "flexarm_control",
     "goals": "flexarm_control",
+    "shaper": "flexarm_control",
 }
 
 

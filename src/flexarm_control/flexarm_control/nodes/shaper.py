@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shaper node: trajectories, goals and streams in, the same without vibration out, to a controller of positions.
+
+It stands before a joint_trajectory_controller, or anything with its topics and actions, and needs no arm file.
+"""
+
+import math
+
+import numpy as np
+from builtin_interfaces.msg import Duration
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from flexarm_dynamics.errors import MessageError, ParameterError, TrajectoryError
+from flexarm_dynamics.parameters import parameter
+from flexarm_msgs.msg import ShaperState
+from flexarm_ros import qos
+from flexarm_ros.messages import set_stamp
+from flexarm_ros.node import OK, WARN, ArmNode, run
+from flexarm_ros.start import leave
+
+from .. import trajectory
+from ..shaping import modes, trajectory_shaper
+from ..shaping.modes import Modes
+from ..shaping.stream import StreamShaper
+from ..shaping.trajectory_shaper import TrajectoryShaper
+from .shaper_goals import ShaperGoals
+from .trajectory_inbox import rows
+
+POSITIONS, VELOCITIES = "positions", "velocities"
+PARAMETERS = (
+    parameter("joint_names", [""], read_only=True).described(
+        "The joints of the controller that follows, in its order."
+    ),
+    parameter("output", "joint_trajectory_controller", read_only=True).described(
+        "The controller that follows: shaped trajectories go to its topic joint_trajectory, goals to its actions."
+    ),
+    parameter("synchronised_clocks", True, read_only=True).described(
+        "Whether the controller's clock is this node's; false: stamps are 0, which means now."
+    ),
+    parameter("stream_output", "", read_only=True).described(
+        "Topic to which the shaped stream goes, forward_position_controller/commands, say; empty: no streams."
+    ),
+    parameter("stream_kind", POSITIONS, choices=(POSITIONS, VELOCITIES), read_only=True).described(
+        "What the stream has: positions [rad] or velocities [rad/s] of all joints."
+    ),
+    parameter("stream_rate", 125.0, "Hz", 1.0, 2000.0, read_only=True).described(
+        "Rate of the shaped stream."
+    ),
+    parameter("stream_timeout", 0.2, "s", 0.01, 60.0, read_only=True).described(
+        "Without inputs for so long, velocities are 0, and a stream that stands is no longer published."
+    ),
+)
+#: Between two looks at whether a motion has ended; measured positions are used while they are not older [s].
+LOOK, FRESH = 0.01, 1.0
+
+
+def parameter_groups():
+    """Declared parameters of this node, by prefix."""
+    return {
+        "": PARAMETERS,
+        "shaper.": modes.PARAMETERS,
+        "limits.": trajectory_shaper.PARAMETERS,
+    }
+
+
+class ShaperNode(ArmNode):
+    """Messages to arrays, one call of `TrajectoryShaper` or `StreamShaper`, arrays to messages."""
+
+    def __init__(self):
+        super().__init__("shaper", parameter_groups())
+
+    def build(self):
+        names = self._names = joint_names(self.parameters["joint_names"])
+        self.parameters.resolve({"joints": len(names)})
+        own = Modes(self.parameters.group("shaper."), len(names))
+        none = Modes({**self.parameters.group("shaper."), "type": modes.NONE}, len(names))
+        limits = self.parameters.group("limits.")
+        self._shapers = {
+            False: TrajectoryShaper(own, names, limits),
+            True: TrajectoryShaper(none, names, limits),
+        }
+        self._streams = {False: StreamShaper(own, names), True: StreamShaper(none, names)}
+        self._bypass = self._wanted = False
+        self.core = self._shapers[False]
+        self._measured, self._measured_at = None, -math.inf
+        self._state = ShaperState(joint_names=names, shaper=own.kind, stretch=1.0)
+        self._states = self.make_publisher(ShaperState, "shaper/state", qos.COMMAND)
+        output = self.parameters["output"]
+        self._trajectories = self.make_publisher(
+            JointTrajectory, f"{output}/joint_trajectory", qos.COMMAND
+        )
+        self.make_subscription(
+            JointTrajectory, "joint_trajectory", self._on_trajectory, qos.COMMAND
+        )
+        self.make_subscription(
+            JointState, "joint_states", self._on_joint_states, qos_profile_sensor_data
+        )
+        self.make_service(SetBool, "shaper/bypass", self._on_bypass)
+        self.make_service(Trigger, "shaper/stop", self._on_stop)
+        self._goals = ShaperGoals(self, output)
+        self._build_stream()
+        self.make_timer(LOOK, self._look)
+
+    def start(self):
+        self._publish_state()
+
+    def stop(self):
+        self._goals.close()
+
+    def now_ns(self):
+        """ROS time [ns]."""
+        return self.get_clock().now().nanoseconds
+
+    # Trajectories ----------------------------------------------------------------------------
+
+    def _on_trajectory(self, msg):
+        if not self.active:
+            return
+        try:
+            self._trajectories.publish(self.shape(msg))
+        except TrajectoryError as error:
+            self.get_logger().warning(f"trajectory refused: {error}")
+
+    def shape(self, msg):
+        """The shaped trajectory that takes the place of one; without points: a stop, as the controller has it.
+
+        Raises
+        ------
+        TrajectoryError
+            Where it can't be used; nothing changes then, but the state says it.
+        """
+        now = self.now_ns()
+        self._settle_bypass(now)
+        if not msg.points:
+            stopped = self.stopping("asked for by a trajectory without points")
+            return msg if stopped is None else stopped
+        try:
+            data = trajectory.validate(
+                msg.joint_names,
+                self._names,
+                msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec,
+                rows(msg),
+            )
+            shaped = self.core.offer(data, now, self._measurement())
+        except TrajectoryError as error:
+            self._state.rejected_reason = str(error)
+            self._publish_state()
+            raise
+        state = self._state
+        state.trajectory_id += 1
+        state.rejected_reason = state.stopped = ""
+        state.added_time, state.stretch = float(shaped.added), float(shaped.stretch)
+        set_stamp(state.start, shaped.start_ns)
+        self._moves_until(shaped)
+        if shaped.stretch > 1.0:
+            text = f"slowed down {shaped.stretch:.4g} times to keep its limits"
+            self.report(f"trajectory {state.trajectory_id} {text}", info=True)
+        return self._message(shaped, data.stamp_ns)
+
+    def stopping(self, reason):
+        """The trajectory that stops the motion under way, None where nothing moves; the state gives the `reason`."""
+        shaped = self.core.stop(self.now_ns())
+        if shaped is None:
+            return None
+        self._state.stopped = reason
+        self._moves_until(shaped)
+        return self._message(shaped, 0)
+
+    def _moves_until(self, shaped):
+        set_stamp(self._state.end, shaped.end_ns)
+        self._state.moving = True
+        self._publish_state()
+
+    def _message(self, shaped, stamp_ns):
+        """A `Shaped` as a message; one that was to begin now and finds the joints at rest still does."""
+        message = JointTrajectory(joint_names=self._names)
+        now = shaped.fresh and stamp_ns == 0
+        if not now and self.parameters["synchronised_clocks"]:
+            set_stamp(message.header.stamp, shaped.start_ns)
+        empty = [[]] * len(shaped.times_ns)
+        columns = [values.tolist() for values in shaped.fields]
+        columns += [empty] * (3 - len(columns))
+        for time_ns, *values in zip(shaped.times_ns.tolist(), *columns, strict=True):
+            point = JointTrajectoryPoint(time_from_start=Duration())
+            point.positions, point.velocities, point.accelerations = values
+            set_stamp(point.time_from_start, time_ns)
+            message.points.append(point)
+        return message
+
+    def _on_joint_states(self, msg):
+        index = {name: i for i, name in enumerate(msg.name)}
+        if not all(name in index for name in self._names):
+            return  # of other joints
+        if len(msg.position) != len(msg.name):
+            text = f"joint_states: {len(msg.position)} positions of {len(msg.name)} names"
+            self.report(f"{text} are ignored")
+            return
+        found = np.array([msg.position[index[name]] for name in self._names])
+        if not np.isfinite(found).all():
+            self.report("joint_states: a position is not finite: ignored")
+            return
+        self._measured, self._measured_at = found, self._steady_s()
+
+    def _measurement(self):
+        return self._measured if self._steady_s() - self._measured_at < FRESH else None
+
+    def _steady_s(self):
+        return 1e-9 * self._steady.now().nanoseconds
+
+    # Bypass, stop, state ---------------------------------------------------------------------
+
+    def _on_bypass(self, request, response):
+        self._wanted = request.data
+        self._settle_bypass(self.now_ns())
+        response.success = True
+        if self._bypass == self._wanted:
+            response.message = "bypassed" if self._bypass else "shaping"
+        else:
+            response.message = "taken once the motion that is under way has ended"
+        return response
+
+    def _settle_bypass(self, now_ns):
+        """Change over where nothing moves: a change in the middle would be a step."""
+        stream = self._streams[self._bypass]
+        if self._bypass == self._wanted or self.core.moving(now_ns) or not stream.settled():
+            return
+        self._bypass = self._state.bypassed = self._wanted
+        self.core = self._shapers[self._bypass]
+        self.core.forget()
+        if stream.started:
+            self._streams[self._bypass].begin(stream.output)
+        self._publish_state()
+
+    def _on_stop(self, request, response):
+        message = self.stopping("asked for by the service stop")
+        response.success = True
+        response.message = "nothing moves" if message is None else "stops"
+        if message is not None and not self._goals.replace(message):
+            self._trajectories.publish(message)
+        return response
+
+    def _look(self):
+        if not self.active:
+            return
+        now = self.now_ns()
+        if self._state.moving and not self.core.moving(now):
+            self._state.moving = False
+            self._publish_state()
+        self._settle_bypass(now)
+
+    def _publish_state(self):
+        set_stamp(self._state.header.stamp, self.now_ns())
+        self._states.publish(self._state)
+
+    # Streams ---------------------------------------------------------------------------------
+
+    def _build_stream(self):
+        topic, rate = self.parameters["stream_output"], self.parameters["stream_rate"]
+        self._wish, self._wished_at, self._step = None, -math.inf, 1.0 / rate
+        if not topic:
+            return
+        self._commands = self.make_publisher(Float64MultiArray, topic, qos.CONTROL_PATH)
+        self.make_subscription(Float64MultiArray, "stream", self._on_stream, qos.CONTROL_PATH)
+        self.make_timer(self._step, self._on_tick)
+
+    def _on_stream(self, msg):
+        if not self.active:
+            return
+        stream = self._streams[self._bypass]
+        try:
+            wish = stream.check(msg.data)
+            if self.parameters["stream_kind"] == POSITIONS and not stream.started:
+                self._refuse_far(wish)
+        except MessageError as error:
+            self.report(f"stream: {error}: ignored")
+            return
+        self._wish, self._wished_at = wish, self._steady_s()
+
+    def _refuse_far(self, wish):
+        """Refuse a first position that is not where the joints are."""
+        measured = self._measurement()
+        if measured is None:
+            return
+        joint = int(np.argmax(np.abs(wish - measured)))
+        if abs(wish[joint] - measured[joint]) > trajectory_shaper.START_TOLERANCE:
+            raise MessageError(
+                f"rad is not where the joint is: {measured[joint]:g}",
+                field=f"data of joint {self._names[joint]}",
+                value=float(wish[joint]),
+                limit=f"within {trajectory_shaper.START_TOLERANCE:g}",
+            )
+
+    def _on_tick(self):
+        if not self.active or self._wish is None:
+            return
+        silent = self._steady_s() - self._wished_at > self.parameters["stream_timeout"]
+        stream, velocities = (
+            self._streams[self._bypass],
+            self.parameters["stream_kind"] == VELOCITIES,
+        )
+        if silent and velocities:
+            self._wish = np.zeros(len(self._names))
+        if not stream.started:
+            stream.begin(np.zeros(len(self._names)) if velocities else self._wish)
+        if silent and stream.settled() and not stream.steps_to(self._wish):
+            return
+        where = self._measurement() if velocities else None
+        value = stream.step(self._wish, self._step, where)
+        self._commands.publish(Float64MultiArray(data=value.tolist()))
+
+    # -----------------------------------------------------------------------------------------
+
+    def diagnose(self):
+        state = self._state
+        values = {
+            "shaper": state.shaper,
+            "bypassed": state.bypassed,
+            "moving": state.moving,
+            "trajectories": state.trajectory_id,
+            "added time [s]": f"{state.added_time:.4g}",
+            "last refused": state.rejected_reason,
+        }
+        if not self._trajectories.get_subscription_count() and not self._goals.served():
+            topic = self._trajectories.topic_name
+            return WARN, f"nothing listens on {topic}: is parameter output right?", values
+        return OK, "bypassed" if state.bypassed else "", values
+
+
+def joint_names(given):
+    """The names of a parameter joint_names.
+
+    Raises
+    ------
+    ParameterError
+        Where none is `given`, or one twice.
+    """
+    names = [name for name in given if name]
+    hint = "give the joints of the controller that follows, in its order"
+    if not names:
+        raise ParameterError("is empty", field="joint_names", hint=hint)
+    if len(set(names)) != len(names):
+        raise ParameterError("has a name twice", field="joint_names", value=names, hint=hint)
+    return names
+
+
+def main(args=None):
+    """Entry point of ``ros2 run flexarm_control shaper``."""
+    leave(run(ShaperNode, args))

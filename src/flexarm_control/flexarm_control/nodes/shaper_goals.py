@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Action servers of the shaper: goals are shaped and sent on to the controller's own server, results sent back.
+
+A goal that is cancelled ends in a stop that is shaped: the stop goes to the controller as a goal that replaces the one
+that it follows, and the result is sent once that is done.
+"""
+
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient, CancelResponse, GoalResponse
+
+from flexarm_dynamics.errors import TrajectoryError
+
+from ..trajectory.goal import Code
+from .goals import Server, kinds
+
+
+class Goal:
+    """A goal on its way.
+
+    Parameters
+    ----------
+    server : Server
+    handle : ServerGoalHandle
+    client : ActionClient
+        Of the controller's server of the same type.
+    """
+
+    def __init__(self, server, handle, client):
+        self.server, self.handle, self.client = server, handle, client
+        self.sent = 0  # goals sent on; results of all but the last don't count
+        self.over = False
+        self.reason = ""
+
+
+class ShaperGoals:
+    """Serves goals for a node with `shape` and `stopping`.
+
+    Parameters
+    ----------
+    node : ShaperNode
+    output : str
+        Name of the controller that follows.
+    """
+
+    def __init__(self, node, output):
+        self._node, self._current, self._clients = node, None, {}
+        for kind, name in kinds():
+            client = ActionClient(node, kind, f"{output}/{name}")
+            self._clients[kind] = node._keep(lambda c: c.destroy(), client)
+            server = Server(node, kind, f"shaper/{name}", self)
+            node._keep(lambda s: s.destroy(), server)
+
+    def served(self):
+        """Whether the controller has an action server."""
+        return any(client.server_is_ready() for client in self._clients.values())
+
+    def close(self):
+        """The node stops: what is under way is no longer followed."""
+        if self._current is not None:
+            self._end(self._current, Code.INVALID_GOAL, "the shaper was stopped")
+
+    def may_begin(self, request):
+        """Accept any goal while active: what is wrong with it, its result says in words."""
+        return GoalResponse.ACCEPT if self._node.active else GoalResponse.REJECT
+
+    def take(self, server, handle):
+        """Shape an accepted goal, and send it on."""
+        kind, request = server.action_type, handle.request
+        goal = Goal(server, handle, self._clients[kind])
+        if not goal.client.server_is_ready():
+            text = f"no action server {goal.client._action_name}: is parameter output right?"
+            self._end(goal, Code.INVALID_GOAL, text)
+            return
+        try:
+            shaped = self._node.shape(request.trajectory)
+        except TrajectoryError as error:
+            code = Code.INVALID_JOINTS if "joint_names" in error.field else Code.INVALID_GOAL
+            self._end(goal, code, str(error))
+            return
+        before, self._current = self._current, goal
+        if before is not None:
+            self._end(before, Code.INVALID_GOAL, "replaced by a newer goal")
+        request.trajectory = shaped
+        self._send(goal, request)
+
+    def may_cancel(self, handle):
+        """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
+        goal = self._current
+        if goal is None or goal.handle != handle:
+            return CancelResponse.REJECT
+        goal.reason = "cancelled: the arm was stopped"
+        message = self._node.stopping("the goal was cancelled")
+        if message is not None:
+            self.replace(message)
+        return CancelResponse.ACCEPT
+
+    def replace(self, message):
+        """Send a trajectory in place of that of the goal under way; whether there is one."""
+        if self._current is None:
+            return False
+        request = self._current.server.action_type.Goal(trajectory=message)
+        self._send(self._current, request)
+        return True
+
+    def _send(self, goal, request):
+        goal.sent += 1
+        number = goal.sent
+
+        def answered(future):
+            handle = future.result()
+            if number != goal.sent or goal.over:
+                return
+            if not handle.accepted:
+                self._node.core.forget()
+                self._end(goal, Code.INVALID_GOAL, "the controller has rejected the shaped goal")
+                return
+            handle.get_result_async().add_done_callback(finished)
+
+        def finished(future):
+            if number == goal.sent and not goal.over:
+                self._relay(goal, future.result())
+
+        def feedback(message):
+            if not goal.over and number == goal.sent:
+                goal.handle.publish_feedback(message.feedback)
+
+        future = goal.client.send_goal_async(request, feedback_callback=feedback)
+        future.add_done_callback(answered)
+
+    def _relay(self, goal, answer):
+        """The controller's result is that of the goal."""
+        result = answer.result
+        if answer.status != GoalStatus.STATUS_SUCCEEDED:
+            self._node.core.forget()
+        if goal.reason and answer.status == GoalStatus.STATUS_SUCCEEDED:
+            result.error_string = goal.reason
+        self._finish(goal, answer.status, result)
+
+    def _end(self, goal, code, text):
+        """A result of the shaper's own."""
+        result = goal.server.action_type.Result()
+        result.error_code, result.error_string = int(code), text
+        self._node.get_logger().warning(f"goal: {text}")
+        self._finish(goal, GoalStatus.STATUS_ABORTED, result)
+
+    def _finish(self, goal, status, result):
+        goal.over = True
+        if self._current is goal:
+            self._current = None
+
+        def end(handle):
+            if handle.is_cancel_requested:
+                handle.canceled()
+            elif status == GoalStatus.STATUS_SUCCEEDED:
+                handle.succeed()
+            else:
+                handle.abort()
+            return result
+
+        goal.server.finish(goal.handle, end)

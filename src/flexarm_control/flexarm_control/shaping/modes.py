@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The modes that ring: their frequencies over the joints, and the shaper that takes them out.
+
+Between the configurations at which frequencies were measured they are interpolated by inverse squared distance in the
+joints (Shepard 1968),
+
+.. math:: f(q) = \frac{\sum_c w_c(q) f_c}{\sum_c w_c(q)}, \qquad w_c = \lVert q - q_c\rVert^{-2}.
+
+The result is smooth, equals f_c at q_c, and lies between the smallest and the largest everywhere.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.parameters import parameter
+
+from ..motions import robust_shapers, shapers
+from ..motions.shapers import NONE, SHAPERS
+
+ROBUST = "robust"
+KINDS = (*SHAPERS, ROBUST, NONE)
+
+PARAMETERS = (
+    parameter("type", "zvd", choices=KINDS, read_only=True).described(
+        "Shaper: robust is optimal for the spread of all modes in shaper.periods; none passes motions as they are."
+    ),
+    parameter("frequencies", [], "Hz", 0.01, 1000.0, kind="float_array", read_only=True).described(
+        "Natural frequencies of the modes to shape; with configurations, one row of modes after the other."
+    ),
+    parameter("dampings", [0.0], "-", 0.0, 0.99, read_only=True).described(
+        "Damping ratios, as many as frequencies, or one for all."
+    ),
+    parameter("configurations", [], "rad", -1e3, 1e3, kind="float_array", read_only=True).described(
+        "Joint positions at which the frequencies were measured, one row after the other; empty: everywhere the same."
+    ),
+    parameter("spread", 0.15, "-", 0.0, 0.5, read_only=True).described(
+        "Of the type robust: frequencies may be off by this fraction."
+    ),
+    parameter("periods", 1.0, "-", 0.25, 3.0, read_only=True).described(
+        "Of the type robust: how much longer a motion gets, in periods of the lowest mode."
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A shaper in phase of one mode: an impulse at phase 2 pi comes a period after one at 0.
+
+    Attributes
+    ----------
+    cycles : (k,) ndarray
+        Impulses, from 0, in periods of the mode [-].
+    amplitudes : (k,) ndarray
+    mode : int
+        Column of the frequencies.
+    """
+
+    cycles: np.ndarray
+    amplitudes: np.ndarray
+    mode: int
+
+
+class Modes:
+    """Checked modes, and the shaper for them.
+
+    Parameters
+    ----------
+    settings : mapping
+        Checked values of `PARAMETERS`.
+    joints : int
+        n, of the configurations.
+
+    Attributes
+    ----------
+    configurations : (c, n) ndarray
+        Empty where the frequencies are everywhere the same.
+    frequencies, dampings : (c, modes) ndarrays
+        With one row at least [Hz], [-].
+
+    Raises
+    ------
+    ParameterError
+        Naming the parameter, where the numbers of values don't fit together.
+    DesignError
+        Where there is no such shaper.
+    """
+
+    def __init__(self, settings, joints):
+        self.kind = settings["type"]
+        given = np.array(settings["configurations"], float)
+        if given.size % joints:
+            raise ParameterError(
+                f"values are no rows of {joints} joints",
+                field="shaper.configurations",
+                value=given.size,
+                hint=f"give {joints} joint positions for each configuration",
+            )
+        self.configurations = given.reshape(-1, joints)
+        rows = max(len(self.configurations), 1)
+        frequencies = np.array(settings["frequencies"], float)
+        if self.kind != NONE and (not frequencies.size or frequencies.size % rows):
+            raise ParameterError(
+                f"values for {rows} configurations" if frequencies.size else "are not given",
+                field="shaper.frequencies",
+                value=frequencies.size,
+                hint="give the same number of modes for each configuration",
+            )
+        dampings = np.array(settings["dampings"], float)
+        if dampings.size not in (1, frequencies.size):
+            raise ParameterError(
+                "values",
+                field="shaper.dampings",
+                value=dampings.size,
+                limit=f"{frequencies.size}, as frequencies, or 1",
+            )
+        if self.kind == NONE:
+            frequencies, dampings = np.ones(rows), np.zeros(1)
+        self.frequencies = frequencies.reshape(rows, -1)
+        self.dampings = np.broadcast_to(dampings, frequencies.shape).reshape(rows, -1)
+        self._refuse_same(self.configurations)
+        self._spread, self._periods = settings["spread"], settings["periods"]
+        self.stages = self._designed()
+
+    @staticmethod
+    def _refuse_same(configurations):
+        for i, row in enumerate(configurations):
+            same = np.flatnonzero((configurations[:i] == row).all(axis=1))
+            if same.size:
+                raise ParameterError(
+                    f"row {i} is that of row {same[0]}",
+                    field="shaper.configurations",
+                    hint="give each configuration once",
+                )
+
+    def _designed(self):
+        """Stages, one for each mode; one for all of them where their ratios must stay anyway."""
+        frequencies, dampings = self.frequencies.mean(axis=0), self.dampings.mean(axis=0)
+        if self.kind == NONE:
+            return ()
+        if self.kind == ROBUST:
+            lowest = int(np.argmin(frequencies))
+            train = robust_shapers.robust(frequencies, dampings, self._spread, self._periods)
+            return (Stage(train.times * frequencies[lowest], train.amplitudes, lowest),)
+        trains = [
+            shapers.impulses(self.kind, f, d) for f, d in zip(frequencies, dampings, strict=True)
+        ]
+        shapers.convolve(trains)  # refuses too many
+        return tuple(
+            Stage(train.times * f, train.amplitudes, mode)
+            for mode, (train, f) in enumerate(zip(trains, frequencies, strict=True))
+        )
+
+    @property
+    def varies(self):
+        """Whether the frequencies depend on the configuration."""
+        return bool(self.stages) and bool(np.ptp(self.frequencies, axis=0).any())
+
+    @property
+    def delay(self):
+        """Mean delay of the shaped motion, at the mean frequencies [s]."""
+        mean = self.frequencies.mean(axis=0)
+        return float(sum(s.cycles @ s.amplitudes / mean[s.mode] for s in self.stages))
+
+    @property
+    def max_duration(self):
+        """How much longer a motion gets at most [s]."""
+        low = self.frequencies.min(axis=0)
+        return float(sum(s.cycles[-1] / low[s.mode] for s in self.stages))
+
+    def at(self, q):
+        """Frequencies at joint positions (k, n), (k, modes) [Hz]."""
+        q = np.asarray(q, float)
+        if len(self.frequencies) == 1:
+            return np.repeat(self.frequencies, len(q), axis=0)
+        squared = ((q[:, None] - self.configurations) ** 2).sum(axis=2)
+        # As products without the own factor, which is right at the configurations, too.
+        weights = np.stack(
+            [np.delete(squared, c, axis=1).prod(axis=1) for c in range(squared.shape[1])], axis=1
+        )
+        weights /= weights.sum(axis=1, keepdims=True)
+        return weights @ self.frequencies
+
+    def constant(self):
+        """The `Shaper` of frequencies that are everywhere the same."""
+        if not self.stages:
+            return shapers.Shaper(np.zeros(1), np.ones(1))
+        frequencies = self.frequencies.mean(axis=0)
+        trains = [shapers.Shaper(s.cycles / frequencies[s.mode], s.amplitudes) for s in self.stages]
+        return shapers.convolve(trains)

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Trajectories in, shaped trajectories out: what the node `shaper` does, without ROS.
+
+The unshaped motion is kept as long as it still acts: a trajectory that replaces another one takes over from its own
+start, and the whole is shaped, so that no vibration is left of either. The same holds for a stop: the unshaped
+motion's own time slows down (see `trajectory.path.Slowing`), at most as hard as the limits of acceleration allow, and
+the result is shaped.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.parameters import parameter
+
+from ..trajectory.path import Slowing
+from ..trajectory.values import SECOND, SPEED_ROUNDING
+from .modes import Modes
+from .piecewise import PiecewiseMotion
+from .shaped_motion import ShapedMotion
+
+PARAMETERS = (
+    parameter("velocity", [0.0], "rad/s", 0.0, 1e4, length="joints", read_only=True).described(
+        "Largest speeds of the shaped motion, which is slowed down where they would be exceeded; 0: not limited."
+    ),
+    parameter(
+        "acceleration", [0.0], "rad/s^2", 0.0, 1e6, length="joints", read_only=True
+    ).described(
+        "Largest accelerations, likewise; 0: not limited. Trajectories must then give velocities."
+    ),
+)
+#: A shaped trajectory of more points is refused.
+MAX_POINTS = 20_000
+#: How far a first point at time 0 may be from where the joints are [rad].
+START_TOLERANCE = 0.05
+#: Attempts to slow a motion down into its limits, and by how much more than needed.
+ATTEMPTS, MARGIN = 60, 1.0 + 1e-9
+#: Places in each piece at which its speed and acceleration are looked at, as fractions of its length.
+PLACES = np.linspace(0.0, 1.0 - 1e-6, 9)
+#: Points of a stop, its shortest duration [s], and the ratio of the durations that are tried.
+STOP_POINTS, MIN_STOP, LONGER = 24, 0.05, 1.15
+#: Without limits: acceleration of a stop over the motion's own, and at least so much for each rad/s of speed [1/s].
+STOP_ACCELERATION, STOP_RATE = 1.3, 4.0
+#: A motion that is under way is handed over with its first point so much later [s].
+HANDOVER = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Shaped:
+    """A shaped trajectory, to be sent on.
+
+    Attributes
+    ----------
+    start_ns : int
+        Time from which its times count [ns].
+    fresh : bool
+        Whether nothing moves before `start_ns`; else it goes on from where the motion is then.
+    times_ns : (k,) int64 ndarray
+        Of the points [ns].
+    fields : list of (k, n) ndarrays
+        Positions, then velocities and accelerations, as many as the unshaped trajectory has.
+    end_ns : int
+        When the shaped motion ends [ns].
+    added : float
+        How much later it ends than the trajectory that was given [s].
+    stretch : float
+        By which factor it was slowed down for its limits [-].
+    """
+
+    start_ns: int
+    fresh: bool
+    times_ns: np.ndarray
+    fields: list
+    end_ns: int
+    added: float
+    stretch: float
+
+
+class TrajectoryShaper:
+    """Shapes trajectories, one after the other or one into the other.
+
+    Parameters
+    ----------
+    modes : Modes
+    joint_names : sequence of str
+        n joints.
+    limits : mapping
+        Checked values of `PARAMETERS`.
+    """
+
+    def __init__(self, modes: Modes, joint_names, limits):
+        self.modes, self.joint_names = modes, tuple(joint_names)
+        self._velocity, self._acceleration = (
+            np.where(np.array(limits[name]) > 0.0, limits[name], np.inf)
+            for name in ("velocity", "acceleration")
+        )
+        self._epoch_ns = 0
+        self._motion = self._shaped = None
+
+    # Where it is -----------------------------------------------------------------------------
+
+    def _seconds(self, time_ns):
+        return (time_ns - self._epoch_ns) / SECOND
+
+    def moving(self, now_ns):
+        """Whether the shaped motion is under way, or still to come."""
+        return self._shaped is not None and self._seconds(now_ns) < self._shaped.end
+
+    def state(self, now_ns):
+        """Position, velocity and acceleration of the shaped motion, (3, n); None before the first trajectory."""
+        if self._shaped is None:
+            return None
+        return self._shaped.states(np.array([self._seconds(now_ns)]))[:, 0]
+
+    def forget(self):
+        """The joints were moved by others: the next trajectory begins where it is measured."""
+        self._motion = self._shaped = None
+
+    # Trajectories ----------------------------------------------------------------------------
+
+    def offer(self, trajectory, now_ns, measured=None) -> Shaped:
+        """Shape a trajectory, from now on or from its own start.
+
+        Parameters
+        ----------
+        trajectory : JointTrajectoryData
+            Checked.
+        now_ns : int
+            [ns]
+        measured : (n,) array_like, optional
+            Where the joints are [rad].
+
+        Raises
+        ------
+        TrajectoryError
+            Where it has no beginning, can't be kept within the limits, or gets too many points; nothing changes then.
+        """
+        start_ns = max(trajectory.stamp_ns, now_ns) if trajectory.stamp_ns else now_ns
+        moving = self.moving(now_ns)
+        epoch_ns = self._epoch_ns if moving else now_ns
+        start = (start_ns - epoch_ns) / SECOND
+        late = (start_ns - trajectory.stamp_ns) if trajectory.stamp_ns else 0
+        given = trajectory.times_ns - late
+        if given[-1] < 0:
+            raise TrajectoryError(
+                "s ago is when it ended",
+                field="header.stamp",
+                value=-float(given[-1]) / SECOND,
+                hint="use an earlier stamp, or 0 for now",
+            )
+        keep = given >= 0
+        times = given[keep] / SECOND
+        fields = [values[keep] for values in trajectory.fields]
+        before = self._motion if moving else None
+        begin = self._begin(before, start, times, fields, measured)
+        motion, stretch = self._within_limits(before, begin, start, times, fields)
+        now, last = (now_ns - epoch_ns) / SECOND, start + times[-1]
+        motion = motion.since(now - self.modes.max_duration - 2.0 * self.modes.delay)
+        fresh = before is None
+        return self._take(motion, epoch_ns, start if fresh else now, last, stretch, fresh)
+
+    def _begin(self, before, start, times, fields, measured):
+        """State (3, n) at which the trajectory begins."""
+        first = fields[0][0]
+        if before is not None:
+            own = np.stack([before.derivative(order, start) for order in range(3)])
+        elif self._motion is not None or measured is not None:
+            own = np.zeros((3, first.size))
+            own[0] = self._rest(measured)
+        elif times[0] > 0.0:
+            raise TrajectoryError(
+                "s is after the start, and where the joints are is unknown",
+                field="points[0].time_from_start",
+                value=float(times[0]),
+                hint="begin at time 0 with where the joints are, or publish joint states",
+            )
+        else:
+            own = np.zeros((3, first.size))
+            own[0] = first
+        if times[0] == 0.0:
+            away = np.abs(first - own[0])
+            joint = int(np.argmax(away))
+            if away[joint] > START_TOLERANCE:
+                raise TrajectoryError(
+                    f"rad is not where the joint is: {own[0][joint]:g}",
+                    field=f"points[0].positions of joint {self.joint_names[joint]}",
+                    value=float(first[joint]),
+                    limit=f"within {START_TOLERANCE:g}",
+                    hint="begin where the joints are, or later than at time 0",
+                )
+            for order, values in enumerate(fields):
+                own[order] = values[0]
+        return own
+
+    def _rest(self, measured):
+        """Where the joints stand (n,): where the last motion has ended, unless they were moved since."""
+        if self._motion is None:
+            return measured
+        end = self._motion.end
+        moved = measured is not None and (np.abs(measured - end) > START_TOLERANCE).any()
+        return measured if moved else end
+
+    def _within_limits(self, before, begin, start, times, fields):
+        """The unshaped motion, slowed down where the shaped one would exceed its limits; and by which factor."""
+        if np.isfinite(self._acceleration).any() and len(fields) == 1:
+            raise TrajectoryError(
+                "are not given: speeds step, and no limit of acceleration can be kept",
+                field="points[0].velocities",
+                hint="give velocities, or no limits.acceleration",
+            )
+        stretch = 1.0
+        for _ in range(ATTEMPTS):
+            motion = _joined(before, begin, start, times * stretch, _slower(fields, stretch))
+            excess = self._excess(motion, start)
+            if excess <= 1.0 + SPEED_ROUNDING:
+                return motion, stretch
+            stretch *= excess * MARGIN
+        raise TrajectoryError(
+            "times slower is still too fast",
+            field="trajectory",
+            value=float(f"{stretch:.3g}"),
+            hint="raise limits.velocity or limits.acceleration, or give it a start with less speed",
+        )
+
+    def _excess(self, motion, start):
+        """By which factor time must be stretched, 1 or less where the limits are kept from `start` on."""
+        if np.isinf(self._velocity).all() and np.isinf(self._acceleration).all():
+            return 1.0
+        shaped = ShapedMotion(motion, self.modes)
+        knots = shaped.knots()
+        knots = knots[np.searchsorted(knots, start) :]
+        lengths = np.diff(knots)[:, None] * PLACES[1]
+        places = (knots[:-1, None] + np.diff(knots)[:, None] * PLACES).ravel()
+        _, v, a = shaped.states(places).reshape(3, len(lengths), PLACES.size, -1)
+        speed = np.abs(v).max(axis=(0, 1))
+        # Between two places where the acceleration changes sign, it is taken as linear: so it is for cubic pieces.
+        before, after = a[:, :-1], a[:, 1:]
+        turns = before * after < 0.0
+        top = v[:, :-1] + 0.5 * lengths[:, :, None] * before**2 / np.where(
+            turns, before - after, np.inf
+        )
+        speed = np.maximum(speed, np.abs(top).max(axis=(0, 1)))
+        by_speed = (speed / self._velocity).max()
+        by_acceleration = np.sqrt((np.abs(a).max(axis=(0, 1)) / self._acceleration).max())
+        return float(max(by_speed, by_acceleration))
+
+    def stop(self, now_ns):
+        """Stop on the unshaped motion's own way, and shape it; None where nothing moves.
+
+        Parameters
+        ----------
+        now_ns : int
+            [ns]
+
+        Returns
+        -------
+        Shaped or None
+        """
+        if not self.moving(now_ns):
+            return None
+        start, motion = self._seconds(now_ns), self._motion
+        if start >= motion.knots[-1]:  # only the shaper's own delay is left
+            stopped = motion
+        else:
+            stopped = self._slowed(motion, start)
+        return self._take(stopped, self._epoch_ns, start, stopped.knots[-1], 1.0, fresh=False)
+
+    def _slowed(self, motion, start):
+        """The motion up to `start` [s], then along its own way to rest, no harder than allowed."""
+        ahead = np.linspace(start, motion.knots[-1], 200)
+        speed, acceleration = (np.abs(motion.derivative(k, ahead)).max(axis=0) for k in (1, 2))
+        own = np.maximum(STOP_ACCELERATION * acceleration, STOP_RATE * speed)
+        allowed = np.where(np.isfinite(self._acceleration), self._acceleration, own)
+        duration = MIN_STOP
+        while True:
+            elapsed, states = _along(motion, start, duration)
+            if (np.abs(states[2]) <= allowed * (1.0 + 1e-3) + 1e-9).all():
+                break
+            duration *= LONGER
+        return motion.then(PiecewiseMotion.through(start + elapsed, states[: motion.fields]))
+
+    def _take(self, motion, epoch_ns, begin, last, stretch, fresh):
+        """Shape a whole motion, and write what is left of it from a time on."""
+        shaped = ShapedMotion(motion, self.modes)
+        knots = shaped.knots()
+        knots = knots[knots > begin + (0.0 if fresh else HANDOVER)]
+        if fresh:
+            knots = np.concatenate([[begin], knots])
+        elif not knots.size:
+            knots = np.array([begin + HANDOVER])
+        if knots.size > MAX_POINTS:
+            raise TrajectoryError(
+                "are too many after shaping",
+                field="points",
+                value=knots.size,
+                limit=f"at most {MAX_POINTS}",
+                hint="send fewer: a quintic polynomial joins them",
+            )
+        states = shaped.states(knots)[: motion.fields]
+        states[0][-1], states[1:, -1] = motion.end, 0.0
+        self._motion, self._shaped, self._epoch_ns = motion, shaped, epoch_ns
+        times_ns = np.rint((knots - begin) * SECOND).astype(np.int64)
+        begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
+        added = float(shaped.end - last)
+        return Shaped(begin_ns, fresh, times_ns, list(states), end_ns, added, stretch)
+
+
+def _along(motion, start, duration):
+    """Times since the stop (k,) [s], and position, velocity, acceleration (3, k, n), of a stop of a duration."""
+    slowing = Slowing(duration)
+    elapsed = np.linspace(0.0, duration, STOP_POINTS + 1)
+    s, rate, bend = np.array([slowing.at(x) for x in elapsed]).T
+    p, v, a = (motion.derivative(order, start + s) for order in range(3))
+    rate, bend = rate[:, None], bend[:, None]
+    return elapsed, np.stack([p, v * rate, a * rate**2 + v * bend])
+
+
+def _slower(fields, stretch):
+    """Positions, velocities and accelerations at a slower pace."""
+    return [values / stretch**order for order, values in enumerate(fields)]
+
+
+def _joined(before, begin, start, times, fields):
+    """The unshaped motion: what was commanded before, then the points from a state `begin` (3, n) at `start` [s]."""
+    if times[0] > 0.0:
+        times = np.concatenate([[0.0], times])
+        fields = [np.vstack([b, values]) for b, values in zip(begin, fields, strict=False)]
+    if len(times) == 1:
+        motion = PiecewiseMotion.resting(fields[0][0], start)
+    else:
+        motion = PiecewiseMotion.through(start + times, fields)
+    return motion if before is None else before.then(motion)
