@@ -35,7 +35,15 @@ KEYS = {
     "yaml": "python3-yaml",
 }
 #: Packages of Jazzy, whose key is their name.
-JAZZY = {"builtin_interfaces", "diagnostic_msgs", "launch", "launch_ros", "rcl_interfaces", "rclpy"}
+JAZZY = {
+    "action_msgs",
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "launch",
+    "launch_ros",
+    "rcl_interfaces",
+    "rclpy",
+}
 JAZZY |= {
     "geometry_msgs",
     "lifecycle_msgs",
