@@ -88,16 +88,16 @@ class ShaperNode(ArmNode):
         self.core = self._shapers[False]
         self._measured, self._measured_at = None, -math.inf
         self._state = ShaperState(joint_names=names, shaper=own.kind, stretch=1.0)
-        self._states = self.make_publisher(ShaperState, "shaper/state", qos.COMMAND)
-        output = self.parameters["output"]
+        output, given = self.parameters["output"], {"qos_overriding_options": qos.overridable()}
+        self._states = self.make_publisher(ShaperState, "shaper/state", qos.COMMAND, **given)
         self._trajectories = self.make_publisher(
-            JointTrajectory, f"{output}/joint_trajectory", qos.COMMAND
+            JointTrajectory, f"{output}/joint_trajectory", qos.COMMAND, **given
         )
         self.make_subscription(
-            JointTrajectory, "joint_trajectory", self._on_trajectory, qos.COMMAND
+            JointTrajectory, "joint_trajectory", self._on_trajectory, qos.COMMAND, **given
         )
         self.make_subscription(
-            JointState, "joint_states", self._on_joint_states, qos_profile_sensor_data
+            JointState, "joint_states", self._on_joint_states, qos_profile_sensor_data, **given
         )
         self.make_service(SetBool, "shaper/bypass", self._on_bypass)
         self.make_service(Trigger, "shaper/stop", self._on_stop)
@@ -263,8 +263,8 @@ class ShaperNode(ArmNode):
         self._wish, self._wished_at, self._step = None, -math.inf, 1.0 / rate
         if not topic:
             return
-        self._commands = self.make_publisher(Float64MultiArray, topic, qos.CONTROL_PATH)
-        self.make_subscription(Float64MultiArray, "stream", self._on_stream, qos.CONTROL_PATH)
+        self._commands = self.make_publisher(Float64MultiArray, topic)
+        self.make_subscription(Float64MultiArray, "stream", self._on_stream)
         self.make_timer(self._step, self._on_tick)
 
     def _on_stream(self, msg):
