@@ -88,16 +88,26 @@ class ShaperNode(ArmNode):
         self.core = self._shapers[False]
         self._measured, self._measured_at = None, -math.inf
         self._state = ShaperState(joint_names=names, shaper=own.kind, stretch=1.0)
-        output, given = self.parameters["output"], {"qos_overriding_options": qos.overridable()}
-        self._states = self.make_publisher(ShaperState, "shaper/state", qos.COMMAND, **given)
+        output, given = self.parameters["output"], qos.overridable()
+        self._states = self.make_publisher(
+            ShaperState, "shaper/state", qos.COMMAND, qos_overriding_options=given
+        )
         self._trajectories = self.make_publisher(
-            JointTrajectory, f"{output}/joint_trajectory", qos.COMMAND, **given
+            JointTrajectory, f"{output}/joint_trajectory", qos.COMMAND, qos_overriding_options=given
         )
         self.make_subscription(
-            JointTrajectory, "joint_trajectory", self._on_trajectory, qos.COMMAND, **given
+            JointTrajectory,
+            "joint_trajectory",
+            self._on_trajectory,
+            qos.COMMAND,
+            qos_overriding_options=given,
         )
         self.make_subscription(
-            JointState, "joint_states", self._on_joint_states, qos_profile_sensor_data, **given
+            JointState,
+            "joint_states",
+            self._on_joint_states,
+            qos_profile_sensor_data,
+            qos_overriding_options=given,
         )
         self.make_service(SetBool, "shaper/bypass", self._on_bypass)
         self.make_service(Trigger, "shaper/stop", self._on_stop)
