@@ -130,3 +130,20 @@ def test_the_shipped_arm_explains_the_part_that_was_not_fitted(real_arm, flexarm
     shoulder, elbow = result["currents"]
     assert shoulder["left_of_scored"] < 0.08 and shoulder["explained"]
     assert not elbow["explained"]
+
+
+#: Begin of the ring-downs after fast motions [s].
+RING_DOWNS = (17.6, 28.5, 54.3, 60.3, 76.5)
+
+
+def test_what_rings_is_found_window_by_window(real_arm, flexarm):
+    """3.0 to 3.3 Hz, 0.6 to 3 % of damping within the intervals; docs/resonance.md has the table."""
+    code, printed, err = flexarm("resonance", real_arm / "exp1.csv", "--mapping", "tudor", "--json")
+    assert code == 0, err
+    found = {window["from_s"]: window["modes"][0] for window in json.loads(printed)["windows"]}
+    for begin in RING_DOWNS:
+        mode = found[min(found, key=lambda at: abs(at - begin))]
+        assert min(abs(at - begin) for at in found) < 0.1
+        assert 3.0 < mode["frequency_hz"] < 3.3 and mode["frequency_half_width_hz"] < 0.02
+        width = mode["damping_half_width"]
+        assert 0.006 - width < mode["damping"] < 0.03 and width < 0.006

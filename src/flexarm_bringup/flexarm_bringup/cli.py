@@ -165,6 +165,11 @@ COMMANDS = {
         "recording",
         "what a recording shows, a bag or a CSV file: gaps, rest, noise, drift, delays, ring-downs, spectra",
     ),
+    "resonance": Command(
+        "flexarm_tools.resonance.command",
+        "resonance",
+        "frequencies and damping of what rings in an arm, and the shaper that takes it out; no arm file",
+    ),
     "replay": Command(
         "flexarm_tools.replay.command",
         "replay",

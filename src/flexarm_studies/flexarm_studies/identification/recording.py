@@ -24,7 +24,7 @@ ENABLED = 1
 MARGIN = 2
 #: What is measured of joints, gauges and modes: the attributes of a `Recording` that have a row per sample.
 OF_JOINTS = ("position", "velocity", "acceleration", "torque", "current")
-SIGNALS = (*OF_JOINTS, "strain", "amplitude")
+SIGNALS = (*OF_JOINTS, "strain", "amplitude", "linear_acceleration", "angular_velocity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,9 @@ class Recording:
         Of the joints [rad/s], [rad/s^2], [A].
     amplitude : ndarray, shape (s, m), or None
         Of the modes [m, rad].
-    joint_names, gauge_names, mode_names : tuple of str
+    linear_acceleration, angular_velocity : ndarray, shape (s, i), or None
+        Of the axes of IMUs [m/s^2], [rad/s].
+    joint_names, gauge_names, mode_names, imu_names : tuple of str
         Of the columns; empty where only the arm has them.
     start : float
         Time of the first sample, as the source counts it [s].
@@ -66,9 +68,12 @@ class Recording:
     acceleration: np.ndarray | None = None
     current: np.ndarray | None = None
     amplitude: np.ndarray | None = None
+    linear_acceleration: np.ndarray | None = None
+    angular_velocity: np.ndarray | None = None
     joint_names: tuple = ()
     gauge_names: tuple = ()
     mode_names: tuple = ()
+    imu_names: tuple = ()
     start: float = 0.0
     stamps: np.ndarray | None = None
     held: tuple = ()
@@ -116,6 +121,11 @@ class Recording:
         if not np.isfinite(self.torque).any():
             hint = "the driver must report the torque that it applies"
             raise FlexarmError("is unknown (NaN) in every sample", field="joint_torque", hint=hint)
+
+
+def kind_of(quantity):
+    """To what a quantity of `SIGNALS` belongs: joint, gauge, mode or imu."""
+    return mappings.QUANTITIES[quantity][0]
 
 
 def uniform(time, signals, usable=None, **more):
@@ -262,7 +272,7 @@ def _named_columns(path, header, arm):
     joints = arm.joint_names if arm is not None else made.names("joint")
     wanted = ["t", *(f"{joint}_position" for joint in joints)]
     missing = [name for name in wanted if name not in header]
-    if missing or not joints:
+    if missing or len(made.columns) < 2:
         wanted = wanted if joints else ["t", "<joint>_position", "<gauge>_strain"]
         raise tables.TableError(
             f"no column {', '.join(missing or wanted[1:2])} (wanted: {', '.join(wanted)})",
@@ -272,11 +282,12 @@ def _named_columns(path, header, arm):
 
 
 def _names(mapping, arm):
-    """Names of joints, gauges and modes, in the arm's order, or in the file's without one; foreign ones are refused."""
-    names = {kind: mapping.names(kind) for kind in ("joint", "gauge", "mode")}
+    """Names of what was measured, in the arm's order, or in the file's without one; foreign ones are refused."""
+    names = {kind: mapping.names(kind) for kind in mappings.KINDS}
     if arm is None:
         return names
-    known = {kind: getattr(arm, f"{kind}_names") for kind in names}
+    known = {kind: mappings.names_in(arm, kind) or () for kind in names}
+    known["imu"] = names["imu"]  # no arm file has them
     for kind, found in names.items():
         # A joint that stands still need not be in the arm's model.
         foreign = [n for n in found if n not in known[kind] and n not in mapping.held]

@@ -38,9 +38,13 @@ QUANTITIES = {
     "acceleration": ("joint", {f"{u}/s^2": f for u, f in ANGLE.items()}),
     "torque": ("joint", {"N m": 1.0, "mN m": 1e-3}),
     "current": ("joint", {"A": 1.0, "mA": 1e-3}),
+    "linear_acceleration": ("imu", {"m/s^2": 1.0, "g": 9.80665}),
+    "angular_velocity": ("imu", {f"{u}/s": f for u, f in ANGLE.items()} | {"rpm": np.pi / 30.0}),
     "strain": ("gauge", {"strain": 1.0, "millistrain": 1e-3, "microstrain": 1e-6}),
     "amplitude": ("mode", {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3}),
 }
+#: To what a quantity may belong.
+KINDS = ("joint", "gauge", "mode", "imu")
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 
 
@@ -55,7 +59,7 @@ class Column:
     quantity : str
         One of `QUANTITIES`.
     of : str
-        Joint, gauge or mode; empty for the time.
+        Joint, gauge, mode, or axis of an IMU; empty for the time.
     factor : float
         From the cell to SI, the sign in it.
     """
@@ -98,7 +102,7 @@ class Mapping:
     decimal: str = "."
 
     def names(self, kind):
-        """Names of the joints, gauges or modes (`kind`: joint, gauge, mode), in the file's order, held joints last."""
+        """Names of what is of a `kind` (of `KINDS`), in the file's order, held joints last."""
         found = [c.of for c in self.columns if QUANTITIES[c.quantity][0] == kind]
         return tuple(dict.fromkeys([*found, *(self.held if kind == "joint" else ())]))
 
@@ -212,6 +216,19 @@ def _sign(entry):
     return sign
 
 
+def _parts(title):
+    """Name and quantity of a column; both empty where it is none."""
+    for quantity in sorted(QUANTITIES, key=len, reverse=True):
+        if title.endswith(f"_{quantity}"):
+            return title[: -len(quantity) - 1], quantity
+    return "", ""
+
+
+def names_in(arm, kind):
+    """Names of what an arm has of a `kind`; None without an `arm`, and for what is in no arm file."""
+    return getattr(arm, f"{kind}_names", None)
+
+
 def by_names(header, arm=None):
     """The `Mapping` of a file whose first line has names, see the module.
 
@@ -221,12 +238,12 @@ def by_names(header, arm=None):
     arm : Arm, optional
         Whose joints, gauges and modes are wanted; others are then ignored.
     """
-    wanted = {kind: arm and getattr(arm, f"{kind}_names") for kind in ("joint", "gauge", "mode")}
+    wanted = {kind: names_in(arm, kind) for kind in KINDS}
     columns = [Column("t", "time")]
     for title in header:
-        of, _, quantity = title.rpartition("_")
+        of, quantity = _parts(title)
         kind = QUANTITIES.get(quantity, ("",))[0]
-        if of and kind and (arm is None or of in wanted[kind]):
+        if of and kind and (wanted[kind] is None or of in wanted[kind]):
             columns.append(Column(title, quantity, of))
     return Mapping(tuple(dict.fromkeys(columns)), header=True)
 

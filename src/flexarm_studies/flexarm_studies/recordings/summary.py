@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from ..identification.recording import JITTER, OF_JOINTS, SIGNALS
+from ..identification.recording import JITTER, SIGNALS, kind_of
 from . import rest, ring_down, trends
 
 #: SI units of the signals, as they are printed.
@@ -15,6 +15,8 @@ UNITS = {
     "current": "A",
     "strain": "-",
     "amplitude": "m, rad",
+    "linear_acceleration": "m/s^2",
+    "angular_velocity": "rad/s",
 }
 #: Length of the pieces of a spectrum [s]; peaks that are reported: so many, so far above their surroundings [-].
 SEGMENT, MAX_PEAKS, OUTSTANDING = 8.0, 4, 4.0
@@ -46,9 +48,7 @@ def channels(recording):
     """Yield quantity, of what, and values (s,) of each channel that was measured."""
     for quantity in SIGNALS:
         values = getattr(recording, quantity)
-        kind = (
-            "joint" if quantity in OF_JOINTS else {"strain": "gauge", "amplitude": "mode"}[quantity]
-        )
+        kind = kind_of(quantity)
         names = getattr(recording, f"{kind}_names")
         if values is None or not names:
             continue

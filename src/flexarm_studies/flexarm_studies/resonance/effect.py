@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""What a given motion excites: the vibration that it leaves in a mode of a unit that hangs at each joint.
+
+.. math:: \ddot x + 2\zeta\omega\dot x + \omega^2 x = -\ddot q_j, \qquad
+    \hat x_j = \frac1\omega\Bigl|\int_0^T \ddot q_j\,e^{p(T-t)}\,dt\Bigr|
+
+is the amplitude at its end T. How much of it the tip has is the arm's; what a shaper leaves of it is not.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import BPoly
+
+from flexarm_control.motions import shapers
+from flexarm_control.trajectory import files
+from flexarm_dynamics.errors import TrajectoryError
+
+from .recommendation import SMOOTH, box, impulses, train_of
+
+#: Times per period of the fastest mode, and at most so many in all.
+PER_PERIOD, MOST = 40, 200_000
+
+
+def read(path):
+    """A trajectory from a file of any joints; its `JointTrajectoryData`.
+
+    Parameters
+    ----------
+    path : str or Path
+        YAML, whose ``joint_names`` are taken, or CSV with columns ``q1`` and so on.
+
+    Raises
+    ------
+    TrajectoryError
+        With file, place and value.
+    """
+    return files.read(path, _joint_names(Path(path)))
+
+
+def _joint_names(path):
+    """The joints that a file names or numbers, for `files.read`, which checks them; one if that is unknown."""
+    import yaml
+
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        if path.suffix.lower() == ".csv":
+            header = next(line for line in text.splitlines() if line.strip()).split(",")
+            count = sum(word.strip()[:1] == "q" and word.strip()[1:].isdigit() for word in header)
+            return [f"joint{k + 1}" for k in range(max(count, 1))]
+        found = next(yaml.safe_load_all(text))
+        return [str(name) for name in found["joint_names"]] or ["joint1"]
+    except (
+        OSError,
+        UnicodeDecodeError,
+        ValueError,
+        yaml.YAMLError,
+        LookupError,
+        TypeError,
+        StopIteration,
+    ):
+        return ["joint1"]
+
+
+def steps(trajectory, fastest):
+    """The motion as small steps of the speed at equal times, from its first point to its last.
+
+    Parameters
+    ----------
+    trajectory : JointTrajectoryData
+    fastest : float
+        Frequency that is to be resolved [Hz].
+
+    Returns
+    -------
+    time : ndarray, shape (k,)
+        [s]
+    steps : ndarray, shape (k, n)
+        [rad/s]
+
+    Raises
+    ------
+    TrajectoryError
+        For fewer than two points.
+    """
+    times = trajectory.times
+    if times.size < 2:
+        hint = "give the point at which it starts, too"
+        raise TrajectoryError("point is no motion", field="trajectory", value=times.size, hint=hint)
+    spline = BPoly.from_derivatives(times, np.stack(trajectory.fields, axis=1))
+    length = times[-1] - times[0]
+    count = int(np.clip(np.ceil(PER_PERIOD * fastest * length), 200, MOST))
+    grid = np.linspace(times[0], times[-1], count + 1)
+    speed = np.diff(spline(grid), axis=0) * (count / length)
+    change = np.diff(speed, axis=0, prepend=0.0, append=0.0)
+    return grid - times[0], change
+
+
+def left(time, change, poles):
+    """Amplitudes that a motion leaves at its end.
+
+    Parameters
+    ----------
+    time : ndarray, shape (k,)
+        [s]
+    change : ndarray, shape (k, n)
+        Steps of the speed [rad/s].
+    poles : ndarray, shape (m,)
+        [1/s]
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+        [rad]
+    """
+    response = np.array([np.exp(p * (time[-1] - time)) @ change for p in np.asarray(poles)])
+    return np.abs(response) / np.abs(poles)[:, None]
+
+
+def of_trajectory(trajectory, spreads, candidates):
+    """What a motion leaves of each mode, as it is and with each candidate.
+
+    Parameters
+    ----------
+    trajectory : JointTrajectoryData
+    spreads : sequence of Spread
+    candidates : sequence of Candidate
+        Those with a kernel; ``least_exciting`` is left out.
+
+    Returns
+    -------
+    list of dict
+        Of each candidate: kind, duration_s, amplitude_rad (per mode, the worst joint and pole).
+    """
+    time, change = steps(trajectory, max(s.high for s in spreads))
+    now = [left(time, change, s.poles()) for s in spreads]
+    rows = []
+    for candidate in candidates:
+        response = _response(candidate, spreads)
+        if response is None:
+            continue
+        after = [
+            float((a * np.abs(response(s.poles()))[:, None]).max())
+            for a, s in zip(now, spreads, strict=True)
+        ]
+        duration = float(time[-1]) + candidate.delay
+        rows.append({"kind": candidate.kind, "duration_s": duration, "amplitude_rad": after})
+    return rows
+
+
+def _response(candidate, spreads):
+    """What a candidate's kernel does to poles (k,); None where it has none."""
+    if candidate.kind in SMOOTH:
+        return box(candidate.width, SMOOTH[candidate.kind])
+    if candidate.kind in shapers.SHAPERS or candidate.kind == shapers.NONE:
+        return impulses(train_of(candidate.kind, [spreads[k] for k in candidate.modes]))
+    return None

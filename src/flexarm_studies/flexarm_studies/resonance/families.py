@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The same mode in several windows: its spread of frequency and damping, and how it depends on the joints.
+
+Between configurations the frequency is :math:`f(q) = f_0 + g\cdot(q - \bar q)`, by least squares with the weights of
+the intervals, where that predicts windows that were left out better than a constant does.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Modes farther apart than this are not the same, of the logarithm of their frequencies [-].
+GAP = 0.2
+#: What an amplitude is divided by, to be that of a deflection: this power of omega.
+POWERS = {"linear_acceleration": 2, "acceleration": 2, "velocity": 1, "angular_velocity": 1}
+#: A fit over the joints counts if it predicts windows that were left out this much better than their mean [-].
+BETTER = 0.6
+#: A joint that moves less than this between the windows has no slope [rad or m].
+MOVES = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """A mode, seen in several windows.
+
+    Attributes
+    ----------
+    modes : tuple of Mode
+        One per window in which it rings.
+    windows : tuple of int
+        Which.
+    part : float
+        Of the squares of all deflections, over all windows and channels [-].
+    """
+
+    modes: tuple
+    windows: tuple
+    part: float
+
+    def values(self, name):
+        """An attribute of all its modes, such as ``frequency``, shape (k,)."""
+        return np.array([getattr(mode, name) for mode in self.modes])
+
+    @property
+    def frequencies(self):
+        """Lowest and highest frequency, their intervals included [Hz]."""
+        value, width = self.values("frequency"), self.values("frequency_width")
+        return float((value - width).min()), float((value + width).max())
+
+    @property
+    def dampings(self):
+        """Lowest, median and highest damping ratio that was found [-]."""
+        return tuple(float(d) for d in np.quantile(self.values("damping"), (0.0, 0.5, 1.0)))
+
+    @property
+    def frequency(self):
+        """Middle of `frequencies` [Hz]."""
+        return float(np.mean(self.frequencies))
+
+
+@dataclass(frozen=True, eq=False)
+class Dependence:
+    """A family's frequency over the joints.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n,)
+        Mean configuration [rad].
+    frequency : float
+        There [Hz].
+    slope : ndarray, shape (n,)
+        [Hz/rad]
+    error, constant_error : float
+        Rms with which it, and the mean, predict a window that was left out [Hz].
+    """
+
+    mean: np.ndarray
+    frequency: float
+    slope: np.ndarray
+    error: float
+    constant_error: float
+
+    @property
+    def counts(self):
+        """Whether it predicts better than the mean."""
+        return self.error < BETTER * self.constant_error
+
+    def at(self, configuration):
+        """Frequency at a configuration (n,) [Hz]."""
+        return float(self.frequency + self.slope @ (configuration - self.mean))
+
+
+def families(windows, quantities):
+    """The modes of several windows, joined.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+    quantities : sequence of str
+        Of each channel.
+
+    Returns
+    -------
+    list of Family
+        Ascending.
+    """
+    all_modes = [(mode, i) for i, window in enumerate(windows) for mode in window.fit.modes]
+    all_modes.sort(key=lambda item: item[0].frequency)
+    if not all_modes:
+        return []
+    squares = np.array([_deflections(mode, quantities) ** 2 for mode, _ in all_modes])
+    # Channels count alike, whatever their units are.
+    size = squares.sum(axis=0)
+    parts = (squares[:, size > 0.0] / size[size > 0.0]).mean(axis=1)
+    groups = _groups(all_modes, list(range(len(all_modes))))
+    return [
+        Family(
+            tuple(all_modes[k][0] for k in group),
+            tuple(all_modes[k][1] for k in group),
+            float(parts[group].sum()),
+        )
+        for group in groups
+    ]
+
+
+def _deflections(mode, quantities):
+    powers = np.array([POWERS.get(q, 0) for q in quantities])
+    return mode.amplitude / (2.0 * np.pi * mode.frequency) ** powers
+
+
+def _groups(all_modes, members):
+    """Split at the widest gap until no gap is wide, and no window is twice in a group."""
+    if len(members) == 1:
+        return [members]
+    gaps = np.diff(np.log([all_modes[k][0].frequency for k in members]))
+    widest = int(np.argmax(gaps))
+    windows = [all_modes[k][1] for k in members]
+    if gaps[widest] <= GAP and len(set(windows)) == len(windows):
+        return [members]
+    left, right = members[: widest + 1], members[widest + 1 :]
+    return _groups(all_modes, left) + _groups(all_modes, right)
+
+
+def dependence(family, windows):
+    """How a family's frequency depends on the joints; None where too few windows tell it.
+
+    Parameters
+    ----------
+    family : Family
+    windows : sequence of Window
+        All, as for `families`.
+
+    Returns
+    -------
+    Dependence or None
+    """
+    configurations = np.array([windows[i].configuration for i in family.windows])
+    moves = np.ptp(configurations, axis=0) > MOVES
+    count = len(family.modes)
+    if count < moves.sum() + 3 or not moves.any():
+        return None
+    mean = configurations.mean(axis=0)
+    B = np.column_stack([np.ones(count), (configurations - mean)[:, moves]])
+    target = family.values("frequency")
+    spread = 0.1 * target.std()
+    weight = 1.0 / np.maximum(np.hypot(family.values("frequency_width"), spread), 1e-9)
+    errors, constant = _left_out(B, target, weight), _left_out(B[:, :1], target, weight)
+    x = _solve(B, target, weight)
+    slope = np.zeros(mean.size)
+    slope[moves] = x[1:]
+    rms = [float(np.sqrt(np.mean(e**2))) for e in (errors, constant)]
+    return Dependence(mean, float(x[0]), slope, *rms)
+
+
+def _solve(B, target, weight):
+    return np.linalg.lstsq(B * weight[:, None], target * weight, rcond=1e-6)[0]
+
+
+def _left_out(B, target, weight):
+    keep = ~np.eye(len(target), dtype=bool)
+    return np.array(
+        [
+            t - row @ _solve(B[k], target[k], weight[k])
+            for k, row, t in zip(keep, B, target, strict=True)
+        ]
+    )

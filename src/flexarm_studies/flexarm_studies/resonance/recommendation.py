@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Which shaper, or which smoothing, leaves as little vibration as is wanted, at the least delay.
+
+Every candidate is a kernel by which a motion is convolved. Of the vibration of a mode with the pole p it leaves
+
+.. math:: V(p) = \left|\int_0^L k(\tau)\,e^{p(L-\tau)}\,d\tau\right|
+
+at its end, L later. Impulses are the shapers of `flexarm_control.motions.shapers`. A jerk limit is the kernel 1/W on
+[0, W], of which :math:`V = |(e^{pW} - 1)/(pW)|`: steps of the acceleration become ramps of the length W. A snap
+limit is two of these. Speeds and accelerations become no larger with any of them.
+
+Of several modes the residual is :math:`\sqrt{\sum_k s_k V_k^2}`, :math:`s_k` the part of the vibration's energy that
+mode k had in the recording, :math:`V_k` the largest over its spread of frequency and damping.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_control.motions import shapers
+from flexarm_dynamics.errors import FlexarmError
+
+from .time_law import least_exciting_duration
+
+TURN = 2.0 * np.pi
+#: Points over the spread of the frequency.
+POINTS = 41
+#: Widths of a smoothing that are tried, up to so many periods of the slowest mode.
+WIDTHS, PERIODS = 400, 5.0
+#: Names of the smooth ones, and how many boxes they are.
+SMOOTH = {"jerk_limited": 1, "snap_limited": 2}
+BY_PROGRAMME = "least_exciting"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What is known of a mode.
+
+    Attributes
+    ----------
+    low, high : float
+        Frequencies [Hz].
+    dampings : tuple of float
+        Lowest, middle and highest ratio [-].
+    part : float
+        Of the vibration's energy [-].
+    """
+
+    low: float
+    high: float
+    dampings: tuple
+    part: float
+
+    @property
+    def frequency(self):
+        """Middle [Hz]."""
+        return 0.5 * (self.low + self.high)
+
+    @property
+    def damping(self):
+        """Middle [-]."""
+        return self.dampings[1]
+
+    def poles(self):
+        """Poles over the spread, shape (k,) [1/s]."""
+        omega = TURN * np.linspace(self.low, self.high, POINTS)[:, None]
+        zeta = np.array(self.dampings)
+        return (omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A shaper or a smoothing, and what it does.
+
+    Attributes
+    ----------
+    kind : str
+        Of `shapers.SHAPERS`, ``none``, of `SMOOTH`, or ``least_exciting``.
+    modes : tuple of int
+        For which modes it is made; empty for a smoothing.
+    delay : float
+        By which a motion gets longer [s].
+    residual : float
+        Largest over the spread [-].
+    nominal : float
+        In the middle of the spread [-].
+    width : float
+        Of a smoothing's box [s]; 0 for others.
+    """
+
+    kind: str
+    modes: tuple
+    delay: float
+    residual: float
+    nominal: float
+    width: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Recommendation:
+    """What is recommended.
+
+    Attributes
+    ----------
+    wanted : float
+        Residual [-].
+    candidates : tuple of Candidate
+        The quickest of each kind that meets the residual, or the best of its kind where none does.
+    chosen : Candidate
+        A shaper: the quickest that meets the residual, or the best.
+    """
+
+    wanted: float
+    candidates: tuple
+    chosen: Candidate
+
+    @property
+    def met(self):
+        """Whether the chosen one meets the residual."""
+        return self.chosen.residual <= self.wanted
+
+
+def widened(spreads, margin):
+    """The `spreads` with frequencies that may be off by a further fraction `margin`."""
+    return [
+        Spread(s.low * (1.0 - margin), s.high * (1.0 + margin), s.dampings, s.part) for s in spreads
+    ]
+
+
+def recommend(spreads, residual=0.05, move=None) -> Recommendation:
+    """The candidates, and the shaper among them that meets the residual with the least delay.
+
+    Parameters
+    ----------
+    spreads : sequence of Spread
+        At least one.
+    residual : float
+        Wanted, above 0, below 1 [-].
+    move : Move, optional
+        For which the least exciting time law is found; None: it is left out.
+
+    Raises
+    ------
+    FlexarmError
+        Without a mode, or for a residual out of range.
+    """
+    if not 0.0 < residual < 1.0:
+        raise FlexarmError(
+            "is out of range", field="residual", value=residual, limit="above 0, below 1"
+        )
+    if not spreads:
+        raise FlexarmError(
+            "nothing rings", field="modes", hint="record the arm after a quick motion"
+        )
+    spreads = list(spreads)
+    found = [_quickest(_shapers(kind, spreads), residual) for kind in shapers.SHAPERS]
+    chosen = _quickest(found, residual)
+    smooth = [_smoothing(kind, spreads, residual) for kind in SMOOTH]
+    none = _shaped(shapers.NONE, spreads, ())
+    law = [] if move is None else [_least_exciting(spreads, residual, move)]
+    return Recommendation(residual, (none, *found, *smooth, *law), chosen)
+
+
+def _quickest(candidates, residual):
+    enough = [c for c in candidates if c.residual <= residual]
+    if enough:
+        return min(enough, key=lambda c: (c.delay, c.residual))
+    return min(candidates, key=lambda c: c.residual)
+
+
+def _shapers(kind, spreads):
+    """One kind of shaper for the most important mode, the two most important, and so on."""
+    order = sorted(range(len(spreads)), key=lambda k: -spreads[k].part)
+    return [_shaped(kind, spreads, tuple(sorted(order[: k + 1]))) for k in range(len(order))]
+
+
+def _shaped(kind, spreads, modes):
+    train = train_of(kind, [spreads[k] for k in modes])
+    return Candidate(kind, modes, train.duration, *_residuals(impulses(train), spreads))
+
+
+def impulses(train):
+    """Response of a `Shaper`'s impulses: a function of poles (k,)."""
+    left = lambda poles: np.multiply.outer(poles, train.duration - train.times)  # noqa: E731
+    return lambda poles: np.exp(left(poles)) @ train.amplitudes
+
+
+def train_of(kind, modes):
+    """The `Shaper` of a kind for the middle of some spreads, or for some modes; without any, a single impulse."""
+    trains = [shapers.impulses(kind, mode.frequency, mode.damping) for mode in modes]
+    return shapers.convolve(trains or [shapers.impulses(shapers.NONE, 1.0, 0.0)])
+
+
+def _residuals(response, spreads):
+    """Largest and middle residual of a kernel, given as a function of poles."""
+    part = np.array([s.part for s in spreads])
+    part = part / part.sum()
+    worst = np.array([np.abs(response(s.poles())).max() for s in spreads])
+    middle = [
+        TURN * s.frequency * complex(-s.damping, np.sqrt(1.0 - s.damping**2)) for s in spreads
+    ]
+    nominal = np.abs(response(np.array(middle)))
+    return tuple(float(np.sqrt(part @ values**2)) for values in (worst, nominal))
+
+
+def box(width, count=1):
+    """Response of `count` boxes of a `width` [s], one after the other: a function of poles (k,)."""
+    return lambda poles: (np.expm1(poles * width) / (poles * width)) ** count
+
+
+def _smoothing(kind, spreads, residual):
+    """The narrowest box that meets the residual, or the best."""
+    count, slowest = SMOOTH[kind], min(s.low for s in spreads)
+    widths = np.linspace(0.0, PERIODS / slowest, WIDTHS + 1)[1:] / count
+    made = [Candidate(kind, (), count * w, *_residuals(box(w, count), spreads), w) for w in widths]
+    return _quickest(made, residual)
+
+
+def _least_exciting(spreads, residual, move):
+    part = np.array([s.part for s in spreads])
+    part = part / part.sum()
+    # Poles of modes that hardly take part in it may have more.
+    wanted = residual / np.sqrt(np.maximum(part * len(part), 1e-6))
+    poles = [s.poles() for s in spreads]
+    longer = PERIODS / min(s.low for s in spreads)
+    duration, worst = least_exciting_duration(move, poles, wanted, longer)
+    left = float(np.sqrt(part @ np.asarray(worst) ** 2))
+    return Candidate(BY_PROGRAMME, (), duration - move.duration, left, left)

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a recording to a shaper: windows, modes, their spread, the recommendation; as plain data and as text."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexarm_dynamics.errors import FlexarmError
+
+from . import effect, windows
+from .families import dependence, families
+from .fit import HIGHEST
+from .recommendation import BY_PROGRAMME, Spread, recommend, widened
+from .time_law import Move
+
+#: A mode that takes part in less than this fraction of the vibration's energy is not shaped for [-].
+MIN_PART = 1e-3
+#: Configurations nearer than this are one [rad].
+SAME_PLACE = 0.05
+#: For the least exciting time law, unless another is asked for.
+MOVE = Move(0.5, 1.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What is asked for.
+
+    Attributes
+    ----------
+    residual : float
+        Vibration that may be left [-].
+    margin : float
+        By which frequencies may be off beyond what was measured [-].
+    low, high : float
+        Frequencies that are looked for [Hz].
+    windows : tuple of (float, float)
+        From when to when [s]; empty: they are found.
+    quantities : tuple of str
+        Empty: what there is.
+    move : Move
+        For the least exciting time law.
+    """
+
+    residual: float = 0.05
+    margin: float = 0.05
+    low: float = 0.0
+    high: float = HIGHEST
+    windows: tuple = ()
+    quantities: tuple = ()
+    move: Move = MOVE
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What a recording says of the modes, and what follows.
+
+    Attributes
+    ----------
+    channels : Channels
+    windows : list of Window
+    families : list of Family
+    spreads : list of Spread
+        Of each family, widened.
+    recommendation : Recommendation
+    """
+
+    channels: windows.Channels
+    windows: list
+    families: list
+    spreads: list
+    recommendation: object
+
+
+def study(recording, wishes=None) -> Study:
+    """Find the modes of a recording that ring freely, and recommend a shaper.
+
+    Parameters
+    ----------
+    recording : Recording
+    wishes : Wishes, optional
+
+    Raises
+    ------
+    FlexarmError
+        Where nothing rings, or a window has no samples.
+    """
+    wishes = wishes or Wishes()
+    found = windows.channels(recording, wishes.quantities or None)
+    if wishes.windows:
+        parts = [found.rows(*window) for window in wishes.windows]
+    else:
+        parts = windows.free(found, recording)
+    return of_windows(found, windows.modes_of(found, parts, wishes.low, wishes.high), wishes)
+
+
+def of_windows(found, rings, wishes) -> Study:
+    """The study of windows that ring.
+
+    Parameters
+    ----------
+    found : Channels
+    rings : list of Window
+    wishes : Wishes
+
+    Raises
+    ------
+    FlexarmError
+        Where none does.
+    """
+    if not rings:
+        hint = "record what follows a quick motion or a blow, or name a stretch with --window"
+        raise FlexarmError("nothing rings freely", field="recording", hint=hint)
+    modes = families(rings, found.quantities)
+    spreads = [Spread(*f.frequencies, f.dampings, f.part) for f in modes]
+    spreads = widened(spreads, wishes.margin)
+    shaped = [s for s in spreads if s.part > MIN_PART]
+    return Study(found, rings, modes, shaped, recommend(shaped, wishes.residual, wishes.move))
+
+
+def by_configuration(made):
+    """The shaped modes of each configuration, for a shaper that goes with the joints.
+
+    Parameters
+    ----------
+    made : Study
+
+    Returns
+    -------
+    list of (ndarray, list of Spread)
+        Configuration [rad] and its modes; empty where no mode depends on the joints.
+    """
+    modes = made.recommendation.chosen.modes
+    shaped = [f for f in made.families if f.part > MIN_PART]
+    laws = [dependence(shaped[k], made.windows) for k in modes]
+    if not any(law is not None and law.counts for law in laws):
+        return []
+    out = []
+    for place in _places(made.windows):
+        here = []
+        for k, law in zip(modes, laws, strict=True):
+            middle = law.at(place) if law is not None and law.counts else shaped[k].frequency
+            here.append(replace(made.spreads[k], low=middle, high=middle))
+        out.append((place, here))
+    return out
+
+
+def _places(rings):
+    places = []
+    for window in rings:
+        near = [np.abs(window.configuration - p).max() < SAME_PLACE for p in places]
+        if not any(near):
+            places.append(window.configuration)
+    return places
+
+
+# As plain data -------------------------------------------------------------------------------
+
+
+def plain(made):
+    """All that was found, ready for JSON: numbers in SI."""
+    names = made.channels.joint_names
+    return {
+        "channels": list(made.channels.names),
+        "joints": list(names),
+        "windows": [_window(w) for w in made.windows],
+        "modes": [_family(f, made.windows) for f in made.families],
+        "recommendation": _recommendation(made),
+        "yaml": yaml_lines(made),
+    }
+
+
+def _window(window):
+    fitted = window.fit
+    return {
+        "from_s": window.begin,
+        "to_s": window.end,
+        "configuration": [float(q) for q in window.configuration],
+        "explained": [float(e) for e in fitted.explained],
+        "modes": [
+            {
+                "frequency_hz": mode.frequency,
+                "frequency_half_width_hz": mode.frequency_width,
+                "damping": mode.damping,
+                "damping_half_width": mode.damping_width,
+                "amplitude": [float(a) for a in mode.amplitude],
+            }
+            for mode in fitted.modes
+        ],
+    }
+
+
+def _family(family, rings):
+    law = dependence(family, rings)
+    return {
+        "frequency_hz": family.frequency,
+        "frequencies_hz": list(family.frequencies),
+        "dampings": list(family.dampings),
+        "windows": list(family.windows),
+        "part": family.part,
+        "dependence": law
+        and {
+            "at": [float(q) for q in law.mean],
+            "frequency_hz": law.frequency,
+            "slope_hz_per_rad": [float(g) for g in law.slope],
+            "error_hz": law.error,
+            "constant_error_hz": law.constant_error,
+            "counts": law.counts,
+        },
+    }
+
+
+def _recommendation(made):
+    found = made.recommendation
+    return {
+        "residual_wanted": found.wanted,
+        "met": found.met,
+        "shaper": found.chosen.kind,
+        "delay_s": found.chosen.delay,
+        "residual": found.chosen.residual,
+        "spreads": [
+            {"low_hz": s.low, "high_hz": s.high, "dampings": list(s.dampings), "part": s.part}
+            for s in made.spreads
+        ],
+        "candidates": [
+            {
+                "kind": c.kind,
+                "modes": list(c.modes),
+                "delay_s": c.delay,
+                "residual": c.residual,
+                "nominal_residual": c.nominal,
+                "width_s": c.width,
+            }
+            for c in found.candidates
+        ],
+    }
+
+
+def yaml_lines(made):
+    """Parameters of the node `shaper`, a list of lines to paste."""
+    chosen = made.recommendation.chosen
+    shaped = [made.spreads[k] for k in chosen.modes]
+    places = by_configuration(made)
+    rows = [here for _, here in places] or [shaped]
+    lines = [
+        "shaper:",
+        "  ros__parameters:",
+        f"    shaper.type: {chosen.kind}",
+        f"    shaper.frequencies: {_floats([s.frequency for row in rows for s in row])}",
+        f"    shaper.dampings: {_floats([s.damping for row in rows for s in row])}",
+    ]
+    if places:
+        flat = [float(q) for place, _ in places for q in place]
+        lines.append(f"    shaper.configurations: {_floats(flat)}")
+    return lines
+
+
+def _floats(values):
+    """A list of YAML, every number with a point: ROS takes no integers for floats."""
+    return "[" + ", ".join(repr(float(f"{v:.4g}")) for v in values) + "]"
+
+
+# As text ---------------------------------------------------------------------------------------
+
+
+def text(made, motion=None):
+    """Lines for people; `motion` is what `effect.of_trajectory` found of a trajectory, if there is one."""
+    yield from _windows_text(made)
+    yield from _modes_text(made)
+    yield from _table(made.recommendation)
+    if motion:
+        yield from _motion_text(motion)
+    yield from ("", "to paste into the parameters of the node shaper:", *yaml_lines(made))
+
+
+def _windows_text(made):
+    yield f"channels: {', '.join(made.channels.names)}"
+    yield "free ringing"
+    for window in made.windows:
+        at = ", ".join(f"{q:.2f}" for q in window.configuration)
+        yield f"  {window.begin:.2f} to {window.end:.2f} s" + (f" at ({at})" if at else "")
+        for mode in window.fit.modes:
+            yield (
+                f"    {mode.frequency:8.3f} +- {mode.frequency_width:.3f} Hz, damping "
+                f"{mode.damping:.4f} +- {mode.damping_width:.4f}"
+            )
+
+
+def _modes_text(made):
+    yield "\nmodes"
+    for family in made.families:
+        (low, high), (least, _, most) = family.frequencies, family.dampings
+        yield (
+            f"  {low:.3f} to {high:.3f} Hz, damping {least:.4f} to {most:.4f}, in {len(family.modes)} of "
+            f"{len(made.windows)} windows, {100.0 * family.part:.2g} % of the vibration"
+        )
+        law = dependence(family, made.windows)
+        if law is not None:
+            slopes = ", ".join(
+                f"{g:+.3f} of {name}"
+                for name, g in zip(made.channels.joint_names, law.slope, strict=True)
+                if g
+            )
+            which = "goes with the joints" if law.counts else "does not go with the joints"
+            yield (
+                f"    {which}: {slopes} [Hz/rad]; a window that was left out is predicted within "
+                f"{law.error:.3f} Hz, by the mean within {law.constant_error:.3f} Hz"
+            )
+
+
+def _table(found):
+    yield f"\nresidual over the spread, and the time that a motion gets longer; wanted {100.0 * found.wanted:g} %"
+    yield "  shaper           modes  residual   in the middle   delay [s]"
+    for c in sorted(found.candidates, key=lambda c: c.delay):
+        mark = "*" if c is found.chosen else " "
+        modes = str(len(c.modes)) if c.modes else "-"
+        middle = f"{100.0 * c.nominal:7.2f} %"
+        yield f"{mark} {c.kind:16} {modes:5} {100.0 * c.residual:8.2f} % {middle:>13} {c.delay:13.3f}"
+    if not found.met:
+        yield "none meets it: the modes spread too far; measure where the arm works, or shape by configuration"
+    law = [c for c in found.candidates if c.kind == BY_PROGRAMME]
+    if law:
+        yield f"{BY_PROGRAMME}: for one motion, against the trapezoidal one within the same limits"
+
+
+def _motion_text(rows):
+    yield "\nthe trajectory: what it leaves of each mode, per unit at the joint [mrad]"
+    for row in rows:
+        amplitudes = "  ".join(f"{1e3 * a:9.4f}" for a in row["amplitude_rad"])
+        yield f"  {row['kind']:16} {row['duration_s']:8.3f} s {amplitudes}"
+
+
+def of_trajectory(made, path):
+    """What a trajectory's file excites, now and with each candidate; see `effect.of_trajectory`.
+
+    Parameters
+    ----------
+    made : Study
+    path : str or Path
+
+    Raises
+    ------
+    FlexarmError
+        For a file that can't be used.
+    """
+    return effect.of_trajectory(effect.read(path), made.spreads, made.recommendation.candidates)

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""The quickest motion from rest to rest that leaves no more vibration than is wanted, within speed and acceleration.
+
+The acceleration is linear between N times, with the values a. What is left of a mode is linear in a, so that
+
+.. math:: \min_{a,\rho}\ \rho \quad\text{with}\quad |a_i| \le a_{max},\; 0 \le v_i \le v_{max},\; v(T) = 0,\;
+    s(T) = D,\; \Bigl|\int_0^T a\,e^{p(T-t)}dt\Bigr| \le \rho\,w_p\,\frac{4a_{max}}{|p|}
+
+is a linear programme for each duration T, the modulus bounded by an octagon; the shortest T with :math:`\rho \le 1` is
+found by bisection. :math:`4a_{max}/|p|` is what the trapezoidal motion within the same limits leaves where its four
+corners add up, and :math:`w_p` the residual that is wanted of the mode.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linprog
+
+from flexarm_dynamics.errors import FlexarmError
+
+#: Times per period of the fastest mode, at least so many in all, and at most.
+PER_PERIOD, FEWEST, MOST = 10, 40, 160
+#: Poles of each mode that are looked at, and steps of the bisection.
+POLES, STEPS = 12, 9
+_SIDES = 8
+
+
+@dataclass(frozen=True)
+class Move:
+    """A motion from rest to rest, and its limits.
+
+    Attributes
+    ----------
+    distance : float
+        [rad or m]
+    velocity, acceleration : float
+        Limits [1/s], [1/s^2] of the same.
+    """
+
+    distance: float
+    velocity: float
+    acceleration: float
+
+    def __post_init__(self):
+        """Refuse what is not above 0.
+
+        Raises
+        ------
+        FlexarmError
+        """
+        for name in ("distance", "velocity", "acceleration"):
+            value = getattr(self, name)
+            if not 0.0 < value < np.inf:
+                raise FlexarmError(
+                    "is out of range", field=f"move: {name}", value=value, limit="above 0"
+                )
+
+    @property
+    def duration(self):
+        """Of the trapezoidal motion, the quickest [s]."""
+        if self.velocity**2 >= self.distance * self.acceleration:
+            return 2.0 * np.sqrt(self.distance / self.acceleration)
+        return self.distance / self.velocity + self.velocity / self.acceleration
+
+
+def least_exciting_duration(move, poles, wanted, longer):
+    """Duration of the quickest motion that leaves what is wanted, and what it leaves.
+
+    Parameters
+    ----------
+    move : Move
+    poles : sequence of ndarray
+        Of each mode, over its spread [1/s].
+    wanted : sequence of float
+        Of each mode [-].
+    longer : float
+        It may last this much longer than the trapezoidal motion [s].
+
+    Returns
+    -------
+    duration : float
+        [s]
+    residuals : list of float
+        Of each mode [-].
+
+    Raises
+    ------
+    FlexarmError
+        Where there is none within the limits.
+    """
+    thin = [p[:: max(len(p) // POLES, 1)] for p in poles]
+    low, high = move.duration, move.duration + longer
+    best = solve(move, thin, wanted, high)
+    for _ in range(STEPS):
+        middle = 0.5 * (low + high)
+        made = solve(move, thin, wanted, middle)
+        if made is not None and max(made[1] / np.asarray(wanted)) <= 1.0:
+            high, best = middle, made
+        else:
+            low = middle
+    if best is None:
+        raise FlexarmError("has no least exciting time law", field="move", hint="raise its limits")
+    return high, list(best[1])
+
+
+def solve(move, poles, wanted, duration):
+    """The acceleration at equal times that leaves least, in a given time; None where limits contradict each other.
+
+    Parameters
+    ----------
+    move : Move
+    poles, wanted
+        As for `least_exciting_duration`.
+    duration : float
+        [s]
+
+    Returns
+    -------
+    acceleration : ndarray, shape (N + 1,)
+        At times from 0 to the duration [1/s^2].
+    residuals : ndarray, shape (m,)
+        Of each mode, its largest [-].
+    """
+    fastest = max(np.abs(p).max() for p in poles) / (2.0 * np.pi)
+    count = int(np.clip(np.ceil(PER_PERIOD * duration * fastest), FEWEST, MOST))
+    step = duration / count
+    time = step * np.arange(count + 1)
+    # Speed after each step and way at the end, of an acceleration that is linear in between, in units of the limit.
+    unit = move.acceleration
+    speed = step * np.tril(np.ones((count + 1, count + 1)), -1)
+    speed[1:, 0] = np.diag(speed, -1).copy() / 2.0
+    np.fill_diagonal(speed[1:, 1:], step / 2.0)
+    way = step * (duration - time)
+    kernels = [_kernel(p, time, step, duration) * np.abs(p)[:, None] / 4.0 for p in poles]
+    turns = np.exp(2j * np.pi * np.arange(_SIDES) / _SIDES) / np.cos(np.pi / _SIDES)
+    rows = np.vstack(
+        [
+            np.real(np.multiply.outer(turns, k / w)).reshape(-1, count + 1)
+            for k, w in zip(kernels, wanted, strict=True)
+        ]
+    )
+    inner = slice(1, count)
+    upper = np.vstack(
+        [np.column_stack([rows[:, inner], -np.ones(len(rows))])]
+        + [np.column_stack([sign * speed[1:, inner], np.zeros(count)]) for sign in (1.0, -1.0)]
+    )
+    bound = np.concatenate(
+        [np.zeros(len(rows)), np.full(count, move.velocity / unit), np.zeros(count)]
+    )
+    equal = np.zeros((2, count))
+    equal[0, :-1], equal[1, :-1] = speed[-1, inner], way[inner]
+    made = linprog(
+        np.append(np.zeros(count - 1), 1.0), A_ub=upper, b_ub=bound, A_eq=equal, b_eq=[0.0, move.distance / unit],
+        bounds=[(-1.0, 1.0)] * (count - 1) + [(0.0, None)],
+    )  # fmt: skip
+    if made.x is None:
+        return None
+    acceleration = np.zeros(count + 1)
+    acceleration[inner] = made.x[:-1]
+    left = np.array([np.abs(k @ acceleration).max() for k in kernels])
+    return unit * acceleration, left
+
+
+def _kernel(poles, time, step, duration):
+    """What each hat of a piecewise linear acceleration leaves of each pole, shape (k, N + 1)."""
+    half = poles * step / 2.0
+    hat = step * (np.sinh(half) / half) ** 2
+    return hat[:, None] * np.exp(np.multiply.outer(poles, duration - time))
