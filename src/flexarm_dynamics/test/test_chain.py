@@ -17,7 +17,15 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, eigh
 from scipy.optimize import brentq
 
-from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
+from flexarm_dynamics.arm.description import (
+    Arm,
+    Flexibility,
+    Friction,
+    Joint,
+    Link,
+    Payload,
+    Piece,
+)
 from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.kernels import generated
 from flexarm_dynamics.models.chain import Chain, work_space
@@ -102,13 +110,30 @@ def random_arm(seed, layout, level="first order", friction=True, gravity=True):
             for d in ("y", "z", "twist")
             if d in flexible
         }  # fmt: skip
-        links.append(Link(f"link{i + 1}", length, rho, stiffness, modes, polar))
+        pieces = varied(rng) if flexible.get("varied") else ()
+        links.append(Link(f"link{i + 1}", length, rho, stiffness, modes, polar, pieces))
     payload = Payload(rng.uniform(0.1, 0.5), body(rng, 0.05), tuple(rng.uniform(-0.1, 0.1, 3)))
     weight = tuple(rng.uniform(-9.0, 9.0, 3)) if gravity else (0.0, 0.0, 0.0)
     arm = Arm("random", tuple(joints), tuple(links), payload, gravity=weight)
     return at_level(arm, level)
 
 
+def varied(rng):
+    """Two parts of a link, each tapered, with a step between them; relative to the link's own numbers."""
+    step = rng.uniform(0.3, 0.7)
+
+    def taper():
+        return {name: tuple(rng.uniform((0.6, -0.3, -0.2), (1.4, 0.2, 0.1))) for name in PROPERTIES}
+
+    # The link's mass and polar inertia are those of the mean.
+    pieces = [Piece(0.0, step, **taper()), Piece(step, 1.0, **taper())]
+    for name in ("mass", "polar"):
+        mean = sum((p.end - p.start) * np.polyint(getattr(p, name)[::-1]).sum() for p in pieces)
+        pieces = [replace(p, **{name: tuple(np.array(getattr(p, name)) / mean)}) for p in pieces]
+    return tuple(pieces)
+
+
+PROPERTIES = ("mass", "y", "z", "twist", "polar")
 FULL = {"y": (2, "loaded"), "z": (2, "clamped_free"), "twist": (1, "loaded")}
 
 
@@ -119,12 +144,15 @@ def layouts(draw, most=5):
     links = []
     for _ in range(draw(st.integers(1, most))):
         directions = draw(st.sets(st.sampled_from(["y", "z", "twist"])))
-        links.append(
-            {
-                d: (draw(st.integers(1, 2 if d == "twist" else 3)), draw(shapes))
-                for d in sorted(directions)
-            }
-        )
+        changes = draw(st.booleans())
+        link = {
+            d: (
+                draw(st.integers(1, 2 if d == "twist" else 3)),
+                draw(shapes.filter(lambda s: s != "from_frequencies") if changes else shapes),
+            )
+            for d in sorted(directions)
+        }
+        links.append({**link, "varied": True} if changes else link)
     return links
 
 
@@ -269,10 +297,22 @@ def spin(R):
     return vee(back @ R.c[1]), vee(back @ (2.0 * R.c[2]))
 
 
-NODES, WEIGHTS = leggauss(48)
-XI, WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
-#: Gauss points between the base and each node, and between the base and the tip.
-INNER = np.append(XI, 1.0)[:, None] * XI[None, :]
+def gauss(count):
+    """Gauss's points and weights on [0, 1]."""
+    nodes, weights = leggauss(count)
+    return 0.5 * (nodes + 1.0), 0.5 * weights
+
+
+XI, WEIGHTS = gauss(48)
+
+
+def along(link, ends=1.0):
+    """Gauss's points and weights from a link's base to each of `ends`, between its breaks; (..., points)."""
+    xi, weights = gauss(28) if link.pieces else (XI, WEIGHTS)
+    breaks = np.minimum(link.breaks, np.asarray(ends)[..., None])
+    low, length = breaks[..., :-1, None], np.diff(breaks)[..., None]
+    at, w = low + length * xi, length * weights
+    return at.reshape(*at.shape[:-2], -1), w.reshape(*w.shape[:-2], -1)
 
 
 class Reference:
@@ -302,15 +342,15 @@ class Reference:
 
     def _shortening(self, i, delta, ends):
         """How far the axis has drawn back at each of `ends`."""
-        length, level = self.arm.links[i].length, level_of(self.arm)
+        link, level = self.arm.links[i], level_of(self.arm)
         if level == "first order":
             return Jet(np.zeros((3, delta.c.shape[1], ends.size)))
-        at = (ends[:, None] * XI).ravel()
-        y, z, _ = self._shape(i, delta, at, 1)
+        at, weights = along(link, ends)
+        y, z, _ = self._shape(i, delta, at.ravel(), 1)
         u = y * y + z * z
         lost = 0.5 * u if level == "foreshortening" else 1.0 - (1.0 - u).sqrt()
-        lost = Jet(lost.c.reshape(*lost.c.shape[:2], ends.size, XI.size))
-        return Jet((lost.c @ WEIGHTS) * ends * length)
+        lost = lost.c.reshape(*lost.c.shape[:2], *at.shape)
+        return Jet((lost * weights).sum(axis=-1) * link.length)
 
     def section(self, i, delta, xi):
         """Position and rotation of a section in its link's frame: jets (b, 3), (b, 3, 3)."""
@@ -324,9 +364,9 @@ class Reference:
         if level == "finite slope":
             a, b = (sy / (1.0 - sz * sz).sqrt()).arcsin(), sz.arcsin()
         if level != "first order":
-            bend = self._shape(i, delta, XI * xi, 2)[0]
-            slope = self._shape(i, delta, XI * xi, 1)[1]
-            twist = twist - Jet((bend * slope).c @ WEIGHTS * (length * xi))
+            at, weights = along(self.arm.links[i], xi)
+            bend, slope = self._shape(i, delta, at, 2)[0], self._shape(i, delta, at, 1)[1]
+            twist = twist - Jet((bend * slope).c @ weights * length)
         (sa, ca), (sb, cb), (s, c) = ((v.sin(), v.cos()) for v in (a, b, twist))
         Rz = matrix(ca, -sa, 0.0, sa, ca, 0.0, 0.0, 0.0, 1.0)
         Ry = matrix(cb, 0.0, -sb, 0.0, 1.0, 0.0, sb, 0.0, cb)
@@ -408,12 +448,14 @@ class Reference:
             inertia(joint.hub_inertia * np.outer(joint.axis, joint.axis), R)
             turns = joint.gear_ratio * q.c[..., i : i + 1]
             wheels(np.array([joint.rotor_inertia]), carrier, joint.axis, turns[1], 2 * turns[2, -1])
-            y, zz, twist = self._shape(i, delta, XI)
-            x = link.length * XI - self._shortening(i, delta, XI)
+            at, weights = along(link)
+            y, zz, twist = self._shape(i, delta, at)
+            x = link.length * at - self._shortening(i, delta, at)
             local = rows(x, y, zz)
             points = p[:, None] + local @ transposed(R)
-            masses(link.mass * WEIGHTS, points)
-            polar = link.polar_inertia_per_length * link.length * WEIGHTS
+            masses(link.mass * weights * link.factor("mass", at), points)
+            polar = link.polar_inertia_per_length * link.length * weights
+            polar = polar * link.factor("polar", at)
             wheels(polar, R, (1.0, 0.0, 0.0), twist.c[1], 2.0 * twist.c[2, -1])
         _, R, p = frames[-1]
         payload = self.arm.payload
@@ -426,9 +468,12 @@ class Reference:
         _, delta = self._motion(z, zd, 0.0 * zd)
         energy = Jet(np.zeros((3, z.size + 1)))
         for i, link in enumerate(self.arm.links):
-            stiffness = {d: link.stiffness.get(d, 0.0) for d in ("y", "z", "twist")}
-            by, bz, _ = self._shape(i, delta, XI, 2)
-            sy, sz, turn = self._shape(i, delta, XI, 1)
+            at, weights = along(link)
+            stiffness = {
+                d: link.stiffness.get(d, 0.0) * link.factor(d, at) for d in ("y", "z", "twist")
+            }
+            by, bz, _ = self._shape(i, delta, at, 2)
+            sy, sz, turn = self._shape(i, delta, at, 1)
             ky2, kz2 = by * by, bz * bz
             if level_of(self.arm) == "finite slope":
                 # Tangent by a about z, then b: curvatures b' and a' cos b, along the axis's own length.
@@ -438,7 +483,7 @@ class Reference:
                 da = (by / c.sqrt() + sy * sz * bz / (c * c.sqrt())) / (1.0 - root).sqrt()
                 ky2, kz2 = da * da * c, db * db
             density = stiffness["y"] * ky2 + stiffness["z"] * kz2 + stiffness["twist"] * turn * turn
-            energy = energy + Jet(0.5 * link.length * density.c @ WEIGHTS)
+            energy = energy + Jet(0.5 * link.length * density.c @ weights)
         return energy.c[0, -1], energy.c[1, :-1], energy.c[1, -1]
 
     def damping(self):

@@ -6,10 +6,12 @@ A file gives an `Arm` or an `ArmFileError`, never half an arm.
 
 import math
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from ..errors import ArmFileError
 from .description import (
@@ -27,10 +29,13 @@ from .description import (
     Limits,
     Link,
     Payload,
+    Piece,
     Transmission,
 )
-from .entries import Section, kind_of, read_yaml, value_error
+from .entries import MAX_NUMBER, Section, kind_of, read_yaml, value_error
 
+#: Most parts of a link with sections of their own.
+MAX_SECTIONS = 40
 #: Largest resolution of a gauge's bridge [bit].
 MAX_BITS = 32
 #: Largest play of a transmission [rad].
@@ -188,61 +193,208 @@ def _flexibility(s):
     return Flexibility(modes, shape, frequencies, damping)
 
 
+#: Keys of a link's or a part's stiffnesses, in the order of `DIRECTIONS`.
+STIFFNESS_KEYS = ("EI_y", "EI_z", "GJ")
+#: What a part of a link has from the part before it unless it states its own.
+INHERITED = ("shape", "density", "youngs_modulus", "shear_modulus")
+#: Where the properties of a tapered section are computed, from one end to the other [-].
+_TAPER = 0.5 - 0.5 * np.cos(np.pi * np.arange(9) / 8.0)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Properties of a link between two places: polynomials of t from 0 to 1, lowest power first, in SI."""
+
+    mass: tuple
+    stiffness: dict
+    polar: tuple
+
+
+def _ends(s, key, dimension, default=None, low=None):
+    """A number, or one for each end of a tapered part, as a polynomial: one or two coefficients."""
+    if isinstance(s.raw(key), list):
+        pair = s.vector(key, 2, dimension)
+        for value in pair:
+            if not value >= (1.0 / MAX_NUMBER if low is None else low):
+                limit = "greater than 0 at both ends" if low is None else f"at least {low:g}"
+                raise s.error(key, "is too small", value=list(s.raw(key)), limit=limit)
+        return (pair[0], pair[1] - pair[0]) if pair[0] != pair[1] else pair[:1]
+    return (s.number(key, dimension, default, low=low, positive=low is None),)
+
+
 def _section_properties(s):
-    """Stiffnesses and mass of a rectangular or tubular section."""
+    """Mass, stiffnesses and polar inertia of a rectangular or tubular section, which may be tapered."""
     shape = s.text("shape", choices=("rectangle", "tube"))
     density = s.number("density", "density", positive=True)
     young = s.number("youngs_modulus", "stress", positive=True)
     shear = s.number("shear_modulus", "stress", default=young / 2.6, positive=True)
-    if shape == "rectangle":
-        b = s.number("size_y", "length", positive=True)
-        h = s.number("size_z", "length", positive=True)
-        area, inertia_y, inertia_z = b * h, h * b**3 / 12.0, b * h**3 / 12.0
-        wide, thin = max(b, h), min(b, h)
-        # Roark, torsion constant of a rectangle, within 0.5 %.
-        ratio = thin / wide
-        torsion = wide * thin**3 * (1.0 / 3.0 - 0.21 * ratio * (1.0 - ratio**4 / 12.0))
-    else:
-        outer = s.number("outer_diameter", "length", positive=True)
-        wall = s.number("wall", "length", positive=True)
-        if 2.0 * wall > outer:
-            problem = "m is more than the radius"
-            raise s.error("wall", problem, value=wall, limit=f"{outer / 2} m")
-        inner = outer - 2.0 * wall
-        area = math.pi * (outer**2 - inner**2) / 4.0
-        inertia_y = inertia_z = math.pi * (outer**4 - inner**4) / 64.0
-        torsion = 2.0 * inertia_y
+    of_sizes = _rectangle if shape == "rectangle" else _tube
+    keys = ("size_y", "size_z") if shape == "rectangle" else ("outer_diameter", "wall")
+    sizes = [_ends(s, key, "length") for key in keys]
+    if shape == "tube":
+        for end in (0.0, 1.0):
+            diameter, wall = (float(_along(size)(end)) for size in sizes)
+            if 2.0 * wall > diameter:
+                problem = "m is more than the radius"
+                raise s.error("wall", problem, value=wall, limit=f"{diameter / 2} m")
     s.done()
-    stiffness = {"y": young * inertia_y, "z": young * inertia_z, "twist": shear * torsion}
-    return density * area, stiffness, density * (inertia_y + inertia_z)
+    if all(len(size) == 1 for size in sizes):
+        area, inertia_y, inertia_z, torsion = ((v,) for v in of_sizes(*(v[0] for v in sizes)))
+    else:
+        at = of_sizes(*(_along(size)(_TAPER) for size in sizes))
+        # Products of sizes are polynomials of degree four at most; the torsion constant is not.
+        area, inertia_y, inertia_z = (tuple(polynomial.polyfit(_TAPER, v, 4)) for v in at[:3])
+        torsion = tuple(polynomial.polyfit(_TAPER, at[3], 8))
+
+    def times(factor, values):
+        return tuple(float(factor * v) for v in values)
+
+    stiffness = {"y": times(young, inertia_y), "z": times(young, inertia_z)}
+    polar = [a + b for a, b in zip(inertia_y, inertia_z, strict=True)]
+    return _Part(
+        times(density, area),
+        stiffness | {"twist": times(shear, torsion)},
+        times(density, polar),
+    )
+
+
+def _along(coefficients):
+    return lambda t: polynomial.polyval(t, coefficients)
+
+
+def _rectangle(b, h):
+    """Area, second moments and torsion constant of a rectangle of sizes b along y, h along z."""
+    wide, thin = np.maximum(b, h), np.minimum(b, h)
+    # Roark, torsion constant of a rectangle, within 0.5 %.
+    ratio = thin / wide
+    torsion = wide * thin**3 * (1.0 / 3.0 - 0.21 * ratio * (1.0 - ratio**4 / 12.0))
+    return b * h, h * b**3 / 12.0, b * h**3 / 12.0, torsion
+
+
+def _tube(outer, wall):
+    """The same of a tube."""
+    inner = outer - 2.0 * wall
+    area = math.pi * (outer**2 - inner**2) / 4.0
+    second = math.pi * (outer**4 - inner**4) / 64.0
+    return area, second, second, 2.0 * second
+
+
+def _numbers(s, taper):
+    """Properties given as numbers; with `taper` they may differ from end to end."""
+
+    def read(key, dimension, default=None, low=None):
+        if taper:
+            return _ends(s, key, dimension, default, low)
+        return (s.number(key, dimension, default, low=low, positive=low is None),)
+
+    return _Part(
+        read("mass_per_length", "mass_per_length"),
+        {
+            direction: read(key, "stiffness")
+            for direction, key in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True)
+            if s.has(key)
+        },
+        read("polar_inertia_per_length", "mass", 0.0, low=0.0),
+    )
+
+
+def _parts(s, length):
+    """The parts of a link of this length: (end [m], `_Part`) from base to tip."""
+    if s.has("section") and s.has("sections"):
+        raise s.error("sections", "beside a section", hint="give one of them")
+    for key in (*STIFFNESS_KEYS, "mass_per_length", "polar_inertia_per_length"):
+        if (s.has("section") or s.has("sections")) and s.has(key):
+            hint = "give either a section or the stiffnesses"
+            raise s.error(key, "beside a section", hint=hint)
+    if s.has("section"):
+        return [(length, _section_properties(s.section("section")))]
+    if not s.has("sections"):
+        return [(length, _numbers(s, taper=False))]
+    given = s.sections("sections")
+    if not 1 <= len(given) <= MAX_SECTIONS:
+        raise s.error("sections", "is out of range", value=len(given), limit=f"1 to {MAX_SECTIONS}")
+    parts, before, material = [], 0.0, {}
+    for part in given:
+        last = part is given[-1]
+        end = part.number("to", "length", default=length if last else None, positive=True)
+        if last and abs(end - length) <= 1e-9 * length:
+            end = length
+        if not (before < end <= length) or (last and end != length):
+            limit = (
+                f"{length:.6g} m, the link's length" if last else f"{before:.6g} to {length:.6g} m"
+            )
+            hint = "parts go from base to tip; the last one ends at the tip"
+            raise part.error("to", "m is out of place", value=end, limit=limit, hint=hint)
+        part.data = {**material, **part.data}
+        if {"shape", "outer_diameter", "size_y"} & set(part.data):
+            parts.append((end, _section_properties(part)))
+        else:
+            parts.append((end, _numbers(part, taper=True)))
+            part.done()
+        if set(parts[-1][1].stiffness) != set(parts[0][1].stiffness):
+            wanted = ", ".join(
+                k
+                for d, k in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True)
+                if d in parts[0][1].stiffness
+            )
+            raise ArmFileError(
+                part.path, "has other stiffnesses than the first part", limit=wanted or "none"
+            )
+        before, material = end, {k: v for k, v in part.data.items() if k in INHERITED}
+    return parts
+
+
+def _pieces(parts, length):
+    """Reference numbers of a link, and its `Piece`s: none of a uniform link."""
+    first = parts[0][1]
+    stiffness = {d: c[0] for d, c in first.stiffness.items()}
+    if len(parts) == 1 and all(
+        len(c) == 1 for c in (first.mass, first.polar, *first.stiffness.values())
+    ):
+        return first.mass[0], stiffness, first.polar[0], ()
+    ends = [0.0, *(end / length for end, _ in parts)]
+    steps = np.diff(ends)
+
+    def mean(name):
+        values = (getattr(part, name) for _, part in parts)
+        return float(sum(h * sum(c / (k + 1.0) for k, c in enumerate(v))
+                         for h, v in zip(steps, values, strict=True)))  # fmt: skip
+
+    mass, polar = mean("mass"), mean("polar")
+
+    def relative(values, unit):
+        return tuple(float(v / unit) for v in values) if unit > 0.0 else (1.0,)
+
+    pieces = tuple(
+        Piece(
+            ends[k],
+            ends[k + 1],
+            mass=relative(part.mass, mass),
+            polar=relative(part.polar, polar),
+            **{d: relative(c, stiffness[d]) for d, c in part.stiffness.items()},
+        )
+        for k, (_, part) in enumerate(parts)
+    )
+    return mass, stiffness, polar, pieces
 
 
 def _link(s):
     name = s.name()
     length = s.number("length", "length", positive=True)
-    if s.has("section"):
-        for key in ("EI_y", "EI_z", "GJ", "mass_per_length"):
-            if s.has(key):
-                hint = "give either a section or the stiffnesses"
-                raise s.error(key, "beside a section", hint=hint)
-        per_length, stiffness, polar = _section_properties(s.section("section"))
-    else:
-        per_length = s.number("mass_per_length", "mass_per_length", positive=True)
-        polar = s.number("polar_inertia_per_length", "mass", 0.0, low=0.0)
-        stiffness = {
-            direction: s.number(key, "stiffness", positive=True)
-            for direction, key in zip(DIRECTIONS, ("EI_y", "EI_z", "GJ"), strict=True)
-            if s.has(key)
-        }
+    per_length, stiffness, polar, pieces = _pieces(_parts(s, length), length)
     flexible = {}
     if s.has("flexible"):
         f = s.section("flexible")
-        for direction, key in zip(DIRECTIONS, ("EI_y", "EI_z", "GJ"), strict=True):
+        for direction, key in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True):
             if f.has(direction):
                 flexible[direction] = _flexibility(f.section(direction))
                 if direction not in stiffness:
                     hint = f"the link is flexible in {direction}"
                     raise s.error(key, "missing", hint=hint)
+                if pieces and flexible[direction].shape == "from_frequencies":
+                    problem, hint = "is for uniform links", "take loaded, and fit the stiffness"
+                    at = f.section(direction)
+                    raise at.error("shape", problem, value="from_frequencies", hint=hint)
         f.done()
     if "twist" in flexible and not polar > 0.0:
         raise s.error(
@@ -251,7 +403,7 @@ def _link(s):
             hint="a link that twists needs the polar inertia of its sections (rho I_p), or a section",
         )
     s.done()
-    return Link(name, length, per_length, stiffness, flexible, polar)
+    return Link(name, length, per_length, stiffness, flexible, polar, pieces)
 
 
 def _tensor(s, key):
@@ -293,6 +445,7 @@ def _gauge(s, links):
     )
     s.done()
     _check_gauge(s, gauge, links[link].length)
+    _check_jump(s, gauge, links[link])
     return gauge
 
 
@@ -312,6 +465,22 @@ def _check_gauge(s, gauge, length):
     ):  # fmt: skip
         if not fits:
             raise s.error(key, problem, value=getattr(gauge, key), limit=limit, hint=hint)
+
+
+def _check_jump(s, gauge, link):
+    """Refuse a gauge where its link's section jumps: strain has two values there."""
+    for piece, after in pairwise(link.pieces):
+        place = piece.end * link.length
+        before = float(sum(getattr(piece, gauge.direction)))
+        jumps = abs(before - getattr(after, gauge.direction)[0]) > 1e-9 * before
+        if jumps and abs(gauge.position - place) <= 1e-6 * link.length:
+            hint = "strain jumps with the section; move the gauge to one side"
+            raise s.error(
+                "position",
+                f"m is where the section of {link.name} jumps",
+                value=gauge.position,
+                hint=hint,
+            )
 
 
 def _unique(things, path):

@@ -7,15 +7,17 @@ joint's frame; it bends along y and z and twists about x.
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from ..errors import ModelError
 
 DIRECTIONS = ("y", "z", "twist")
 ENCODERS = ("motor", "link")
 SAFE_ACTIONS = ("brake", "damp", "zero")
-#: At most this many modes per direction: beyond, a uniform beam is no longer the model to use.
+#: At most this many modes per direction: beyond, a slender beam is no longer the model to use.
 MAX_MODES = 20
 SHAPES = ("clamped_free", "loaded", "from_frequencies")
 
@@ -132,20 +134,108 @@ class Flexibility:
 
 
 @dataclass(frozen=True)
+class Piece:
+    r"""A part of a link over which its section changes gradually, or not at all.
+
+    Each property is a polynomial in :math:`t = (\xi - start)/(end - start)`, lowest power first, in units of the
+    link's own number: its mass per length, stiffnesses and polar inertia per length.
+    """
+
+    start: float  # [-] xi at its end towards the base
+    end: float  # [-]
+    mass: tuple = (1.0,)
+    y: tuple = (1.0,)
+    z: tuple = (1.0,)
+    twist: tuple = (1.0,)
+    polar: tuple = (1.0,)
+
+
+@dataclass(frozen=True)
 class Link:
-    """A uniform link along x; rigid where `flexible` says nothing."""
+    """A link along x; rigid where `flexible` says nothing, uniform where it has no `pieces`."""
 
     name: str
     length: float  # [m]
-    mass_per_length: float  # [kg/m]
-    stiffness: dict = field(default_factory=dict)  # direction -> EI [N m^2], twist: GJ [N m^2]
+    mass_per_length: float  # [kg/m]; with pieces: the mean
+    # direction -> EI [N m^2], twist: GJ [N m^2]; with pieces: at the base
+    stiffness: dict = field(default_factory=dict)
     flexible: dict = field(default_factory=dict)  # direction -> Flexibility
-    polar_inertia_per_length: float = 0.0  # [kg m] rho I_p, for twist
+    polar_inertia_per_length: float = 0.0  # [kg m] rho I_p, for twist; with pieces: the mean
+    pieces: tuple = ()  # Piece, from base to tip, without gaps
 
     @property
     def mass(self):
         """Mass of the beam [kg]."""
         return self.mass_per_length * self.length
+
+    @property
+    def breaks(self):
+        """Places where the section, or its first derivative, jumps, with both ends: from 0 to 1 [-]."""
+        return (0.0, *(piece.end for piece in self.pieces[:-1]), 1.0)
+
+    def factor(self, name, xi):
+        """A property along the link, in units of the link's own number; where it jumps, the value towards the base.
+
+        Parameters
+        ----------
+        name : str
+            ``mass``, ``y``, ``z``, ``twist`` or ``polar``, as in `Piece`.
+        xi : ndarray
+            Places [-].
+
+        Returns
+        -------
+        ndarray, of the shape of xi
+        """
+        xi = np.asarray(xi, float)
+        if not self.pieces:
+            return np.ones_like(xi)
+        span = np.clip(np.searchsorted(self.breaks, xi) - 1, 0, len(self.pieces) - 1)
+        out = np.empty_like(xi)
+        for k, piece in enumerate(self.pieces):
+            here = span == k
+            t = (xi[here] - piece.start) / (piece.end - piece.start)
+            out[here] = polynomial.polyval(t, getattr(piece, name))
+        return out
+
+    def rigidity(self, direction, position):
+        """EI (twist: GJ) at a place [N m^2].
+
+        Parameters
+        ----------
+        direction : str
+        position : float
+            From the link's base [m].
+        """
+        return self.stiffness[direction] * float(self.factor(direction, position / self.length))
+
+    def moments(self, low=0.0, high=None):
+        """Integrals over the mass of the straight link, or of its part between two places.
+
+        Parameters
+        ----------
+        low, high : float
+            From the link's base; without `high` to its tip [m].
+
+        Returns
+        -------
+        mass, first, second, polar : float
+            Mass [kg], integrals of x [kg m] and x^2 [kg m^2] from the link's base, inertia about x [kg m^2].
+        """
+        high = self.length if high is None else high
+        if not self.pieces:
+            powers = ((high**k - low**k) / k for k in (1, 2, 3))
+            mass, first, second = (self.mass_per_length * p for p in powers)
+            return mass, first, second, self.polar_inertia_per_length * (high - low)
+        sums = np.zeros(4)
+        points, weights = np.polynomial.legendre.leggauss(8)  # exact: polynomials
+        for a, b in pairwise(np.clip(np.array(self.breaks) * self.length, low, high)):
+            x = a + 0.5 * (b - a) * (points + 1.0)
+            w = 0.5 * (b - a) * weights
+            m = w * self.mass_per_length * self.factor("mass", x / self.length)
+            polar = w * self.polar_inertia_per_length * self.factor("polar", x / self.length)
+            sums += [m.sum(), m @ x, m @ x**2, polar.sum()]
+        return tuple(sums.tolist())
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ class _Writer:
                 self._inertial(body, 0.0, _about(joint))
             self._pieces(link, junctions, tip)
         else:
-            self._beam(body, link, link.length, _about(joint))
+            self._beam(body, link, 0.0, link.length, _about(joint))
             self._fixed(f"{tip}_joint", link.name, tip, (link.length, 0.0, 0.0))
         after = self.arm.joints[i + 1 : i + 2]
         end = self._link(tip)
@@ -215,18 +215,19 @@ class _Writer:
                     self._link(child)
                 parent, step = child, 0.0
             if k < self.chain.pieces:
-                self._beam(self._link(parent), link, length)
+                self._beam(self._link(parent), link, k * length, length)
             step = length
 
-    def _beam(self, body, link, length, more=0.0):
-        """A rigid piece of a link from its frame's origin along x; `more` inertia (3, 3) at the origin [kg m^2]."""
-        mass = link.mass_per_length * length
-        across = mass * length**2 / 12.0
+    def _beam(self, body, link, start, length, more=0.0):
+        """A rigid piece of a link from `start` on, along x [m]; `more` inertia (3, 3) at its origin [kg m^2]."""
+        mass, first, second, polar = link.moments(start, start + length)
+        centre = first / mass
+        across = second - mass * centre**2
         # Sections have no inertia of their own in the model but for twist: a rod as it is drawn.
-        along = link.polar_inertia_per_length * length or 0.5 * mass * self.radius**2
-        middle = (0.5 * length, 0.0, 0.0)
-        self._inertial(body, mass, np.diag([along, across, across]) + more, middle)
-        self._visual(body, length, self.radius, (1.0, 0.0, 0.0), middle, "beam")
+        along = polar or 0.5 * mass * self.radius**2
+        inertia = np.diag([along, across, across]) + more
+        self._inertial(body, mass, inertia, (centre - start, 0.0, 0.0))
+        self._visual(body, length, self.radius, (1.0, 0.0, 0.0), (0.5 * length, 0.0, 0.0), "beam")
 
     def _payload(self, parent):
         payload = self.arm.payload

@@ -2,13 +2,15 @@
 """From an arm to the constants of `kernels.chain`: mode shapes, loads, modal integrals, work space."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from ..arm.description import DIRECTIONS
+from ..errors import ModelError
 from ..kernels import chain as kernel
-from . import beam
+from . import beam, varied_beam
 from .model import damping_matrix, rotation
 
 _KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST}
@@ -124,14 +126,12 @@ def _payload(arm):
 
 def _straight(link, joint):
     """A link's undeformed self with its hub and the motor at its base, in its base frame."""
-    L, rho = link.length, link.mass_per_length
     a = np.asarray(joint.axis)
-    second = rho * L**3 / 3.0
-    inertia = np.diag([link.polar_inertia_per_length * L, second, second])
+    mass, first, second, polar = link.moments()
     return Load(
-        joint.motor_mass + rho * L,
-        np.array([rho * L**2 / 2.0, 0.0, 0.0]),
-        inertia + joint.hub_inertia * np.outer(a, a),
+        joint.motor_mass + mass,
+        np.array([first, 0.0, 0.0]),
+        np.diag([polar, second, second]) + joint.hub_inertia * np.outer(a, a),
     )
 
 
@@ -157,6 +157,8 @@ def shapes_of(link, direction, flexibility, load):
     `flexibility` is the arm file's for that direction: kind of shape and number of modes.
     """
     L, rho, modes = link.length, link.mass_per_length, flexibility.modes
+    if link.pieces:
+        return _varied_shapes(link, direction, flexibility, load)
     if direction == "twist":
         polar, GJ = link.polar_inertia_per_length, link.stiffness["twist"]
         if flexibility.shape == "from_frequencies":
@@ -173,6 +175,38 @@ def shapes_of(link, direction, flexibility, load):
     return beam.loaded(modes, L, rho, mass, inertia - mass * offset**2, offset)
 
 
+def _varied_shapes(link, direction, flexibility, load):
+    """As `shapes_of`, of a link whose section changes along it."""
+    if flexibility.shape == "from_frequencies":
+        raise ModelError(
+            "are for uniform links",
+            field=f"shapes from_frequencies of {link.name}",
+            hint="take shape loaded, and adjust the section's stiffness to the frequencies",
+        )
+    twist, bodies = direction == "twist", []
+    if flexibility.shape == "loaded":
+        bodies = [_tip_body(link, direction, load)]
+    problem = varied_beam.BeamProblem(
+        link.breaks,
+        lambda xi: link.factor(direction, xi),
+        lambda xi: link.factor("polar" if twist else "mass", xi),
+        bodies,
+        twist,
+    )
+    return problem.shapes(flexibility.modes)
+
+
+def _tip_body(link, direction, load):
+    """A load of a link's tip as its beam problem has it."""
+    L = link.length
+    if direction == "twist":
+        own = link.polar_inertia_per_length * L
+        return varied_beam.Body(1.0, 0.0, 0.0, load.inertia[0, 0] / own)
+    mass, inertia, offset = _bending_load(load, direction)
+    m = link.mass
+    return varied_beam.Body(1.0, mass / m, mass * offset / (m * L), inertia / (m * L**2))
+
+
 def _bending_load(load, direction):
     """Mass, inertia about the tip, and distance along x of a load's centre of mass."""
     axis = 2 if direction == "y" else 1
@@ -186,17 +220,63 @@ def _clamped_mass(link, direction, shapes, load):
     """Modal mass of a link with its base held and its load at its tip: what modal damping refers to."""
     if direction == "twist":
         tip = shapes(1.0)
-        return link.polar_inertia_per_length * link.length * shapes.gram() + load.inertia[
-            0, 0
-        ] * np.outer(tip, tip)
+        own = link.polar_inertia_per_length * link.length
+        return own * shapes.gram(weight=_along(link, "polar")) + load.inertia[0, 0] * np.outer(
+            tip, tip
+        )
     mass, inertia, offset = _bending_load(load, direction)
     tip, slope = shapes(1.0), shapes(1.0, 1) / link.length
     centre = tip + offset * slope
     return (
-        link.mass * shapes.gram()
+        link.mass * shapes.gram(weight=_along(link, "mass"))
         + mass * np.outer(centre, centre)
         + (inertia - mass * offset**2) * np.outer(slope, slope)
     )
+
+
+def _along(link, name):
+    """A property of a link as a weight of integrals along it."""
+    return lambda xi: link.factor(name, xi)
+
+
+def node_count(link, modes, level):
+    """Quadrature nodes in each span of a link between its breaks, for so many modes in a direction."""
+    # Slopes squared are integrated to some 1e-12, roots of them to 1e-9 up to slopes of 0.6.
+    extra = 6 if level == kernel.FORESHORTENING else 12
+    widest = np.diff(link.breaks).max()
+    return int(np.ceil(3 * modes * min(1.0, 1.5 * widest))) + extra
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Quadrature over a link, or its part up to a section, between its breaks.
+
+    Attributes
+    ----------
+    xi, weights : ndarray, shape (G,)
+        Gauss's points and weights in units of the length; points beyond the last span are at 0 and weigh nothing.
+    cumulate : ndarray, shape (G, G + 1)
+        Weights of the integrals from the base to each node and, last, to the end.
+    """
+
+    xi: np.ndarray
+    weights: np.ndarray
+    cumulate: np.ndarray
+
+
+def nodes_of(link, count, size, end=1.0):
+    """The `Nodes` of a link up to `end` [-], with `count` nodes a span, in arrays of `size`."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    points, weights = 0.5 * (points + 1.0), 0.5 * weights
+    integrate = cumulative(points, points).T
+    xi, w, cumulate = np.zeros(size), np.zeros(size), np.zeros((size, size + 1))
+    breaks = np.minimum(link.breaks, end)
+    for k, (low, high) in enumerate(pairwise(breaks)):
+        own, beyond = slice(k * count, (k + 1) * count), slice((k + 1) * count, None)
+        xi[own], w[own] = low + (high - low) * points, (high - low) * weights
+        cumulate[own, own] = (high - low) * integrate
+        cumulate[own, beyond] = w[own, None]
+    return Nodes(xi, w, cumulate)
 
 
 def bishop_integrals(data, index, weights):
@@ -217,13 +297,10 @@ def assemble(arm, shapes, loads):
     if arm.finite_slope:
         level = kernel.FINITE_SLOPE
     most = max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
-    G = 1
+    counts = [1] * N
     if level != kernel.FIRST_ORDER and most:
-        # Slopes squared are integrated to some 1e-12, roots of them to 1e-9 up to slopes of 0.6.
-        G = 3 * most + (6 if level == kernel.FORESHORTENING else 12)
-    points, weights = np.polynomial.legendre.leggauss(G)
-    points, weights = 0.5 * (points + 1.0), 0.5 * weights
-    integrate = cumulative(points, np.append(points, 1.0))
+        counts = [node_count(link, most, level) for link in arm.links]
+    G = max(c * (len(link.breaks) - 1) for c, link in zip(counts, arm.links, strict=True))
     z = np.zeros
     a = {
         "links": N,
@@ -252,15 +329,18 @@ def assemble(arm, shapes, loads):
     # An axis (0, 0, 1) of integers is another type, and would be another compilation.
     a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
-        L, rho = link.length, link.mass_per_length
+        L = link.length
         body = _straight(link, joint)
         a["mass"][i], a["moment"][i], a["inertia"][i] = body.mass, body.moment[0], body.inertia
-        a["node_x"][i], a["node_mass"][i] = L * points, L * rho * weights
-        a["cumulate"][i] = L * integrate.T
+        nodes = nodes_of(link, counts[i], G)
+        a["node_x"][i] = L * nodes.xi
+        a["node_mass"][i] = link.mass * nodes.weights * link.factor("mass", nodes.xi)
+        a["cumulate"][i] = L * nodes.cumulate
         for c, direction in enumerate(("y", "z")):
-            a["node_ei"][i, :, c] = L * weights * link.stiffness.get(direction, 0.0)
+            EI = link.stiffness.get(direction, 0.0) * link.factor(direction, nodes.xi)
+            a["node_ei"][i, :, c] = L * nodes.weights * EI
         for j, (shape, number, direction) in enumerate(modes[i]):
-            _fill_mode(a, i, j, link, shape, number, direction, points)
+            _fill_mode(a, i, j, link, shape, number, direction, nodes.xi)
         for j, (shape, number, direction) in enumerate(modes[i]):
             for k, (other, second, across) in enumerate(modes[i]):
                 a["gram"][i, j, k] = _gram(link, shape, number, direction, other, second, across)
@@ -272,7 +352,8 @@ def assemble(arm, shapes, loads):
             block = (i, slice(start, start + shape.count), slice(start, start + shape.count))
             start += shape.count
             power = 1 if direction == "twist" else 2
-            stiff = link.stiffness[direction] / L ** (2 * power - 1) * shape.gram(power)
+            gram = shape.gram(power, _along(link, direction))
+            stiff = link.stiffness[direction] / L ** (2 * power - 1) * gram
             a["stiffness"][block] = stiff
             a["damping"][block] = damping_matrix(
                 _clamped_mass(link, direction, shape, loads[i]),
@@ -315,11 +396,12 @@ def _fill_mode(a, i, j, link, shape, number, direction, points):
     L, rho = link.length, link.mass_per_length
     a["direction"][i, j] = _KIND[direction]
     if direction == "twist":
-        a["s"][i, j] = link.polar_inertia_per_length * L * shape.integral()[number]
+        own = link.polar_inertia_per_length * L
+        a["s"][i, j] = own * shape.integral(_along(link, "polar"))[number]
         a["slope"][i, j] = shape(1.0)[number]
         return
-    a["s"][i, j] = rho * L * shape.integral()[number]
-    a["e"][i, j] = rho * L**2 * shape.integral(lambda xi: xi)[number]
+    a["s"][i, j] = rho * L * shape.integral(_along(link, "mass"))[number]
+    a["e"][i, j] = rho * L**2 * shape.integral(lambda xi: xi * link.factor("mass", xi))[number]
     a["tip"][i, j] = shape(1.0)[number]
     a["slope"][i, j] = shape(1.0, 1)[number] / L
     a["node_phi"][i, :, j] = shape(points)[:, number]
@@ -332,7 +414,9 @@ def _gram(link, shape, number, direction, other, second, across):
     if (direction == "twist") != (across == "twist"):
         return 0.0
     if direction == "twist":
-        return link.polar_inertia_per_length * link.length * shape.gram()[number, second]
+        own = link.polar_inertia_per_length * link.length
+        return own * shape.gram(weight=_along(link, "polar"))[number, second]
+    weight = _along(link, "mass")
     if direction == across:
-        return link.mass * shape.gram()[number, second]
-    return link.mass * beam.overlap(shape, other)[number, second]
+        return link.mass * shape.gram(weight=weight)[number, second]
+    return link.mass * beam.overlap(shape, other, weight)[number, second]

@@ -288,10 +288,10 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     return _shapes(roots, c, d)
 
 
-def overlap(one, other):
-    r""":math:`\int_0^1\phi_i\psi_j\,d\xi` of two families of shapes, shape (m, k)."""
-    xi, w = one._quadrature() if one.beta.max() > other.beta.max() else other._quadrature()
-    return one(xi).T @ (w[:, None] * other(xi))
+def overlap(one, other, weight=lambda xi: np.ones_like(xi)):
+    r""":math:`\int_0^1 w(\xi)\phi_i\psi_j\,d\xi` of two families of shapes, shape (m, k)."""
+    xi, w = max((one._quadrature(), other._quadrature()), key=lambda q: q[0].size)
+    return one(xi).T @ ((w * weight(xi))[:, None] * other(xi))
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from .assembly import (
     assemble,
     bishop_integrals,
     modes_of,
+    nodes_of,
     outboard,
     packed,
     roomy,
@@ -496,12 +497,15 @@ class Chain(ArmModel):
         link, d = self.arm.links[index], data
         node_slope, node_bend = d.node_slope.copy(), d.node_bend.copy()
         cumulate, bishop = d.cumulate.copy(), d.bishop.copy()
-        points = xi * d.node_x[index] / link.length
-        for j, (shapes, number, direction) in enumerate(modes_of(link, self._shapes)):
+        modes = modes_of(link, self._shapes)
+        if not modes:
+            return d
+        nodes = nodes_of(link, d.nodes // (len(link.breaks) - 1), d.nodes, xi)
+        for j, (shapes, number, direction) in enumerate(modes):
             if direction != "twist":
-                node_slope[index, :, j] = shapes(points, 1)[:, number] / link.length
-                node_bend[index, :, j] = shapes(points, 2)[:, number] / link.length**2
-        cumulate[index, :, -1] *= xi
+                node_slope[index, :, j] = shapes(nodes.xi, 1)[:, number] / link.length
+                node_bend[index, :, j] = shapes(nodes.xi, 2)[:, number] / link.length**2
+        cumulate[index] = link.length * nodes.cumulate
         data = d._replace(node_slope=node_slope, node_bend=node_bend, cumulate=cumulate)
         bishop[index] = bishop_integrals(data, index, cumulate[index, :, -1])
         return data._replace(bishop=bishop)

@@ -129,6 +129,17 @@ def describe(arm_model, q):
             "length": link.length,
             "mass": link.mass,
             "stiffness": link.stiffness,
+            "sections": [
+                {
+                    "to": b * link.length,
+                    "mass_per_length": [link.mass_per_length * v for v in ends(piece.mass)],
+                    "stiffness": {
+                        d: [EI * v for v in ends(getattr(piece, d))]
+                        for d, EI in link.stiffness.items()
+                    },
+                }
+                for piece, b in zip(link.pieces, link.breaks[1:], strict=False)
+            ],
             "flexible": {
                 d: {"modes": f.modes, "shape": f.shape, "damping": list(f.damping)}
                 for d, f in link.flexible.items()
@@ -168,6 +179,11 @@ def describe(arm_model, q):
     }
     result |= {"sag": None, "strain_map_condition": None}
     return result | {"warnings": warnings(arm_model, q, result)}
+
+
+def ends(coefficients):
+    """Values of a polynomial at 0 and 1."""
+    return float(coefficients[0]), float(sum(coefficients))
 
 
 def warnings(arm_model, q, result):
@@ -252,6 +268,15 @@ def text(d):
             for k, v in link["flexible"].items()
         )
         yield f"{link['name']:18}{link['length']:10.4g}{link['mass']:10.4g}  {flexible or 'rigid'}"
+        for part in link["sections"]:
+            values = {"kg/m": part["mass_per_length"]}
+            values |= {
+                f"N m^2 ({'GJ' if d == 'twist' else f'EI {d}'})": v
+                for d, v in part["stiffness"].items()
+                if d in link["flexible"]
+            }
+            spans = (f"{a:.4g} to {b:.4g} {unit}" for unit, (a, b) in values.items())
+            yield f"{'':18}to {part['to']:.4g} m: {', '.join(spans)}"
     p = d["payload"]
     yield f"payload {p['mass']:.4g} kg, centre of mass {p['offset']} m from the tip"
     yield ""

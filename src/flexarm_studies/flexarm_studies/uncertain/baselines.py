@@ -416,7 +416,12 @@ def moment_rows(arm_model):
             part, sign = ABOUT[gauge.direction]
             sign = sign * joint.axis[part] * (1.0 if gauge.direction == "twist" else -1.0)
             strain = gauge_rows(arm_model, [gauge])[0]
-            row[:] = sign * link.stiffness[gauge.direction] / gauge.surface_distance * strain
+            row[:] = (
+                sign
+                * link.rigidity(gauge.direction, gauge.position)
+                / gauge.surface_distance
+                * strain
+            )
     return rows
 
 
