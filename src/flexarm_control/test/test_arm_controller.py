@@ -478,6 +478,25 @@ def test_a_moving_arm_is_taken_over_as_it_moves_and_brought_to_rest(arm_r):
     assert np.abs(torques[:21]).max() <= 0.1 * FILE_LIMIT
 
 
+@pytest.mark.parametrize("moves, state", [(False, State.READY), (True, State.STOPPING)])
+@pytest.mark.parametrize("waited", [200, 4])
+def test_an_arm_whose_positions_rest_is_taken_over_at_rest_whatever_its_estimated_velocity(
+    arm_r, moves, state, waited
+):
+    """An estimate that has just converged is off by its noise; a stop from that speed would move the arm."""
+    core, begins = controller(arm_r), max(waited, 11)
+
+    def place(k):
+        # At last with 0.1 rad/s.
+        return 1e-4 * max(k - begins + 15, 0) if moves else 5e-5 * (k % 2)
+
+    for k in range(begins):
+        rate = None if k < waited else [0.0, 0.0]
+        assert core.step(sample(k, place(k), rate=rate, velocity=[0.1])) is (k == 10 == begins - 1)
+    core.step(sample(begins, place(begins), velocity=[0.1]))
+    assert core.state == state and core.enabled
+
+
 def test_at_a_low_rate_a_period_is_no_gap(arm_r):
     core = started(arm_r)
     for k in range(1, 10):

@@ -22,6 +22,8 @@ FAST_RAMP = 0.1
 
 #: A source that restarts during operation must find each joint within this of where it was [rad], and at rest [rad/s].
 SAME_PLACE, AT_REST = 0.01, 0.05
+#: Before its first torque an arm that has hardly moved in so long rests, whatever its estimated velocity [s].
+SEEN = 0.01
 #: So many periods without a state are no interruption, however long.
 PERIODS_OF_GAP = 5.0
 #: A doubt that its source does not explain.
@@ -111,6 +113,7 @@ class ArmController:
         self.enabled, self.saturated, self.fast_enabled = False, False, True
         self._trajectory_reason, self.judged = "", ("", "")
         self._waiting = False  # joints known, deflections not yet
+        self._seen = []  # stamp and positions of one or two samples meanwhile
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
         self._last_ns, self._period = 0, 0.0  # [ns], [s]
@@ -377,8 +380,8 @@ class ArmController:
         self._doubt = sample.doubt or UNSTATED if sample.trust == ArmSample.STOP else ""
         law = self.answered_by = self.law
         law.limit = self.torque_limit
-        if sample.amplitude is None or (sample.rate is None and law.needs_rates):
-            self._wait(sample, verdict)
+        if reason := self._lacks(sample, verdict):
+            self._wait(sample, verdict, reason)
             return False
         dt = 1e-9 * (sample.stamp_ns - self._last_ns)
         if verdict == SampleOrder.RESTART or not self.supervisor.running:
@@ -553,11 +556,20 @@ class ArmController:
             hint = "synchronise the clocks, or set synchronised_clocks to false"
             raise _refused_stamp(abs(age), f"s {when} is beyond max_age", self._max_age, hint)
 
-    def _wait(self, sample, verdict):
-        """No torque without deflections; the joints are known, so that trajectories may be offered."""
+    def _lacks(self, sample, verdict):
+        """What is not known yet that torque needs; empty if all is."""
+        if sample.amplitude is None:
+            return "modal_amplitude is not known yet"
+        if sample.rate is None and self.law.needs_rates:
+            return "modal_rate is not known yet"
+        # An observer that has just begun: whether its first velocity is noise shows in the positions.
+        if self._waiting and verdict != SampleOrder.RESTART and _moves(sample):
+            return "whether the arm moves is not known yet" if self._seen_for(sample) < SEEN else ""
+        return ""
+
+    def _wait(self, sample, verdict, reason):
+        """No torque, for a `reason`; the joints are known, so that trajectories may be offered."""
         waiting = self._waiting and verdict != SampleOrder.RESTART
-        what = "modal_amplitude" if sample.amplitude is None else "modal_rate"
-        reason = f"{what} is not known yet"
         if verdict == SampleOrder.RESTART:
             self.disable(reason)
         else:
@@ -567,6 +579,9 @@ class ArmController:
         self._waiting = True
         if not waiting:
             self.reference.start(sample.position, sample.stamp_ns)
+            self._seen = [(sample.stamp_ns, sample.position.copy())]
+        elif 1e-9 * (sample.stamp_ns - self._seen[-1][0]) >= SEEN:
+            self._seen = [self._seen[-1], (sample.stamp_ns, sample.position.copy())]
 
     def _begin(self, sample, verdict):
         """First torque of a session, or after a time without: from the position that is found."""
@@ -592,13 +607,25 @@ class ArmController:
     def _take_over(self, sample):
         """The reference begins where the arm is, and brakes it from how it moves."""
         position, stamp, velocity = sample.position, sample.stamp_ns, None
-        if np.abs(sample.velocity).max() > AT_REST:
+        if _moves(sample) and not self._seen_resting(sample):
             velocity = sample.velocity
         deceleration = np.minimum(GENTLE, self.supervisor.deceleration)
         try:
             self.reference.start(position, stamp, velocity, deceleration)
         except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
             self.reference.start(position, stamp)
+
+    def _seen_for(self, sample):
+        """For how long positions have been seen while the controller waited, `SEEN` or a little more [s]."""
+        return 1e-9 * (sample.stamp_ns - self._seen[0][0])
+
+    def _seen_resting(self, sample):
+        """Whether the positions of the last `SEEN` show that the arm rests, whatever an estimated velocity says."""
+        if not self._waiting:
+            return False
+        # An arm that has begun to move is twice as fast as its mean.
+        moved = 2.0 * np.abs(sample.position - self._seen[0][1]).max()
+        return bool(moved <= AT_REST * self._seen_for(sample))
 
     def _interrupted(self, sample, what):
         """The driver took its safe action for a time, for the reason `what`."""
@@ -650,6 +677,11 @@ class ArmController:
             name = self.model.joint_names[int(np.argmax(moved))]
             return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
         return ""
+
+
+def _moves(sample):
+    """Whether a joint is faster than at rest."""
+    return bool(np.abs(sample.velocity).max() > AT_REST)
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):

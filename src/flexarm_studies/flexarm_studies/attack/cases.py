@@ -29,6 +29,8 @@ CONTROLS = {
     "two_link": (("two_link_designed", 500.0), ("two_link", 1000.0)),
     "long_reach": (("long_reach_designed", 500.0), ("long_reach", 500.0)),
 }
+#: Bits of the gauges' converters where an arm file states none.
+BITS = 16
 #: Observers with the noise levels of `kalman`.
 FILTERS = ("kalman", "extended_kalman")
 #: Duration of the motions [s].
@@ -47,7 +49,7 @@ class Case:
     velocity : bool
         Whether joint velocities are measured.
     noise : bool
-        Whether encoders count and gauges have noise.
+        Whether encoders and gauges count, and gauges have noise.
     amplitude : bool
         Whether the driver sends modal amplitudes beside the strains.
     rates : bool
@@ -92,7 +94,9 @@ def arm_of(name, noise):
     arm = arm_file.load(name)
     if not noise:
         return arm
-    gauges = tuple(replace(g, noise=g.noise or STRAIN_NOISE) for g in arm.gauges)
+    gauges = tuple(
+        replace(g, noise=g.noise or STRAIN_NOISE, bits=g.bits or BITS) for g in arm.gauges
+    )
     joints = tuple(replace(j, encoder_counts=j.encoder_counts or COUNTS) for j in arm.joints)
     return replace(arm, gauges=gauges, joints=joints)
 

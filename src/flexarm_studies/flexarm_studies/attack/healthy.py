@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """False alarms: samples in which nothing is wrong but what is usual, and how often something was reported.
 
-In each run the arm moves and holds, with noise and counts, with 20 % of its samples lost and stamps off by up to 40 %
-of the period; its payload is off by up to 30 %, and its joints have friction that the controller does not know.
+In each run the arm moves, rests, moves back part of the way and holds, each time as far and as fast as it happens, with
+the noise and the counts of encoders and gauges, with 20 % of its samples lost and stamps off by up to 40 % of the
+period; its payload is off by up to 30 %, and its joints have friction that the controller does not know.
 """
 
 import json
@@ -18,16 +19,19 @@ from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.arm.description import Friction
 from flexarm_dynamics.errors import FlexarmError
 
+from ..loop import scenario as scenarios
 from ..progress import Progress
 from ..workers import processes
-from .cases import START, arm_of
+from .cases import MOTION, START, arm_of
 from .run import drive, driver_of
 
 #: What is usual: lost samples [-], error of a stamp over the period [-], of the payload [-], friction over the
 #: torque limit: Coulomb's [-], and viscous at 1 rad/s [-].
 LOSS, JITTER, PAYLOAD, COULOMB, VISCOUS = 0.2, 0.4, 0.3, 0.005, 0.005
-#: A run lasts so long [s].
-LASTS = 6.0
+#: A motion is this part of the case's own way, and takes this multiple of its time [-]; so long it rests [s].
+WAY, PACE, RESTS = (0.3, 1.0), (0.9, 1.5), 0.4
+#: After its last motion an arm holds for so long [s].
+HOLDS = 1.0
 #: Of each round of runs so many are an arm's; one where none is given. A sample of these costs less.
 OFTEN = {"R": 6, "two_link": 2}
 
@@ -44,18 +48,39 @@ def plant(case, random):
     return replace(arm, joints=tuple(joints)), random.uniform(1.0 - PAYLOAD, 1.0 + PAYLOAD)
 
 
+def motion(case, random):
+    """There and back part of the way, as a scenario's trajectory; and when it is over [s]."""
+    own = case.scenario()
+    loop = scenarios.loop_of(own)
+    way = scenarios.trajectory_of(own.trajectory, loop.model, loop.simulator.position)
+    start, end = way.positions[0], way.positions[-1]
+    there = start + random.uniform(*WAY, start.size) * (end - start)
+    back = there - random.uniform(*WAY, start.size) * (there - start)
+    first, second = MOTION * random.uniform(*PACE, 2)
+    times = np.cumsum([0.0, first, RESTS, second]).tolist()
+    still = np.zeros((4, start.size)).tolist()
+    places = np.stack([start, there, there, back]).tolist()
+    return {
+        "times": times,
+        "positions": places,
+        "velocities": still,
+        "accelerations": still,
+    }, times[-1]
+
+
 def healthy_run(case, seed):
     """One run: number of samples, and what was reported; empty: nothing."""
     random = np.random.default_rng([seed, 7])
     arm, payload = plant(case, random)
-    own = replace(case.scenario(), plant_arm=arm, payload_scale=payload, seed=seed)
+    way, lasts = motion(case, random)
+    own = replace(case.scenario(), plant_arm=arm, payload_scale=payload, seed=seed, trajectory=way)
     faults = (
         f"state drop share={LOSS} seed={seed}",
         f"state jitter by={JITTER / own.rate} seed={seed}",
     )
     driver = driver_of(own, faults, START)
     try:
-        trace = drive(driver, until=LASTS)
+        trace = drive(driver, until=START + lasts + HOLDS)
     except (
         FlexarmError
     ) as error:  # the motion is refused: a finding about this arm, not the end of the study
