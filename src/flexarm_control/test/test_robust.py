@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
@@ -381,6 +382,81 @@ def test_a_mode_that_no_torque_reaches_is_left_to_itself():
     alone = build(arm).frequencies(np.zeros(1))
     assert found.holds and found.decay > 0.1
     assert any(np.abs(omega / alone - 1.0).min() < 0.02 for omega in found.left)
+
+
+STRIP = {
+    "length": 0.6,
+    "flexible": {"y": {"modes": 1, "shape": "loaded", "damping": [0.005]}},
+    "section": {
+        "shape": "rectangle",
+        "density": 2700.0,
+        "youngs_modulus": 70e9,
+        "shear_modulus": 26e9,
+        "size_y": 0.006,
+        "size_z": 0.05,
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def strips():
+    """Two aluminium strips under gravity, the second joint's motor on the elbow."""
+    links = [{"name": name, **STRIP} for name in ("upper", "fore")]
+    data = {
+        "name": "strips",
+        "units": "si",
+        "gravity": [0.0, -9.81, 0.0],
+        "joints": [
+            {"name": "shoulder", "hub_inertia": 0.05, "limits": {"torque": 40.0}},
+            {
+                "name": "elbow",
+                "hub_inertia": 0.01,
+                "motor_mass": 0.4,
+                "limits": {"torque": 15.0},
+            },
+        ],
+        "links": links,
+        "payload": {"mass": 0.5, "inertia": 5e-4},
+        "gauges": [
+            {
+                "name": f"gauge_{link['name']}",
+                "link": link["name"],
+                "position": 0.012,
+                "direction": "y",
+                "surface_distance": 0.003,
+                "noise": 1e-6,
+            }
+            for link in links
+        ],
+    }
+    return arm_file.parse(yaml.safe_dump(data))
+
+
+def test_a_design_holds_on_the_arm_with_its_own_modes_and_measured_speeds(strips):
+    """One that is made for richer arms alone lets a mode of 15 rad/s grow: their joints give way more."""
+    at = ((0.13, 0.13), (0.26, 0.57))
+    found = design(strips, replace(QUICK, delay=0.003, effort=0.1, configurations=at))
+    measured = replace(found.sampling, joint_corner=np.inf)
+    model = build(strips)
+    for samples in (found.sampling, measured):
+        for q in at:
+            loop = sampled_loop(model, model, np.array(q), samples)
+            assert np.abs(eigenvalues(loop, found.K)[1]).max() < 1.0
+
+
+def test_the_set_has_the_file_s_own_modes_unless_the_plants_have_no_others(strips):
+    samples = Sampling(2e-3, 2e-3, 300.0, 300.0)
+
+    def names(arm):
+        at = np.zeros((1, len(arm.joints)))
+        return [loop.name for loop in uncertain_loops(build(arm), at, samples, Uncertainty())]
+
+    own = "the file's modes alone"
+    assert [name for name in names(strips) if own in name] == [
+        f"{own}, at configuration 1",
+        f"{own}, joint speeds measured, at configuration 1",
+    ]
+    assert not any(own in name for name in names(arm_file.load("rigid")))
 
 
 def test_configurations_are_within_limits_and_rest():

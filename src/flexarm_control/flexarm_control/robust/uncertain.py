@@ -99,10 +99,12 @@ def richer(arm):
 def uncertain_loops(nominal, at, sampling, uncertainty):
     """The set of loops that a design is for.
 
-    In each configuration the softest, the stated and the stiffest arm, and one with measured joint speeds and without
-    delay; in the first one a loop with more and one with less gain, one that is later, and one whose joint speeds are
-    measured. An arm with Coulomb friction also sticks: linear at rest, with the friction as steep as its smoothing
-    makes it.
+    In each configuration the softest, the stated and the stiffest arm, each one mode richer than the file, and one of
+    these with measured joint speeds and without delay; then the arm with the file's modes alone, once with filtered and
+    once with measured joint speeds: a mode beyond the file's lets a joint give way, and gains may hold with it that do
+    not hold without it. In the first configuration a loop with more and one with less gain, one that is later, and one
+    whose joint speeds are measured. An arm with Coulomb friction also sticks: linear at rest, with the friction as
+    steep as its smoothing makes it.
 
     Parameters
     ----------
@@ -157,11 +159,31 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
     for i, q in enumerate(at):
         name = f"joint speeds measured, no delay, at configuration {i + 1}"
         out.append(sampled_loop(nominal, stated, q, sooner, name=name, fraction=UNLIKELY))
+    own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
+    if own.n_modes < stated.n_modes:
+        out += _own_modes(nominal, own, at, sampling, measured)
     if any(joint.friction.coulomb for joint in arm.joints):
         for i, q in enumerate(at):
             name = f"sticking, at configuration {i + 1}"
             out.append(sampled_loop(nominal, stated, q, sampling, 1.0, name, STICKING, True))
     return out
+
+
+def _own_modes(nominal, plant, at, sampling, measured):
+    """Loops of a plant with the file's modes alone, with filtered and with measured joint speeds."""
+    names = {"": sampling, ", joint speeds measured": measured}
+    return [
+        sampled_loop(
+            nominal,
+            plant,
+            q,
+            samples,
+            name=f"the file's modes alone{name}, at configuration {i + 1}",
+            fraction=UNLIKELY,
+        )
+        for i, q in enumerate(at)
+        for name, samples in names.items()
+    ]
 
 
 def reach(model, at, late):
