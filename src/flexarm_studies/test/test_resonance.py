@@ -178,14 +178,15 @@ def spread(low, high, damping=0.01, part=1.0):
 
 
 def test_the_narrower_the_spread_the_quicker_the_shaper():
-    kinds = [recommend([spread(3.0 / w, 3.0 * w)]).chosen for w in (1.01, 1.05, 1.15, 1.3)]
-    assert [c.delay for c in kinds] == sorted(c.delay for c in kinds)
-    assert (
-        kinds[0].kind == "zv"
-        and kinds[2].kind in ("zvd", "ei")
-        and kinds[3].kind in ("2hump_ei", "zvdd")
-    )
-    assert all(c.residual <= 0.05 for c in kinds)
+    made = [recommend([spread(3.0 / w, 3.0 * w)]) for w in (1.01, 1.05, 1.15, 1.3)]
+    chosen = [m.chosen for m in made]
+    assert [c.delay for c in chosen] == sorted(c.delay for c in chosen)
+    assert all(c.residual <= 0.05 for c in chosen) and chosen[0].kind == "zv"
+    enough = [
+        [c for c in m.candidates if c.kind in shapers.SHAPERS and c.residual <= 0.05] for m in made
+    ]
+    kinds = [min(found, key=lambda c: c.delay).kind for found in enough]
+    assert kinds[2] in ("zvd", "ei") and kinds[3] in ("2hump_ei", "zvdd")
 
 
 def test_the_residual_is_that_of_the_shaper_over_the_whole_spread():
@@ -206,7 +207,7 @@ def test_a_mode_that_hardly_takes_part_is_not_paid_for():
 def test_where_no_shaper_meets_it_the_best_is_named_and_that_it_does_not(tmp_path):
     made = recommend([spread(1.0, 6.0)], 0.01)
     assert not made.met and made.chosen.residual == min(
-        c.residual for c in made.candidates if c.kind in shapers.SHAPERS
+        c.residual for c in made.candidates if c.kind in (*shapers.SHAPERS, "robust")
     )
 
 

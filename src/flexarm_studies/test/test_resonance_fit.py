@@ -3,6 +3,9 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy.signal import chirp, lfilter, lsim, lti
 
 from flexarm_studies.resonance import fit as fits
@@ -113,3 +116,16 @@ def test_a_silent_channel_beside_one_that_rings_does_no_harm():
     values = ringing(np.random.default_rng(1))
     values[:, 1] = 4.0
     check(fits.fit(values, 1.0 / RATE))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    arrays(
+        float, st.tuples(st.integers(0, 60), st.integers(1, 3)), elements=st.floats(-1e150, 1e150)
+    ),
+    st.floats(1e-4, 10.0),
+)
+def test_any_finite_numbers_are_fitted_or_have_no_modes(values, period):
+    made = fits.fit(values, period)
+    assert all(np.isfinite([m.frequency, m.damping, m.frequency_width]).all() for m in made.modes)
+    assert made.fitted.shape == made.measured.shape

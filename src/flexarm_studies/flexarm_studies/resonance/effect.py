@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import BPoly
 
-from flexarm_control.motions import shapers
 from flexarm_control.trajectory import files
 from flexarm_dynamics.errors import TrajectoryError
 
-from .recommendation import SMOOTH, box, impulses, train_of
+from .recommendation import BY_PROGRAMME, SMOOTH, box, impulses, train_of
 
 #: Times per period of the fastest mode, and at most so many in all.
 PER_PERIOD, MOST = 40, 200_000
@@ -152,6 +151,7 @@ def _response(candidate, spreads):
     """What a candidate's kernel does to poles (k,); None where it has none."""
     if candidate.kind in SMOOTH:
         return box(candidate.width, SMOOTH[candidate.kind])
-    if candidate.kind in shapers.SHAPERS or candidate.kind == shapers.NONE:
-        return impulses(train_of(candidate.kind, [spreads[k] for k in candidate.modes]))
-    return None
+    if candidate.kind == BY_PROGRAMME:
+        return None
+    modes = [spreads[k] for k in candidate.modes]
+    return impulses(train_of(candidate.kind, modes, candidate.spread, candidate.periods))

@@ -64,7 +64,7 @@ def orders(values, period):
     for order in range(2, most + 1, 2):
         moved = np.linalg.lstsq(V[:-1, :order], V[1:, :order], rcond=None)[0]
         z = np.linalg.eigvals(moved)
-        found.append(np.log(z[np.abs(z) > 1e-6]) / period)
+        found.append(np.log(z[(np.abs(z) > 1e-6) & (np.abs(z) < 1e6)]) / period)
     return found
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexarm_control.motions import shapers
+from flexarm_control.motions import robust_shapers, shapers
 from flexarm_dynamics.errors import FlexarmError
 
 from .time_law import least_exciting_duration
@@ -27,6 +27,8 @@ TURN = 2.0 * np.pi
 POINTS = 41
 #: Widths of a smoothing that are tried, up to so many periods of the slowest mode.
 WIDTHS, PERIODS = 400, 5.0
+#: The shaper by a linear programme, how long it may be in periods of the lowest mode, and steps to find that.
+ROBUST, SHORTEST, LONGEST, HALVINGS = "robust", 0.25, 3.0, 6
 #: Names of the smooth ones, and how many boxes they are.
 SMOOTH = {"jerk_limited": 1, "snap_limited": 2}
 BY_PROGRAMME = "least_exciting"
@@ -86,6 +88,8 @@ class Candidate:
         In the middle of the spread [-].
     width : float
         Of a smoothing's box [s]; 0 for others.
+    spread, periods : float
+        Of ``robust``: by which fraction the frequencies may be off, and its length in periods of the lowest mode [-].
     """
 
     kind: str
@@ -94,6 +98,8 @@ class Candidate:
     residual: float
     nominal: float
     width: float = 0.0
+    spread: float = 0.0
+    periods: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +160,7 @@ def recommend(spreads, residual=0.05, move=None) -> Recommendation:
         )
     spreads = list(spreads)
     found = [_quickest(_shapers(kind, spreads), residual) for kind in shapers.SHAPERS]
+    found.append(_robust(spreads, residual))
     chosen = _quickest(found, residual)
     smooth = [_smoothing(kind, spreads, residual) for kind in SMOOTH]
     none = _shaped(shapers.NONE, spreads, ())
@@ -185,8 +192,51 @@ def impulses(train):
     return lambda poles: np.exp(left(poles)) @ train.amplitudes
 
 
-def train_of(kind, modes):
-    """The `Shaper` of a kind for the middle of some spreads, or for some modes; without any, a single impulse."""
+def _robust(spreads, residual):
+    """The shortest robust shaper that meets the residual, for the most important mode, or for more."""
+    order = sorted(range(len(spreads)), key=lambda k: -spreads[k].part)
+    return _quickest(
+        [_robust_for(tuple(sorted(order[: k + 1])), spreads, residual) for k in range(len(order))],
+        residual,
+    )
+
+
+def _robust_for(modes, spreads, residual):
+    shaped = [spreads[k] for k in modes]
+    spread = min(max((s.high - s.low) / (s.high + s.low) for s in shaped), 0.5)
+
+    def made(periods):
+        train = train_of(ROBUST, shaped, spread, periods)
+        left = _residuals(impulses(train), spreads)
+        return Candidate(ROBUST, modes, train.duration, *left, spread=spread, periods=periods)
+
+    low, high = SHORTEST, LONGEST
+    best = made(high)
+    if best.residual > residual:
+        return best
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        now = made(middle)
+        if now.residual <= residual:
+            high, best = middle, now
+        else:
+            low = middle
+    return best
+
+
+def train_of(kind, modes, spread=0.0, periods=1.0):
+    """The `Shaper` of a kind for the middle of some spreads, or for some modes; without any, a single impulse.
+
+    Parameters
+    ----------
+    kind : str
+    modes : sequence of Spread
+    spread, periods : float
+        Of ``robust``, as of `Candidate`.
+    """
+    if kind == ROBUST:
+        frequencies, dampings = [m.frequency for m in modes], [m.damping for m in modes]
+        return robust_shapers.robust(frequencies, dampings, spread, periods)
     trains = [shapers.impulses(kind, mode.frequency, mode.damping) for mode in modes]
     return shapers.convolve(trains or [shapers.impulses(shapers.NONE, 1.0, 0.0)])
 

@@ -10,7 +10,7 @@ from flexarm_dynamics.errors import FlexarmError
 from . import effect, windows
 from .families import dependence, families
 from .fit import HIGHEST
-from .recommendation import BY_PROGRAMME, Spread, recommend, widened
+from .recommendation import BY_PROGRAMME, ROBUST, Spread, recommend, widened
 from .time_law import Move
 
 #: A mode that takes part in less than this fraction of the vibration's energy is not shaped for [-].
@@ -71,26 +71,44 @@ class Study:
     recommendation: object
 
 
-def study(recording, wishes=None) -> Study:
-    """Find the modes of a recording that ring freely, and recommend a shaper.
+def study(recordings, wishes=None) -> Study:
+    """Find the modes of recordings that ring freely, and recommend a shaper.
 
     Parameters
     ----------
-    recording : Recording
+    recordings : sequence of Recording
+        With the same channels: of one arm, in several configurations, say.
     wishes : Wishes, optional
 
     Raises
     ------
     FlexarmError
-        Where nothing rings, or a window has no samples.
+        Where nothing rings, a window has no samples, or a recording has other channels than the first.
     """
     wishes = wishes or Wishes()
-    found = windows.channels(recording, wishes.quantities or None)
-    if wishes.windows:
-        parts = [found.rows(*window) for window in wishes.windows]
-    else:
-        parts = windows.free(found, recording)
-    return of_windows(found, windows.modes_of(found, parts, wishes.low, wishes.high), wishes)
+    first, rings = None, []
+    for recording in recordings:
+        found = windows.channels(recording, wishes.quantities or None)
+        first = first or found
+        _same_channels(first, found)
+        if wishes.windows:
+            parts = [found.rows(*window) for window in wishes.windows]
+        else:
+            parts = windows.free(found, recording)
+        rings += windows.modes_of(found, parts, wishes.low, wishes.high)
+    return of_windows(first, rings, wishes)
+
+
+def _same_channels(first, other):
+    for name in ("names", "joint_names"):
+        wanted, there = getattr(first, name), getattr(other, name)
+        if wanted != there:
+            field = "channels" if name == "names" else "joints"
+            hint = "choose the same with --channels"
+            raise FlexarmError(
+                "differ from those of the first recording", field=field, value=", ".join(there),
+                limit=", ".join(wanted), hint=hint,
+            )  # fmt: skip
 
 
 def of_windows(found, rings, wishes) -> Study:
@@ -229,6 +247,8 @@ def _recommendation(made):
                 "residual": c.residual,
                 "nominal_residual": c.nominal,
                 "width_s": c.width,
+                "spread": c.spread,
+                "periods": c.periods,
             }
             for c in found.candidates
         ],
@@ -248,6 +268,12 @@ def yaml_lines(made):
         f"    shaper.frequencies: {_floats([s.frequency for row in rows for s in row])}",
         f"    shaper.dampings: {_floats([s.damping for row in rows for s in row])}",
     ]
+    if made.channels.joint_names:
+        lines.insert(2, f"    joint_names: [{', '.join(made.channels.joint_names)}]")
+    if chosen.kind == ROBUST:
+        # Upwards: the printed number covers what was found.
+        spread, periods = (float(np.ceil(1e3 * v)) / 1e3 for v in (chosen.spread, chosen.periods))
+        lines += [f"    shaper.spread: {spread}", f"    shaper.periods: {periods}"]
     if places:
         flat = [float(q) for place, _ in places for q in place]
         lines.append(f"    shaper.configurations: {_floats(flat)}")

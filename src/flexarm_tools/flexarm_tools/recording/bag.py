@@ -173,11 +173,11 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
     FlexarmError
         For what is no bag, has none of the topics, or belongs to another arm.
     """
-    path, notes = _bag(Path(path)), []
+    path, notes = bag_path(Path(path)), []
     if isinstance(arm, str):
         arm = arm_file.load(arm) if arm else None
     known = arm_of(path, notes) if arm is None else arm
-    source = _Source(path, notes)
+    source = Source(path, notes)
     readers, block, count, size = {}, {}, 0, 0
     for topic, kind, raw in source.messages(lambda t, k: _wanted(t, k, namespace)):
         block.setdefault((topic, kind), []).append(raw)
@@ -209,8 +209,14 @@ def from_messages(raw, arm):
     return reader.contents("the recording", "", [])
 
 
-def _bag(path):
-    """The bag that a path means."""
+def bag_path(path):
+    """The bag that a `path` means.
+
+    Raises
+    ------
+    FlexarmError
+        Where there is none.
+    """
     if not path.exists():
         raise FlexarmError("no such file or folder", field=str(path))
     if path.is_dir() and not _is_bag(path) and _is_bag(path / "bag"):
@@ -259,14 +265,35 @@ def _wanted(topic, kind, namespace):
     return None
 
 
-class _Source:
-    """The messages of a bag, up to where it is truncated."""
+class Source:
+    """The messages of a bag, up to where it is truncated.
+
+    Parameters
+    ----------
+    path : Path
+        As of `bag_path`.
+    notes : list of str
+        To which it adds what was left out.
+
+    Attributes
+    ----------
+    topics : dict
+        Topic to the type of its messages, once they are read.
+    count : int
+        Of the messages that are wanted; 0 where the bag does not have it.
+    """
 
     def __init__(self, path, notes):
         self.path, self.notes, self.topics, self.count = path, notes, {}, 0
 
     def messages(self, wanted):
-        """Yield (topic, type, bytes) of the topics for which ``wanted(topic, type)`` is true."""
+        """Yield (topic, type, bytes) of the topics for which ``wanted(topic, type)`` is true.
+
+        Raises
+        ------
+        FlexarmError
+            For what can't be read as a bag.
+        """
         given, problem = 0, None
         try:
             for item in self._by_index(wanted):

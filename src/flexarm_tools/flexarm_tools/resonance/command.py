@@ -2,6 +2,7 @@
 """``flexarm resonance``: the modes that ring in a recording, with intervals, and the shaper that takes them out."""
 
 import json
+from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.commands.options import numbers
@@ -11,7 +12,10 @@ from flexarm_studies.resonance import study as studies
 from flexarm_studies.resonance.time_law import Move
 
 from ..identification import recording as recordings
+from ..recording import robot
+from ..recording.bag import KINDS
 
+STATE = KINDS["arm_state"]
 DEFAULT = studies.Wishes()
 
 
@@ -26,7 +30,12 @@ def add_arguments(parser):
         "example: flexarm resonance results/bag --residual 0.02 --trajectory motion.csv"
     )
     add = parser.add_argument
-    add("recording", metavar="FILE", help="a bag's directory, or a CSV file")
+    add(
+        "recordings",
+        metavar="FILE",
+        nargs="+",
+        help="a bag's directory, or a CSV file; several of one arm, in several configurations",
+    )
     mappings.add_option(parser)
     add("--namespace", default="", help="of the topics in a bag")
     add(
@@ -86,10 +95,12 @@ def resonance(options):
     """
     wishes = wishes_of(options)
     mapping = mappings.of_options(options)
-    measured = recordings.read(options.recording, None, mapping, options.namespace)
+    measured = [
+        read(path, mapping, options.namespace, wishes.quantities) for path in options.recordings
+    ]
     made = studies.study(measured, wishes)
     motion = studies.of_trajectory(made, options.trajectory) if options.trajectory else None
-    found = {"recording": str(options.recording)} | studies.plain(made)
+    found = {"recordings": [str(path) for path in options.recordings]} | studies.plain(made)
     if motion is not None:
         found["trajectory"] = motion
     if options.figure:
@@ -103,6 +114,32 @@ def resonance(options):
     if "figure" in found:
         print(f"figure: {found['figure']}")
     return found
+
+
+def read(path, mapping=None, namespace="", quantities=()):
+    """A `Recording` of a CSV file, or of a bag: of its `arm_state` where there is one, else of joint states and IMUs.
+
+    Parameters
+    ----------
+    path : str or Path
+    mapping : Mapping, optional
+        What the columns of a CSV file are.
+    namespace : str
+        Of the topics in a bag.
+    quantities : sequence of str
+        That are wanted: those of an IMU are in no `arm_state`.
+
+    Raises
+    ------
+    FlexarmError
+        For what can't be read.
+    """
+    if Path(path).exists() and recordings.is_bag(path) and mapping is None:
+        there = robot.kinds(path)
+        of_imu = {"linear_acceleration", "angular_velocity"} & set(quantities)
+        if STATE not in there or (of_imu and robot.IMU in there):
+            return robot.read(path, namespace)
+    return recordings.read(path, None, mapping, namespace)
 
 
 def wishes_of(options):
