@@ -804,9 +804,23 @@ def test_a_start_with_a_velocity_brakes_straight_on_from_it():
     assert (np.diff(np.abs(states[:, 1]), axis=0) <= 1e-12).all()
     assert not generator.stopping
     generator.start([1.0, 2.0], S, [1e-6, 0.0])
-    assert generator.path.duration_ns == S // 2
+    assert generator.path.duration_ns == S // 4  # half a period of the links
     generator.start([1.0, 2.0], S, [0.0, 0.0])
     assert (generator.path, generator.stopping) == (None, False)
+
+
+@pytest.mark.parametrize(
+    "velocity, time", [([0.5, 0.0], 1.2), ([-0.5, 0.0], 2.0), ([0.5, -0.25], 0.16)]
+)
+def test_soft_links_do_not_take_the_braking_out_of_the_range_of_the_trajectory(velocity, time):
+    """Half a period of 4 s would take joint a 0.5 rad on; 0.3 rad are left to it. Joint b is out of its range."""
+    generator = ReferenceGenerator(ARM, period=4.0)
+    generator.start([0.0, 0.0], 0)
+    end = (S, [0.9, 0.0], [0.0, 0.0], [0.0, 0.0], ())
+    assert generator.offer(validate(ARM, ARM, 0, [end])).accepted
+    generator.sample(S // 2)
+    generator.start([0.6, -0.1], S // 2, velocity, 1000.0)
+    assert generator.path.duration_ns == pytest.approx(time * S, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,8 @@ def test_a_fresh_sample_goes_to_each_lie_of_the_gauges():
 
 def row(**values):
     """A row of a lasting lie that holds."""
-    measures = dict.fromkeys(("speed", "strain", "strain under torque", "excursion", "silent"), 0.0)
+    measures = dict.fromkeys(("speed", "strain", "excursion", "silent"), 0.0)
+    measures |= {f"{name} under torque": 0.0 for name in ("speed", "strain")}
     return {**measures, "named": 0.1, "lost": "", "state": "FAULT", "text": "", **values}
 
 
@@ -139,7 +140,8 @@ STUCK = lies.LIES["encoder stuck"]
     [
         ({}, STUCK, []),
         ({"speed": 1.5, "strain": 2.0, "excursion": 0.1, "named": 0.3}, STUCK, []),
-        ({"speed": 1.51}, STUCK, ["speed"]),
+        ({"speed": 1.51, "speed under torque": 1.51}, STUCK, ["speed"]),
+        ({"speed": 1.51}, STUCK, ["the safe action's speed"]),
         ({"strain": 2.1, "strain under torque": 2.1}, STUCK, ["strain"]),
         ({"strain": 2.1}, STUCK, ["the safe action's strain"]),
         ({"excursion": 0.11, "silent": 0.06}, STUCK, ["excursion", "silent"]),

@@ -422,7 +422,7 @@ class ArmController:
             i = int(np.argmin(np.isfinite(u)))
             self.fail(f"torque of {self.model.joint_names[i]} came out as {u[i]}")
             return False
-        self.saturated = self._authority.send(u, dt)
+        self.saturated = self._authority.send(u, dt, min(dt, self._period))
         self._last_ns = sample.stamp_ns
         error = None if law.free else self.position_error
         verdict, why = supervisor.watch(q, qd, sample.amplitude, error, self.saturated, dt)

@@ -9,7 +9,8 @@ it is found,
 so that torque and stiffness grow together. With T = `return_time` of 65 ms, a is below a tenth for the first 20 ms.
 Without gravity u_g is zero. Where u begins within `SMALL` of u_g, at rest, there is nothing to return from: no ramp.
 
-The rate is bounded in any case. The budget of an arm that states none is :math:`8\,\omega_1` times its torque limit
+The rate is bounded in any case; lost samples add nothing to what the next one may change, since an estimate is at its
+worst after them. The budget of an arm that states none is :math:`8\,\omega_1` times its torque limit
 per second, with omega_1 its lowest bending frequency with the joints locked: a torque that swings between its limits
 eight times as fast as the softest mode. A motion needs a hundredth of it.
 """
@@ -119,8 +120,17 @@ class Authority:
         """No torque."""
         self.torque[:] = 0.0
 
-    def send(self, u, dt):
-        """Put what may be sent of a torque u (n,) [N m], dt [s] after the last, into `torque`.
+    def send(self, u, dt, period):
+        """Put what may be sent of a torque u (n,) [N m] into `torque`.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n,)
+            What the law gives [N m].
+        dt : float
+            Since the last torque [s].
+        period : float
+            Part of it for which the torque's rate counts: without lost samples [s].
 
         Returns
         -------
@@ -140,7 +150,7 @@ class Authority:
             wanted = self._weight + a * (u - self._weight)
         if self._any_bounded:
             # Not inf * dt, which is NaN at a start, where dt is 0.
-            step = np.multiply(self.rate, dt, out=np.full_like(u, np.inf), where=self._bounded)
+            step = np.multiply(self.rate, period, out=np.full_like(u, np.inf), where=self._bounded)
             low, high = torque - step, torque + step
             np.copyto(torque, wanted)
             clip(torque, low, high)

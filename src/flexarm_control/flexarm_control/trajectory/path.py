@@ -174,6 +174,11 @@ class Path:
         return np.diff(self._knots_ns) / SECOND
 
     @property
+    def places(self):
+        """Positions at which the polynomials begin, (k, n) [rad]."""
+        return self._coefficients[:, 0]
+
+    @property
     def end(self):
         """Position that is held after the end, (n,) [rad]."""
         return self._end[0]

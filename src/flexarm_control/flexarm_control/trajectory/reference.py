@@ -24,6 +24,10 @@ from .values import (
 
 #: Deceleration from a measured velocity, where none is given [rad/s^2].
 GENTLE = 2.0
+#: Least duration of that braking, over the period of the lowest bending mode.
+BRAKING_PERIODS = 0.5
+#: The braking may always take so much way [rad].
+BEYOND = 0.02
 #: A start that is farther ahead is a stamp of another clock [ns].
 FARTHEST_START = 3600 * SECOND
 #: A stop's acceleration and jerk over the motion's own largest.
@@ -130,7 +134,8 @@ class ReferenceGenerator:
         r"""Hold a measured position, or brake from how the arm moves; earlier trajectories are forgotten.
 
         With a velocity v the reference goes on in its direction from the position, and comes to rest as in `stop`,
-        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least `period`, v T / 2 farther.
+        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least half of `period`, v T / 2 farther. No joint leaves the
+        range of a trajectory that is given up for the sake of that half period.
 
         Parameters
         ----------
@@ -155,7 +160,8 @@ class ReferenceGenerator:
             velocity = _finite("joint_velocity", velocity, names, "rad/s", "brake the joint")
             if velocity.any():
                 bound = _decelerations(deceleration, names)
-                path = _straight(position, velocity, bound, stamp_ns, self._period, names)
+                shortest = self._least_braking(position, velocity)
+                path = _straight(position, velocity, bound, stamp_ns, shortest, names)
         self._drop_all()
         self._state[:] = 0.0
         self._state[0] = position
@@ -163,6 +169,19 @@ class ReferenceGenerator:
             self._state[1] = velocity
             self._path, self.stopping = path, True
         self._last_ns = stamp_ns
+
+    def _least_braking(self, position, velocity):
+        """Time that `start` takes for the links' sake [s]; shorter if it led out of the trajectory's range."""
+        least = BRAKING_PERIODS * self._period
+        if not (self.active and least > 0.0):
+            return least
+        places = np.vstack([self._path.places, self._path.end])
+        left = np.where(
+            velocity > 0.0, places.max(axis=0) - position, position - places.min(axis=0)
+        )
+        speed, left = np.abs(velocity), np.maximum(left, BEYOND)
+        beyond = 0.5 * speed * least > left
+        return float((2.0 * left[beyond] / speed[beyond]).min(initial=least))
 
     def offer(self, trajectory: JointTrajectoryData, judge=None) -> Verdict:
         """Accept a validated trajectory, or return why it is refused; then it changes nothing.

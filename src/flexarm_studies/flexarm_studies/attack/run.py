@@ -4,7 +4,8 @@ r"""Runs of a lie, and what they measure.
 A run is compared with the honest one of the same case, `Honest`, whose motion sets the scale:
 
 - *speed*: the largest speed of a joint over its largest in the motion, :math:`\max|\dot q_i|/\max|\dot q_i^h|`;
-- *strain*: the largest strain on a gauge over the largest in the motion; *strain under torque*: before the safe action;
+- *strain*: the largest strain on a gauge over the largest in the motion; both also *under torque*: before the safe
+  action;
 - *excursion*: how far a joint leaves the range that it passes through in the motion [rad];
 - *step*: the largest change of torque between two samples over that in the motion, begin and end included: a motion
   whose jerk jumps changes its torque most there, and so does a run that is stopped after it. A motion that kicks by
@@ -279,6 +280,7 @@ def measured(honest, lie, trace, driver, at):
     speed = np.abs(trace.velocity[part])
     strain = np.abs(trace.strain[part]) / (honest.strain or 1.0)
     acting = np.flatnonzero(trace.acts[part])
+    under = slice(acting[-1] + 2 if acting.size else 1)
     q = trace.position[part]
     steps = np.abs(np.diff(trace.torque[part], axis=0)) / honest.step
     steps = steps[np.isfinite(steps).all(axis=1)]
@@ -286,10 +288,9 @@ def measured(honest, lie, trace, driver, at):
     named, text = _named(lie, trace, at, _seen(honest, lie, trace, driver, at))
     return {
         "speed": float((speed / honest.speed).max()),
+        "speed under torque": float((speed / honest.speed)[under].max()),
         "strain": float(strain.max(initial=0.0)),
-        "strain under torque": float(
-            strain[: acting[-1] + 2 if acting.size else 1].max(initial=0.0)
-        ),
+        "strain under torque": float(strain[under].max(initial=0.0)),
         "excursion": float(np.maximum(honest.low - q, q - honest.high).max(initial=0.0)),
         "step": float(steps.max(initial=0.0)),
         "torque": float(np.nanmax(fraction, initial=0.0)),
@@ -365,8 +366,8 @@ def judged(row, lie):
     for name in OF_KIND[lie.kind]:
         value = row[name.removeprefix("stop ")]
         if value is not None and value > CRITERIA[name] * (1.0 + ROUNDING):
-            of_brakes = name == "strain" and row["strain under torque"] <= CRITERIA["strain"]
-            failed.append("the safe action's strain" if of_brakes else name)
+            under = row.get(f"{name} under torque", np.inf)
+            failed.append(f"the safe action's {name}" if under <= CRITERIA[name] else name)
     if row["lost"]:
         failed.append("arm lost")
     if lie.ends and row["state"] != lie.ends:
