@@ -165,6 +165,45 @@ def test_trajectories_streamed_at_50_hz_make_one_smooth_motion(arm):
     assert steps.max() < 3e-9  # [rad/ns] never a jump: a ramp of 0.1 s to the goal ahead
 
 
+def test_a_stream_of_points_with_velocities_is_followed_without_steps_and_without_a_line_each(arm):
+    """As of MoveIt Servo: one point in a message, 50 Hz; the arm comes to rest when they stop."""
+    arm.bench.set("controller", allow_nonzero_velocity_at_trajectory_end=True, cmd_timeout=0.05)
+    before = arm.bench.log("controller").count("accepted")
+    try:
+        for t in 0.02 * np.arange(1, 26):  # a velocity that rises smoothly
+            arm.offer(trajectory(J, (0.02, [0.1 * t**3], [0.3 * t**2])))
+            arm.run(0.02)
+        samples = arm.run(1.0)
+    finally:
+        arm.bench.set("controller", allow_nonzero_velocity_at_trajectory_end=False)
+    velocity = column(samples, "reference_velocity")
+    assert np.abs(np.diff(velocity)).max() < 2e-3  # [rad/s] in 1 ms: 2 rad/s^2
+    assert velocity.max() == pytest.approx(0.075, abs=2e-3)
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    assert arm.state.reference_velocity[0] == 0.0
+    assert not any(sample.saturated for sample in samples.values())
+    assert arm.bench.log("controller").count("accepted") < before + 10  # one in ten seconds
+
+
+def test_speed_scaling_makes_a_motion_slower_and_holds_it_on_its_way(arm):
+    arm.bench.set("controller", speed_scaling=0.5)
+    try:
+        arm.offer(trajectory(J, (1.0, [0.3], [0.0], [0.0])))
+        samples = arm.run(0.6)
+        there = np.ravel(profiles.quintic(0.0, 0.3, 1.0).position(0.3))[0]
+        assert column(samples, "reference_position")[-1] == pytest.approx(there, abs=2e-3)
+        arm.bench.set("controller", speed_scaling=0.0)
+        arm.run(1.5)
+        assert arm.state.supervisor_state == CompositeState.TRACKING
+        assert arm.state.reference_velocity[0] == 0.0
+        arm.bench.set("controller", speed_scaling=1.0)
+        arm.run(1.5)
+    finally:
+        arm.bench.set("controller", speed_scaling=1.0)
+    assert arm.state.supervisor_state == CompositeState.HOLDING
+    assert arm.state.reference_position[0] == 0.3
+
+
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_trajectory_that_cannot_be_followed_is_refused_with_a_reason_and_the_arm_holds(arm, case):
     check_refusal(arm, case)

@@ -145,7 +145,7 @@ def path_of(trajectory, start):
     """The path of a trajectory from the reference's state `start`, (3, n), which must be at rest."""
     if np.abs(start[1:]).max() > SAME_START:
         raise DesignError("the motion does not begin at rest", field="feedforward")
-    path = Path(trajectory.times_ns, trajectory.fields, 1)
+    path = Path.of(trajectory, 1)
     path.begin(0, start)
     return path
 

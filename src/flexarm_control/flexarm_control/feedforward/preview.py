@@ -89,7 +89,7 @@ class Preview(ModelFeedforward):
             return _Planner(model, path, start, self.limit).solve()
 
     def _planned(self, prepared, path, stamp_ns):
-        if prepared is None:
+        if prepared is None or path.scaled:  # a plan at another speed is no motion of the arm
             return None
         elapsed_ns = stamp_ns - path.followed.start_ns
         return prepared.plan if 0 <= elapsed_ns < prepared.plan.duration * SECOND else None

@@ -8,7 +8,7 @@ from flexarm_dynamics.parameters import parameter
 
 from ..payload import estimator
 from ..payload.estimator import PayloadEstimator
-from ..trajectory import ReferenceGenerator, Verdict, refuse_torque, validate
+from ..trajectory import ReferenceGenerator, Streaming, Verdict, refuse_torque, streams, validate
 from ..trajectory.reference import GENTLE
 from . import applied, authority, supervisor
 from .applied import Applied
@@ -49,6 +49,11 @@ PARAMETERS = (
     parameter("join_late_trajectories", False).described(
         "Whether a trajectory whose stamp is past, and whose end is not, is joined midway, as"
         " joint_trajectory_controller does; it is refused otherwise."
+    ),
+    *streams.PARAMETERS,
+    parameter("speed_scaling", 1.0, "-", 0.0, 1.0).described(
+        "Factor on the time of trajectories: they are followed so much slower, and it changes smoothly; 0.0: the arm"
+        " rests on its way. Stops are not scaled."
     ),
     *supervisor.PARAMETERS,
     *estimator.PARAMETERS,
@@ -105,7 +110,11 @@ class ArmController:
         self.model, self.law, self.answered_by = model, law, law
         fastest = model.arm.velocity_limits
         self.reference = ReferenceGenerator(
-            model.joint_names, start_tolerance, fastest, longest_period(model)
+            model.joint_names,
+            start_tolerance,
+            fastest,
+            longest_period(model),
+            model.arm.continuous,
         )
         self._start_tolerance = start_tolerance
         self._nothing = np.zeros(0)
@@ -216,6 +225,8 @@ class ArmController:
     def _take_limits(self, settings):
         self._applied.configure(settings, self.torque_limit)
         self.reference.joins = settings["join_late_trajectories"]
+        deceleration, given = self.supervisor.deceleration, self.supervisor.deceleration_given
+        self.reference.scale(settings["speed_scaling"], deceleration, given)
         self._resume_gap = settings["resume_gap"]
         self._max_gap = round(1e9 * settings["max_gap"])
         self._max_age = 1e9 * settings["max_age"] if settings["synchronised_clocks"] else None
@@ -280,6 +291,20 @@ class ArmController:
             return None
         resting = self.reference.resting
         return None if resting is None else resting[0]
+
+    @property
+    def streaming(self):
+        """How points of streams are taken, for `validate`. Any thread may ask."""
+        settings, deceleration = self.supervisor.settings, self.supervisor.deceleration
+        gentle = np.minimum(GENTLE, deceleration)
+        return Streaming(
+            moving_end=settings["allow_nonzero_velocity_at_trajectory_end"],
+            timeout=settings["cmd_timeout"],
+            deceleration=np.where(self.supervisor.deceleration_given, deceleration, gentle),
+            period=self._bending_period,
+            smoothing=settings["smoothing_time"],
+            effort=settings["effort_in_points"],
+        )
 
     @property
     def plans(self):
@@ -418,6 +443,8 @@ class ArmController:
         except Exception as error:  # a user's law may raise anything: no torque then
             self.fail(f"the control law failed: {type(error).__name__}: {error}")
             return False
+        if reference.effort.any():
+            u = u + reference.effort
         if not (u.dot(u) < np.inf or np.isfinite(u).all()):
             i = int(np.argmin(np.isfinite(u)))
             self.fail(f"torque of {self.model.joint_names[i]} came out as {u[i]}")

@@ -14,6 +14,8 @@ from .. import trajectory
 
 #: Longer trajectories are refused: their points are read in one go.
 MAX_POINTS = 10_000
+#: Trajectories that come within this time of each other, by the arm's clock, are a stream [ns].
+STREAMED = 500_000_000
 
 
 def rows(msg):
@@ -24,10 +26,10 @@ def rows(msg):
     ]
 
 
-def read(raw, arm, held=None):
+def read(raw, arm, held=None, streaming=trajectory.streams.PLAIN):
     """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be.
 
-    `held` as of `validate`.
+    `held` and `streaming` as of `validate`.
     """
     try:
         count = trajectory_points(raw)
@@ -48,6 +50,7 @@ def read(raw, arm, held=None):
             *arm.position_limits.T,
             arm.velocity_limits,
             held,
+            streaming,
         )
     except TrajectoryError:
         raise
@@ -69,6 +72,7 @@ class TrajectoryInbox:
     def __init__(self, node, core, designer):
         self._node, self._core, self._designer = node, core, designer
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="trajectory")
+        self._last_came = None  # [ns]
 
     def warm_up(self):
         """Have the designer ready before the first motion comes."""
@@ -84,7 +88,7 @@ class TrajectoryInbox:
         """In a thread: make a message ready to be offered."""
         name = trajectory_name(raw)
         try:
-            data = read(raw, self._core.model.arm, self._core.held)
+            data = read(raw, self._core.model.arm, self._core.held, self._core.streaming)
             self._judge_torque(data)
         except TrajectoryError as error:
             self._node.hand_over(self._refuse, str(error), name)
@@ -93,10 +97,11 @@ class TrajectoryInbox:
             return
         reference = self._core.reference
         plan, start = None, reference.resting
-        whole = reference.ahead(data) is data  # a plan is for all of it
+        ahead = reference.ahead(data)
+        whole = ahead.stamp_ns == data.stamp_ns  # a plan is for all of it
         try:
             if feedforward is not None and feedforward.plans and start is not None and whole:
-                plan = self._designer.prepare(feedforward, data, start)
+                plan = self._designer.prepare(feedforward, ahead, start)
         except CancelledError:
             return
         except Exception as error:
@@ -115,15 +120,26 @@ class TrajectoryInbox:
 
     def _refuse(self, reason, name):
         self._core.refuse(reason, name)
-        self._node.get_logger().warning(f"trajectory refused: {reason}")
+        self._log(f"trajectory refused: {reason}")
 
     def _offer(self, data, plan, name):
         verdict = self._core.offer(data, plan, judged=True, name=name)
         if verdict.accepted:
             text = f"trajectory {verdict.trajectory_id} accepted: {verdict.reason}"
-            self._node.get_logger().info(text)
+            self._log(text, info=True)
         elif not verdict.repeat:
-            self._node.get_logger().warning(f"trajectory refused: {verdict.reason}")
+            self._log(f"trajectory refused: {verdict.reason}")
+
+    def _log(self, text, info=False):
+        """Log what became of a trajectory; of a stream, whose lines differ in their numbers, one in ten seconds."""
+        last, now = self._last_came, self._core.reference.stamp_ns
+        log, self._last_came = self._node.get_logger(), now
+        if last is not None and now is not None and now - last < STREAMED:
+            self._node.report(text, info)
+        elif info:
+            log.info(text)
+        else:
+            log.warning(text)
 
     def close(self):
         """Take no more messages; what is under way is not waited for."""

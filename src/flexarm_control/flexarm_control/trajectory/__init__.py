@@ -13,7 +13,8 @@ positions, velocities, accelerations  quintic Hermite: acceleration continuous t
 The first segment leads from the reference at the start to the first point, at its
 `time_from_start`, with the same interpolation. It begins with the reference's own velocity (and
 acceleration), so that a new trajectory takes over smoothly. After the last point the reference
-holds its position.
+holds its position. Near positions may be smoothed, and a last point may move, see `streams`; time may go slower, see
+`scaling`.
 
 This package is stricter than the joint_trajectory_controller: it refuses partial joint goals (unless allowed),
 velocities without positions, fields that some points lack, a start in the past (unless late ones are joined), and
@@ -24,6 +25,7 @@ Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 
 from .reference import ReferenceGenerator, Verdict
 from .request import JointTrajectoryData, validate
+from .streams import Streaming
 from .torque import refuse_torque
 from .values import MAX_MAGNITUDE, MAX_POINTS
 
@@ -32,6 +34,7 @@ __all__ = [
     "MAX_POINTS",
     "JointTrajectoryData",
     "ReferenceGenerator",
+    "Streaming",
     "Verdict",
     "refuse_torque",
     "validate",

@@ -101,14 +101,22 @@ class Path:
         Positions, then velocities, then accelerations.
     trajectory_id : int
         The trajectory of the path; 0: a stop.
+    coast : Coast, optional
+        How it comes to rest after a last point that moves.
+    effort : (k, n) array, optional
+        Of the points [N m], linear between them, from that at the start; the last one is held, or fades in the coast.
+
     """
 
+    #: Whether the way's time is not that of the arm.
+    scaled = False
     #: The piece that a path ends in: its last state, held.
     END = -1
 
-    def __init__(self, times_ns, derivatives, trajectory_id=0):
+    def __init__(self, times_ns, derivatives, trajectory_id=0, coast=None, effort=None):
         k, n = derivatives[0].shape
         order = 2 * len(derivatives)
+        self._efforts = None if effort is None else np.vstack([np.zeros(n), effort])
         self.trajectory_id = trajectory_id
         self.start_ns = 0
         self.begin_state = np.zeros((3, n))
@@ -126,6 +134,9 @@ class Path:
             for i, values in enumerate(hermite(lengths, before, after)):
                 self._coefficients[1:, i] = values
             self._rest_peaks = _peaks(self._coefficients[1:], lengths)
+        if coast is not None:
+            self._add(coast, [values[-1] for values in derivatives])
+        order = self._coefficients.shape[1]
         # Coefficients of the current segment, for position, velocity and acceleration side by side,
         # so that one Horner scheme evaluates all three. d/dx of sum c_i x^i has (i + 1) c_{i+1}.
         self._stack = np.zeros((order, 3, n))
@@ -137,10 +148,55 @@ class Path:
         self._last = np.zeros((3, n))
         self._forget_segment()
 
+    @classmethod
+    def of(cls, trajectory, trajectory_id=0):
+        """The path of a `JointTrajectoryData`, under a number."""
+        return cls(
+            trajectory.times_ns,
+            trajectory.fields,
+            trajectory_id,
+            trajectory.coast,
+            trajectory.effort,
+        )
+
+    def _add(self, coast, last):
+        """Come to rest after the `last` point: its position, velocity and perhaps acceleration, each (n,)."""
+        pieces, self._end[0] = coast.coefficients(*last, *[0.0 * last[0]] * (3 - len(last)))
+        more, (k, order, n) = np.array(pieces), self._coefficients.shape
+        before = self._coefficients
+        self._coefficients = np.zeros((k + len(more), max(order, more.shape[1]), n))
+        self._coefficients[:k, :order] = before
+        self._coefficients[k:, : more.shape[1]] = more
+        times = np.cumsum(coast.times_ns)
+        lengths = np.array(coast.times_ns)[:, None] / SECOND
+        np.maximum(self._rest_peaks, _peaks(more, lengths), out=self._rest_peaks)
+        if self._efforts is not None:
+            held = [self._efforts[-1]] * (len(times) - 1)
+            self._efforts = np.vstack([self._efforts, *held, np.zeros(n)])
+        self._knots_ns = np.concatenate((self._knots_ns, self.duration_ns + times))
+        self.duration_ns = int(self._knots_ns[-1])
+
     @property
     def followed(self):
         """The path whose way is taken: this one."""
         return self
+
+    @property
+    def pushes(self):
+        """Whether there is an effort on the way."""
+        return self._efforts is not None
+
+    def effort(self, stamp_ns, out):
+        """Fill `out` (n,) with the effort at a stamp [N m]."""
+        elapsed_ns = min(max(stamp_ns - self.start_ns, 0), self.duration_ns)
+        knots = self._knots_ns
+        i = min(int(np.searchsorted(knots, elapsed_ns, side="right")), len(knots) - 1)
+        x = (elapsed_ns - knots[i - 1]) / max(knots[i] - knots[i - 1], 1)
+        out[:] = (1.0 - x) * self._efforts[i - 1] + x * self._efforts[i]
+
+    def rate(self, stamp_ns):
+        """How fast the path's time goes [-]."""
+        return 1.0
 
     def elapsed(self, stamp_ns):
         """Time of this path that a stamp stands for, from its start [s]."""
@@ -208,9 +264,13 @@ class Path:
         self._segment, self._low_ns, self._high_ns = -1, 0, 0
         self._last_ns = -1
 
-    def begin(self, start_ns, reference):
-        """Start at a stamp [ns] from a (3, n) reference state; may be called again."""
+    def begin(self, start_ns, reference, effort=None):
+        """Start at a stamp [ns] from a (3, n) reference state and an effort (n,), if any; may be called again."""
         self.start_ns = start_ns
+        if effort is not None and self._efforts is None and effort.any():
+            self._efforts = np.zeros((len(self._knots_ns), effort.size))
+        if self._efforts is not None:
+            self._efforts[0] = 0.0 if effort is None else effort
         self.begin_state = np.array(reference)
         self._forget_segment()
         length_ns = int(self._knots_ns[1])
@@ -297,16 +357,17 @@ class Slowing:
             return elapsed, 1.0, 0.0
         if x >= 1.0:
             return 0.5 * self.duration, 0.0, 0.0
-        covered, speed, change, _ = _slowing(x)
+        covered, speed, change, _ = slowing(x)
         return covered * self.duration, speed, change / self.duration
 
     @staticmethod
     def table(count):
         """At `count` places x from 0 to 1: s / T and its first three derivatives by x, (4, count) [-]."""
-        return np.array(_slowing(np.linspace(0.0, 1.0, count)))
+        return np.array(slowing(np.linspace(0.0, 1.0, count)))
 
 
-def _slowing(x):
+def slowing(x):
+    """s / T, its rate 1 - S, and the next two derivatives, at x = t / T from 0 to 1 [-]."""
     y, x4 = 1.0 - x, x * x * x * x
     return (
         x - x4 * x * (7.0 - x * (14.0 - x * (10.0 - 2.5 * x))),
@@ -321,7 +382,7 @@ class SlowedPath:
 
     Parameters
     ----------
-    path : Path
+    path : Path or ScaledPath
         Begun, and not changed any more.
     start_ns : int
         Stamp at which slowing begins [ns].
@@ -332,7 +393,8 @@ class SlowedPath:
     trajectory_id = 0
 
     def __init__(self, path, start_ns, duration_ns):
-        self.followed, self.start_ns, self.duration_ns = path, start_ns, duration_ns
+        self._way, self.start_ns, self.duration_ns = path, start_ns, duration_ns
+        self.followed, self.scaled = path.followed, path.scaled
         self._slowing = Slowing(duration_ns / SECOND)
         self._begin_ns = max(start_ns - path.start_ns, 0)
         self.begin_state, self._end = np.zeros((2, *path.begin_state.shape))
@@ -343,23 +405,37 @@ class SlowedPath:
     def _place(self, s):
         """Stamp of the path, and what is left to it [s], at a time s of the path since the stop began [s]."""
         whole = int(s * SECOND)
-        return self.followed.start_ns + self._begin_ns + whole, s - whole / SECOND
+        return self._way.start_ns + self._begin_ns + whole, s - whole / SECOND
+
+    def _at(self, stamp_ns):
+        """The `_place` of a stamp."""
+        since = max(stamp_ns - self.start_ns, 0) / SECOND
+        return self._place(self._slowing.at(since)[0])
 
     def elapsed(self, stamp_ns):
         """Time of the path that a stamp stands for, from the path's start [s]."""
-        since = max(stamp_ns - self.start_ns, 0) / SECOND
-        return self._begin_ns / SECOND + self._slowing.at(since)[0]
+        place, rest = self._at(stamp_ns)
+        return self._way.elapsed(place) + rest
 
     def speed(self, stamp_ns, offset=0.0):
         """How fast the path's time goes, s', `offset` [s] from a stamp [-]."""
         return self._slowing.at((stamp_ns - self.start_ns) / SECOND + offset)[1]
 
+    @property
+    def pushes(self):
+        """Whether there is an effort on the way."""
+        return self._way.pushes
+
+    def effort(self, stamp_ns, out):
+        """Fill `out` (n,) with the effort at a stamp [N m]: the path's, as far as it moves."""
+        self._way.effort(self._at(stamp_ns)[0], out)
+        out *= self.speed(stamp_ns)
+
     def piece(self, stamp_ns):
         """Number of the path's polynomial at a stamp; `Path.END` at the end and after it."""
-        elapsed_ns = max(stamp_ns - self.start_ns, 0)
-        if elapsed_ns >= self.duration_ns:
+        if max(stamp_ns - self.start_ns, 0) >= self.duration_ns:
             return Path.END
-        return self.followed.piece(self._place(self._slowing.at(elapsed_ns / SECOND)[0])[0])
+        return self._way.piece(self._at(stamp_ns)[0])
 
     def evaluate(self, stamp_ns, out):
         """Fill `out` (3, n) with the state at a stamp; return whether it is before the end."""
@@ -380,9 +456,14 @@ class SlowedPath:
         if offset:
             later, speed, change = self._slowing.at(now + offset)
             rest += later - s
-        moving = self.followed.near(place, rest, out)
-        _, velocity, acceleration = out
-        acceleration *= speed * speed
-        acceleration += change * velocity
-        velocity *= speed
+        moving = self._way.near(place, rest, out)
+        at_rate(out, speed, change)
         return moving
+
+
+def at_rate(state, rate, change):
+    """Turn a state (3, n) by a path's own time into one by the arm's, for a rate [-] and its change [1/s]."""
+    _, velocity, acceleration = state
+    acceleration *= rate * rate
+    acceleration += change * velocity
+    velocity *= rate

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generates the reference of the joints: holds, trajectories and stops."""
+"""Generates the reference of the joints: holds, trajectories and stops, and what is added to the torque."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from flexarm_dynamics.errors import TrajectoryError
 
 from .path import Path, SlowedPath, Slowing
 from .request import JointTrajectoryData
+from .scaling import ScaledPath, TimeLaw
 from .values import (
     BRAKING_STEP,
     MAX_BRAKING,
@@ -36,6 +37,10 @@ MORE = 1.15, 1.3
 SLOW_FRACTION = 0.2
 #: Least duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
 PERIODS = 1.2, 1.5
+#: Least time in which speed scaling changes, or an effort goes [s].
+MIN_RAMP = 0.1
+#: A turn of a continuous joint [rad].
+TURN = 2.0 * np.pi
 #: Ratio of the times that are tried for a stop, and the time law at the places where each is judged.
 LONGER, _TABLE = 1.1, Slowing.table(33)[:, :, None]
 
@@ -71,11 +76,17 @@ class ReferenceGenerator:
         Limit of the mean speed between the reference at the start and the first point [rad/s].
     period : float
         Of the lowest bending mode [s]; a stop takes longer, and so hardly excites it. 0: none.
+    continuous : (n,) array_like of bool, optional
+        Joints that turn without an end: a trajectory is moved by whole turns, to the one that is nearest.
 
     Attributes
     ----------
     position, velocity, acceleration : (n,) arrays
         The reference at the last sampled stamp [rad], [rad/s], [rad/s^2]; overwritten in place.
+    effort : (n,) array
+        What is added to the torque there [N m].
+    speed_scaling : float
+        Factor on the time of trajectories, from 0 to 1; see `scale`.
     active : bool
         A trajectory is being followed: from its start until its end.
     finished : bool
@@ -88,7 +99,9 @@ class ReferenceGenerator:
         Whether a trajectory whose start is past, and whose end is not, is followed from now on; else it is refused.
     """
 
-    def __init__(self, joint_names, start_tolerance=0.01, velocity_max=None, period=0.0):
+    def __init__(
+        self, joint_names, start_tolerance=0.01, velocity_max=None, period=0.0, continuous=None
+    ):
         self.joint_names = tuple(joint_names)
         if not 0.0 <= start_tolerance < np.inf:
             raise TrajectoryError(
@@ -110,7 +123,9 @@ class ReferenceGenerator:
             )
         self._period = float(period)
         n = len(self.joint_names)
-        self.joins = False
+        self._continuous = np.zeros(n, bool) if continuous is None else np.array(continuous, bool)
+        self.joins, self.speed_scaling = False, 1.0
+        self.effort = np.zeros(n)
         self._state = np.zeros((3, n))
         self._scratch, self._near = np.zeros((3, n)), np.zeros((3, n))
         self.position, self.velocity, self.acceleration = self._state
@@ -129,6 +144,7 @@ class ReferenceGenerator:
         self._pending = None  # begins at its own start_ns
         self._last_accepted = None
         self.active = self.finished = self.stopping = False
+        self.effort[:] = 0.0
 
     def start(self, position, stamp_ns, velocity=None, deceleration=GENTLE):
         r"""Hold a measured position, or brake from how the arm moves; earlier trajectories are forgotten.
@@ -200,31 +216,52 @@ class ReferenceGenerator:
         except TrajectoryError as error:
             return Verdict(False, str(error), 0)
         verdict = self._accept(ahead)
-        if ahead is not trajectory:
-            self._last_accepted = trajectory
+        self._last_accepted = trajectory
+        if ahead.stamp_ns != trajectory.stamp_ns:
             late = seconds(self._last_ns - trajectory.stamp_ns)
             reason = f"joined {late} after its start: {verdict.reason}"
             verdict = replace(verdict, reason=reason, joined=True)
         return verdict
 
     def ahead(self, trajectory):
-        """What is left of a trajectory that is joined, see `joins`: it starts now, with fewer points; else itself.
+        """What is followed of a trajectory: continuous joints the short way, what is left of one that is joined.
 
-        An arm that is not on its way, within the tolerance of a start, is given at least the lowest mode's period to
-        get there: nearer points are left out, but the last. Any thread may ask.
+        One that is joined, see `joins`, starts now, with fewer points. An arm that is not on its way, within the
+        tolerance of a start, is given at least the lowest mode's period to get there: nearer points are left out, but
+        the last. The trajectory itself where nothing is changed. Any thread may ask.
         """
         now, start = self._last_ns, trajectory.stamp_ns
-        if not self.joins or now is None or not 0 < start < now:
-            return trajectory
-        elapsed = now - start
-        if elapsed >= trajectory.times_ns[-1]:
+        if now is None or trajectory.joint_names != self.joint_names:
             return trajectory  # `_check` refuses it
+        late = self.joins and 0 < start < now and now - start < trajectory.times_ns[-1]
+        if not (late or self._continuous.any()):
+            return trajectory
+        here = self.start_of(0 if late else start)
+        if not late:
+            return self._short_way(trajectory, trajectory.positions[0], here[0])
         state = np.zeros((3, len(self.joint_names)))
-        path = Path(trajectory.times_ns, trajectory.fields)
+        path = Path.of(trajectory)
         path.begin(start, np.array([trajectory.positions[0], state[1], state[2]]))
         path.evaluate(now, state)
-        on_its_way = (np.abs(state[0] - self.start_of(0)[0]) <= self._start_tolerance).all()
-        return rest_of(trajectory, now, 0.0 if on_its_way else self._period)
+        away = state[0] - here[0]
+        away -= self._turns(away)
+        on_its_way = (np.abs(away) <= self._start_tolerance).all()
+        left = rest_of(trajectory, now, 0.0 if on_its_way else self._period)
+        return self._short_way(left, state[0], here[0])
+
+    def _turns(self, angle):
+        """Whole turns of the continuous joints in an angle (n,) [rad]."""
+        return np.where(self._continuous, TURN * np.round(angle / TURN), 0.0)
+
+    def _short_way(self, trajectory, first, here):
+        """The trajectory moved by whole turns, so that `first` is near to `here`, each (n,) [rad]."""
+        turns = self._turns(first - here)
+        if not turns.any():
+            return trajectory
+        positions = trajectory.positions - turns
+        positions.flags.writeable = False
+        first = None if trajectory.first is None else trajectory.first - turns
+        return replace(trajectory, positions=positions, first=first)
 
     def repeats(self, trajectory):
         """Whether a trajectory is the last accepted one again."""
@@ -297,8 +334,10 @@ class ReferenceGenerator:
                 hint="use stamp 0 for now, or a stamp of arm_state plus the wait",
             )
         self._reference_at_start(trajectory.stamp_ns)
-        distance = np.abs(trajectory.positions[0] - self._scratch[0])
-        time = int(trajectory.times_ns[0]) / SECOND
+        at_once = trajectory.first is not None
+        first = trajectory.first if at_once else trajectory.positions[0]
+        distance = np.abs(first - self._scratch[0])
+        time = 0.0 if at_once else int(trajectory.times_ns[0]) / SECOND
         field, names = "points[0].positions", self.joint_names
         if time == 0.0:
             far = distance > self._start_tolerance
@@ -325,7 +364,7 @@ class ReferenceGenerator:
         self._reference_at(path, stamp_ns)
 
     def _accept(self, trajectory):
-        path = Path(trajectory.times_ns, trajectory.fields, self.accepted_id + 1)
+        path = Path.of(trajectory, self.accepted_id + 1)
         replaced = self._pending
         self._pending = None
         if trajectory.stamp_ns == 0:
@@ -339,7 +378,6 @@ class ReferenceGenerator:
         if replaced is not None:
             reason += f"; replaces trajectory {replaced.trajectory_id}, which had not started"
         self.accepted_id = path.trajectory_id
-        self._last_accepted = trajectory
         return Verdict(True, reason, path.trajectory_id)
 
     def sample(self, stamp_ns):
@@ -364,6 +402,10 @@ class ReferenceGenerator:
         if path is None:
             return
         moving = path.evaluate(stamp_ns, self._state)
+        if path.pushes:
+            path.effort(stamp_ns, self.effort)
+        else:
+            self.effort[:] = 0.0
         of_trajectory = path.trajectory_id > 0
         self.active = moving and of_trajectory
         self.finished = not moving and of_trajectory
@@ -382,10 +424,80 @@ class ReferenceGenerator:
         return self._near
 
     def _follow(self, path, start_ns):
-        """Change to a path, from the reference at its start."""
-        self._reference_at(self._path, start_ns)
-        path.begin(start_ns, self._scratch)
-        self._path = path
+        """Change to a path, from the reference at its start, and at the factor on the time."""
+        before, factor = self._path, self.speed_scaling
+        law = TimeLaw(start_ns, 0.0, factor)
+        if before is not None and before.scaled and before.trajectory_id:
+            begin, law = before.own(start_ns), before.law.since(start_ns)
+        else:
+            moving = self._moves_at(start_ns)
+            begin = self._scratch
+            if moving and factor != 1.0:
+                law = TimeLaw(start_ns).changed(start_ns, factor, max(self._period, MIN_RAMP))
+        path.begin(start_ns, begin, self._effort_at(start_ns))
+        scaled = law.ramps or law.level != 1.0
+        self._path = ScaledPath(path, law) if scaled else path
+
+    def _effort_at(self, stamp_ns):
+        """Effort (n,) of the path that is followed at a stamp [N m]."""
+        out = np.zeros_like(self.effort)
+        if self._path is not None and self._path.pushes:
+            self._path.effort(stamp_ns, out)
+        return out
+
+    def scale(self, factor, deceleration=GENTLE, given=True):
+        """Have the time of trajectories go at a factor from 0 to 1 from now on; see module `scaling`.
+
+        A trajectory that is followed goes over to it within the time of a stop, as of `stop`; stops are not scaled.
+
+        Parameters
+        ----------
+        factor : float
+            [-]; 0: the arm rests on its way.
+        deceleration : float or (n,) array_like
+            As of `stop` [rad/s^2].
+        given : bool or (n,) array_like of bool
+            As of `stop`.
+
+        Raises
+        ------
+        TrajectoryError
+            If the factor is not within 0 and 1; nothing changes then.
+        """
+        if not 0.0 <= factor <= 1.0:
+            raise TrajectoryError(
+                "is out of range", field="speed_scaling", value=factor, limit="0 to 1"
+            )
+        if factor == self.speed_scaling:
+            return
+        self.speed_scaling, path = float(factor), self._path
+        if path is None or not (path.trajectory_id and self.active):
+            return
+        now = self._last_ns
+        bound = _decelerations(deceleration, self.joint_names)
+        limits = _limits(path, bound, np.asarray(given, dtype=bool), self._period)
+        try:
+            duration = _braking_time(path, now, *limits) / SECOND
+        except TrajectoryError:  # it can't be stopped either, but it can go slower
+            duration = MAX_BRAKING
+        law = path.law if path.scaled else TimeLaw(now, path.elapsed(now))
+        law = law.changed(now, self.speed_scaling, max(duration, MIN_RAMP))
+        self._path = ScaledPath(path.followed, law)
+
+    def look_at(self, stamp_ns):
+        """State (3, n) of what is followed, or will be, at a stamp `stamp_ns` [ns]; None while there is nothing.
+
+        What has been accepted and waits counts from its start on. Nothing changes.
+        """
+        if self._last_ns is None:
+            return None
+        self._reference_at_start(stamp_ns)
+        pending, state = self._pending, self._scratch
+        if pending is not None and stamp_ns >= pending.start_ns:
+            self._reference_at_start(pending.start_ns)
+            pending.begin(pending.start_ns, self._scratch, self._effort_at(pending.start_ns))
+            pending.evaluate(stamp_ns, state)
+        return state.copy()
 
     def _reference_at(self, path, stamp_ns):
         """Fill the scratch state with the reference that a path gives at a stamp."""
@@ -424,17 +536,28 @@ class ReferenceGenerator:
         if self._last_ns is None:
             raise TrajectoryError("no state yet", hint="there is no reference to stop")
         bound = _decelerations(deceleration, self.joint_names)
+        effort = self._effort_at(stamp_ns)
         moving, path = self._moves_at(stamp_ns), self._path
         if moving and path.trajectory_id:
             limits = _limits(path, bound, np.asarray(given, dtype=bool), self._period)
             duration_ns = _braking_time(path, stamp_ns, *limits)
             path = SlowedPath(path, stamp_ns, duration_ns)
+        elif not moving and effort.any():
+            path, moving = self._fading(effort, stamp_ns), True
         self._drop_all()
+        self.effort[:] = effort
         self._path = path if moving else None
         self.stopping = moving
         if not moving:
             np.copyto(self._state, self._scratch)
         self._last_ns = max(self._last_ns, stamp_ns)
+
+    def _fading(self, effort, stamp_ns):
+        """A path at rest in the scratch state, on which an effort goes."""
+        time_ns = round(max(self._period, MIN_RAMP) * SECOND)
+        path = Path([time_ns], [self._scratch[:1].copy()])
+        path.begin(stamp_ns, self._scratch, effort)
+        return path
 
     def _moves_at(self, stamp_ns):
         """Whether the reference moves at a stamp; its state goes to the scratch state."""
@@ -460,8 +583,12 @@ def rest_of(trajectory, now_ns, least):
     times_ns = trajectory.times_ns - (now_ns - trajectory.stamp_ns)
     first = int(np.searchsorted(times_ns, max(round(least * SECOND), 1)))
     left = slice(min(first, times_ns.size - 1), None)
-    fields = [values[left] for values in trajectory.fields]
-    return JointTrajectoryData(now_ns, trajectory.joint_names, times_ns[left], *fields)
+    kept = {
+        name: values[left]
+        for name in ("positions", "velocities", "accelerations", "effort")
+        if (values := getattr(trajectory, name)) is not None
+    }
+    return replace(trajectory, stamp_ns=now_ns, times_ns=times_ns[left], first=None, **kept)
 
 
 def _decelerations(deceleration, joint_names):
@@ -518,11 +645,12 @@ def _limits(path, deceleration, given, period):
 
 def _braking_time(path, stamp_ns, limits, shortest):
     """Time of a stop from a stamp on [ns], as `ReferenceGenerator.stop` says."""
-    begin = max(path.elapsed(stamp_ns), 0.0)
+    begin, rate = max(path.elapsed(stamp_ns), 0.0), path.rate(stamp_ns)
+    rates = np.array([rate, rate**2, rate**3])[:, None, None]
 
     def fits(time):
         covered, speed, change, bend = _TABLE
-        v, a, j = path.derivatives(begin + time * covered[:, 0])
+        v, a, j = rates * path.derivatives(begin + rate * time * covered[:, 0])
         slowing = v * (change / time)
         total = a * speed**2 + slowing
         jerk = j * speed**3 + 3.0 * a * speed * change / time + v * bend / time**2
@@ -533,7 +661,7 @@ def _braking_time(path, stamp_ns, limits, shortest):
     while not fits(time):
         time *= LONGER
         if time > MAX_BRAKING:
-            if begin + MAX_BRAKING < path.duration_ns / SECOND:
+            if begin + rate * MAX_BRAKING < path.duration_ns / SECOND:
                 raise TrajectoryError(
                     "s are not enough for a stop",
                     field="braking time",

@@ -4,13 +4,14 @@
 import operator
 from array import array
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
 from flexarm_dynamics.shown import listed
 
+from .streams import ADD, PLAIN, REFUSE, Coast, are_near, smoothed
 from .values import (
     END_VELOCITY_TOLERANCE,
     MAX_MAGNITUDE,
@@ -38,6 +39,9 @@ class JointTrajectoryData:
     positions: np.ndarray  # (k, n) [rad]
     velocities: np.ndarray | None = None  # (k, n) [rad/s]; None: linear interpolation
     accelerations: np.ndarray | None = None  # (k, n) [rad/s^2]; None: cubic interpolation at most
+    effort: np.ndarray | None = None  # (k, n) [N m], added to the torque; None: none
+    coast: Coast | None = None  # how it comes to rest after a last point that moves
+    first: np.ndarray | None = None  # position at time 0, (n,) [rad], of which no point is left
 
     @property
     def times(self) -> np.ndarray:
@@ -54,8 +58,12 @@ class JointTrajectoryData:
         """Whether `other` has the same joints, the same stamp and the same points, bit by bit."""
         if self.stamp_ns != other.stamp_ns or self.joint_names != other.joint_names:
             return False
-        mine, others = [self.times_ns, *self.fields], [other.times_ns, *other.fields]
-        return len(mine) == len(others) and all(map(np.array_equal, mine, others))
+        mine, others = (
+            [t.times_ns, *t.fields, *([] if t.effort is None else ["effort", t.effort])]
+            for t in (self, other)
+        )
+        same = len(mine) == len(others) and all(map(np.array_equal, mine, others))
+        return same and self.coast == other.coast
 
 
 def validate(
@@ -67,6 +75,7 @@ def validate(
     position_high=None,
     velocity_max=None,
     held=None,
+    streaming=PLAIN,
 ) -> JointTrajectoryData:
     """Check an untrusted trajectory, and bring it to the arm's joint order.
 
@@ -80,8 +89,8 @@ def validate(
         Start [ns]; 0 means now.
     points : sequence
         One `(time_from_start_ns, positions, velocities, accelerations, effort)` per point, the
-        last four sequences in the order of `joint_names` [ns, rad, rad/s, rad/s^2]. Velocities
-        and accelerations may be empty, but then in every point; effort must be empty.
+        last four sequences in the order of `joint_names` [ns, rad, rad/s, rad/s^2, N m].
+        Velocities, accelerations and effort may be empty, but then in every point.
     position_low, position_high : (n,) array_like, optional
         Limits of the positions in the arm's order [rad]; infinite where there is none.
     velocity_max : (n,) array_like, optional
@@ -89,6 +98,8 @@ def validate(
         the mean speed between two points, which no curve through both can stay below.
     held : (n,) array_like, optional
         Where the joints are that the message may leave out: they stay there [rad]. Not given: it may leave out none.
+    streaming : Streaming
+        Whether the end may move, how near positions are smoothed, and what becomes of effort.
 
     Raises
     ------
@@ -104,13 +115,7 @@ def validate(
         _field(name, column, arm_joint_names, order, held)
         for name, column in zip(_FIELDS[1:4], columns[1:4], strict=True)
     ]
-    filled = np.flatnonzero(_lengths("effort", columns[4]))
-    if filled.size:
-        raise TrajectoryError(
-            "is not empty",
-            field=f"points[{int(filled[0])}].effort",
-            hint="leave it empty: the torque is computed from the motion",
-        )
+    effort = _effort(columns[4], arm_joint_names, order, streaming.effort)
     if fields[0] is None:
         raise TrajectoryError(
             "is empty", field="points[0].positions", hint="give the position of every joint"
@@ -121,10 +126,68 @@ def validate(
             field="points[0]",
             hint="give both, or leave out the accelerations",
         )
-    trajectory = JointTrajectoryData(stamp_ns, arm_joint_names, times_ns, *fields)
-    _refuse_end_velocity(trajectory)
+    trajectory = JointTrajectoryData(stamp_ns, arm_joint_names, times_ns, *fields, effort=effort)
     _check_limits(trajectory, position_low, position_high, velocity_max)
+    if fields[1] is None:
+        return _smoothed(trajectory, streaming.smoothing)
+    if not streaming.moving_end:
+        _refuse_end_velocity(trajectory)
+    elif (np.abs(fields[1][-1]) > END_VELOCITY_TOLERANCE).any():
+        trajectory = replace(trajectory, coast=streaming.coast(fields[1][-1]))
+        _check_rest(trajectory, position_low, position_high)
     return trajectory
+
+
+def _effort(column, arm_joint_names, order, treatment):
+    """Effort of all points, (k, n) [N m], if it is added; it is refused here otherwise, or left out: None."""
+    if treatment == ADD:
+        return _field("effort", column, arm_joint_names, order, None)
+    filled = np.flatnonzero(_lengths("effort", column))
+    if filled.size and treatment == REFUSE:
+        raise TrajectoryError(
+            "is not empty",
+            field=f"points[{int(filled[0])}].effort",
+            hint="leave it empty: the torque is computed from the motion; or set effort_in_points to add or ignore",
+        )
+    return None
+
+
+def _smoothed(trajectory, window):
+    """A trajectory of positions alone, smoothed over a window [s] where they are near."""
+    if not window or not are_near(trajectory.times_ns, window):
+        return trajectory
+    times_ns, fields = smoothed(trajectory.times_ns, trajectory.positions, window)
+    effort = trajectory.effort
+    if effort is not None:
+        before = np.clip(times_ns, *trajectory.times_ns[[0, -1]])
+        effort = np.stack([np.interp(before, trajectory.times_ns, e) for e in effort.T], axis=1)
+    for values in (times_ns, *fields):
+        values.flags.writeable = False
+    return JointTrajectoryData(
+        trajectory.stamp_ns,
+        trajectory.joint_names,
+        times_ns,
+        *fields,
+        effort,
+        first=None if trajectory.times_ns[0] else trajectory.positions[0],
+    )
+
+
+def _check_rest(trajectory, position_low, position_high):
+    """Refuse a last point from which the arm would come to rest outside of the limits."""
+    names, last = trajectory.joint_names, trajectory.times_ns.size - 1
+    state = [values[-1] for values in trajectory.fields]
+    _, rest = trajectory.coast.coefficients(*state, *[0.0 * state[0]] * (3 - len(state)))
+    rest = rest[None]
+    for side, limit, beyond in (
+        ("below", position_low, np.less),
+        ("above", position_high, np.greater),
+    ):
+        if limit is not None:
+            problem = f"rad is where the arm would come to rest after it, {side} the limit"
+            hint = "slow down before the limit, or lower cmd_timeout"
+            limit = np.asarray(limit, float)
+            refuse_joint("positions", beyond(rest, limit), rest, names, problem, limit, hint, last)
 
 
 def _column_order(joint_names, arm_joint_names, partial):
@@ -310,7 +373,8 @@ def _refuse_end_velocity(trajectory):
         return
     end = trajectory.velocities[-1:]
     moving = np.abs(end) > END_VELOCITY_TOLERANCE
-    problem, hint = "rad/s is not zero at the last point", "the arm holds there"
+    problem = "rad/s is not zero at the last point"
+    hint = "the arm holds there; for a stream set allow_nonzero_velocity_at_trajectory_end"
     names, last = trajectory.joint_names, trajectory.times_ns.size - 1
     refuse_joint("velocities", moving, end, names, problem, 0.0, hint, last)
 

@@ -16,7 +16,7 @@ from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 from flexarm_dynamics.singular_perturbation import slow_torque
 
 from .path import Path
-from .values import TORQUE_ROUNDING
+from .values import SECOND, TORQUE_ROUNDING
 
 #: Places per polynomial: a peak between them is right to half a percent with the most.
 MIN_PLACES, MAX_PLACES = 2, 33
@@ -54,11 +54,14 @@ def refuse_torque(model, trajectory, start, limit):
     """
     if np.isinf(limit).all():
         return
-    path = Path(trajectory.times_ns, trajectory.fields)
+    path = Path.of(trajectory)
     if start is not None:
         path.begin(0, start)
-    point, time, motion = _places(path, len(trajectory.times_ns), start is not None)
+    points = len(trajectory.times_ns)
+    piece, time, motion = _places(path, start is not None)
     needed = required_torque(model, motion)
+    if path.pushes:
+        needed += _effort(path, time, model.n_joints)
     excess = np.nan_to_num(np.abs(needed) / limit)
     worst, joint = np.unravel_index(int(np.argmax(excess)), excess.shape)
     if excess[worst, joint] <= 1.0 + TORQUE_ROUNDING:
@@ -66,15 +69,24 @@ def refuse_torque(model, trajectory, start, limit):
     name = model.joint_names[joint]
     raise TrajectoryError(
         "N m are needed there, more than the torque limit",
-        field=f"points[{point[worst]}]: torque of joint {name} at {time[worst]:.4g} s",
+        field=f"points[{min(piece[worst], points - 1)}]: torque of joint {name} at {time[worst]:.4g} s",
         value=float(f"{needed[worst, joint]:.4g}"),
         limit=float(f"{limit[joint]:.6g}"),
         hint=_hint(model, motion[worst], needed[worst], limit),
     )
 
 
-def _places(path, points, from_start):
+def _effort(path, times, n):
+    """Effort (k, n) at times (k,) from the start of a path [s]."""
+    out = np.empty((len(times), n))
+    for row, time in zip(out, times, strict=True):
+        path.effort(path.start_ns + round(time * SECOND), row)
+    return out
+
+
+def _places(path, from_start):
     """Point that each judged polynomial leads to, time from the start [s], and state (k, 3, n)."""
+    points = len(path.lengths)
     kept = np.arange(0 if from_start else 1, points)
     kept = kept[path.lengths[kept] > 0.0]
     each = int(np.clip(PLACES // max(kept.size, 1), MIN_PLACES, MAX_PLACES))

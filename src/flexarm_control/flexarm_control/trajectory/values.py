@@ -17,7 +17,7 @@ SPEED_ROUNDING = 1e-6  # [-]
 # Motions that are planned for the limit meet it to their own accuracy between the points.
 TORQUE_ROUNDING = 1e-3  # [-]
 
-UNITS = {"positions": "rad", "velocities": "rad/s", "accelerations": "rad/s^2"}
+UNITS = {"positions": "rad", "velocities": "rad/s", "accelerations": "rad/s^2", "effort": "N m"}
 SECOND = 1_000_000_000  # [ns]
 NOT_NUMBERS = (TypeError, ValueError, OverflowError)  # what conversions to numbers raise
 

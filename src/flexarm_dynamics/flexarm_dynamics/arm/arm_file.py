@@ -158,8 +158,12 @@ def _joint(s):
         limits=_limits(s),
         safe_action=s.text("safe_action", "damp", SAFE_ACTIONS),
         encoder_counts=s.integer("encoder_counts", 0, low=0, high=2**31),
+        continuous=s.flag("continuous"),
         **optional,
     )
+    if joint.continuous and any(map(math.isfinite, joint.limits.position)):
+        hint = "leave out limits.position, or continuous"
+        raise s.error("continuous", "beside limits.position", value=True, hint=hint)
     s.done()
     return joint
 

@@ -111,6 +111,7 @@ class Joint:
         "motor"  # what it measures: the motor's angle, or the link's behind the transmission
     )
     transmission: Transmission | None = None  # None: the link is fixed to the motor
+    continuous: bool = False  # turns without an end: a trajectory takes the short way
 
     @property
     def housed(self):
@@ -391,6 +392,11 @@ class Arm:
     def velocity_limits(self):
         """Largest speed of each joint, (n,) [rad/s]; infinite where the file has none."""
         return np.array([j.limits.velocity for j in self.joints], float)
+
+    @property
+    def continuous(self):
+        """Whether each joint turns without an end, (n,) bool."""
+        return np.array([j.continuous for j in self.joints], bool)
 
     @property
     def torque_limits(self):
