@@ -6,9 +6,12 @@ Names follow the paper: x = (q, qd), z = (delta, delta_d), a bar for the slow su
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.linalg import matrix_balance
+
+from .kernels import load, rigid
 
 
 @dataclass(frozen=True)
@@ -118,11 +121,14 @@ def slow_torque(terms, acceleration):
     ndarray, shape (n,)
         [N m]
     """
-    M, n = terms.M, terms.n
-    torque = M[:n, :n] @ acceleration + terms.f1
-    if terms.K1.any():
-        torque -= terms.K1 @ np.linalg.solve(terms.K2, M[n:, :n] @ acceleration + terms.f2)
-    return torque
+    t = terms
+    return _compiled().slow_torque(t.M, t.f1, t.f2, t.K1, t.K2, np.asarray(acceleration, float))
+
+
+@cache
+def _compiled():
+    """The compiled functions of `kernels.rigid`."""
+    return load.joined("rigid", (load.source(rigid),), inline=("solve",))
 
 
 def fast_subsystem(terms):

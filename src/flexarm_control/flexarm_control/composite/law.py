@@ -15,7 +15,8 @@ Two things would jump, and fade instead (module `fading`):
 
 import numpy as np
 
-from ..arrays import clip
+from .. import kernels
+from ..arrays import clip, some
 from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..feedforward.model import At
@@ -63,12 +64,12 @@ class CompositeControl:
         # Of (slow torque, delta_bar, its rate), since path, piece and stamp of the last step.
         self._pieces, self._source = Fading(n + 2 * model.n_modes, rate), None
         # Of what motion, and the slow law's torque on it.
-        self._nominal = b"", np.zeros(model.n_joints)
+        self._nominal, self._no_torque = (b"", np.zeros(n)), np.zeros(n)
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = feedforward
         if feedforward is not None:
             response = self.manifold.error_response(feedforward.settings.configuration)
-            self._response, self._error = np.vstack(response), np.zeros(2 * model.n_joints)
+            self._response, self._bar = np.vstack(response), np.zeros(2 * model.n_modes)
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
@@ -173,7 +174,7 @@ class CompositeControl:
                 self.torque += taken
                 old -= taken
             fading.jump(old)
-        return fading.left.any()
+        return some(fading.left)
 
     def _advance(self, reference, dt):
         """Advance the states of the laws, and the feed-forward's motion, to this sample."""
@@ -198,7 +199,7 @@ class CompositeControl:
         u, amplitude, rate = self._towards(q, qd, reference, terms)
         if old is not None:
             fading.jump(old - np.concatenate([u, amplitude, rate]))
-        if not fading.left.any():
+        if not some(fading.left):
             return u, amplitude, rate
         n, m = self.model.n_joints, self.model.n_modes
         more = np.split(fading.left, [n, n + m])
@@ -226,34 +227,28 @@ class CompositeControl:
         """
         u, motion, m = self.slow_torque, self.feedforward, self.model.n_modes
         if self.slow.separate:
-            u[:] = self.slow.feedback(q, qd, motion)
-            u += motion.torque
+            u[:], nominal = self.slow.feedback(q, qd, motion), self._no_torque
         else:
             terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
             u[:] = self.slow.torque(q, qd, motion, terms)
-            u += motion.torque - self._nominal_torque(
-                motion.position, motion.velocity, motion.acceleration
-            )
-        response = self._response @ self._tracking_error(q, qd, motion)
-        u += response[2 * m :]
-        return u, motion.amplitude + response[:m], motion.rate + response[m : 2 * m]
-
-    def _tracking_error(self, q, qd, motion):
-        """(q - q_motion, qd - qd_motion), shape (2n,)."""
-        error, n = self._error, self.model.n_joints
-        np.subtract(q, motion.position, out=error[:n])
-        np.subtract(qd, motion.velocity, out=error[n:])
-        return error
+            nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
+        kernels.compiled().about_motion(
+            q, qd, motion.position, motion.velocity, motion.torque, nominal, self._response, motion.amplitude,
+            motion.rate, u, self._bar,
+        )  # fmt: skip
+        return u, self._bar[:m], self._bar[m:]
 
     def _deviation(self, delta, delta_d, delta_bar, rate_bar):
         """z_f = z - z_bar, shape (2m,); NaN in the place of rates that are not known."""
         z_f, m = self.deviation, delta.size
+        if delta_d is not None:
+            kernels.compiled().deviation(
+                delta, delta_d, delta_bar, rate_bar, self.quasi_steady, z_f
+            )
+            return z_f
         self.quasi_steady[:] = delta_bar
         np.subtract(delta, delta_bar, out=z_f[:m])
-        if delta_d is None:
-            z_f[m:] = np.nan
-        else:
-            np.subtract(delta_d, rate_bar, out=z_f[m:])
+        z_f[m:] = np.nan
         return z_f
 
     def look_ahead(self):

@@ -38,7 +38,8 @@ from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import copy
 
-from ..arrays import clip
+from .. import kernels
+from ..arrays import some
 from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..fast.pole_placement import PolePlacement, reaches
@@ -48,6 +49,8 @@ from .base import Feedforward
 
 #: Prescribed degree of stability of the regulator, over the lowest bending frequency.
 DECAY = 0.3
+#: Of the simulation: of eight stages more than RK4 has, and steps five times as long.
+METHOD = "dop853"
 #: Beyond this joint error the simulated arm starts again on the reference [rad].
 LOST = 1.0
 #: Largest turn of a joint between two designs along a trajectory [rad].
@@ -219,12 +222,6 @@ class _Run:
         self.fading.take(other.fading)
         self.source, self.gained = other.source, other.gained
 
-    def copy(self):
-        """One to be run ahead."""
-        out = _Run(self.state.size, self.torque.size, self.fading.rate)
-        out.take(self)
-        return out
-
 
 class At:
     """The reference on a path's polynomial of a stamp, at an offset from it; the reference itself does not change."""
@@ -264,9 +261,10 @@ class ModelFeedforward(Feedforward):
         super().__init__(model, manifold, settings)
         n, m = model.n_joints, model.n_modes
         self._make_stepper()
-        self._substeps = substeps(model, settings.period, "rk4")
-        self._error = np.zeros(2 * (n + m))
-        self._run = _Run(2 * (n + m), n, fading_rate(model, settings.configuration))
+        self._substeps = substeps(model, settings.period, METHOD)
+        self._error, self._no_gain = np.zeros(2 * (n + m)), np.zeros((n, 2 * (n + m)))
+        rate = fading_rate(model, settings.configuration)
+        self._run, self._spare = (_Run(2 * (n + m), n, rate) for _ in range(2))
         self._name_parts()
         #: The gain, if it does not depend on the joints; else None.
         self.K = None
@@ -278,7 +276,7 @@ class ModelFeedforward(Feedforward):
 
     def _make_stepper(self):
         n, m = self.model.n_joints, self.model.n_modes
-        self._advance = self.model.stepper(METHODS["rk4"])
+        self._advance = self.model.stepper(METHODS[METHOD])
         # Compiled code is loaded at its first call: not on the control path.
         self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
 
@@ -420,12 +418,12 @@ class ModelFeedforward(Feedforward):
         """Set the torque of a run; its state, too, if the simulated arm starts again."""
         prepared, elapsed = self._preparation(reference)
         source, before = self._source(reference, prepared), run.source
-        K, fading, size = self.K, run.fading, run.state.size
+        K, fading = self.K, run.fading
         if K is None and prepared is not None and prepared.gains is not None:
             K = prepared.gains.at(elapsed)
         if self._first or before is None:
             fading.clear()
-            if not (source.rests or reference.velocity.any() or reference.acceleration.any()):
+            if not (source.rests or some(reference.velocity) or reference.acceleration.any()):
                 # A motion's first instant: the arm still rests, and the manifold has jumped.
                 rest = np.concatenate(self._on_manifold(at_rest(reference.position)))
                 fading.jump(rest - np.concatenate([source.state, source.torque]))
@@ -438,15 +436,13 @@ class ModelFeedforward(Feedforward):
             wanted = np.concatenate([source.state, source.torque]) + fading.left
             fading.jump(np.concatenate([run.state, run.torque]) - wanted)
         run.source, run.gained = source, K is not None
-        np.add(source.state, fading.left[:size], out=self._error)
-        self._error -= run.state
-        if self._starts_again(reference, K):
-            run.state += self._error
-            self._error[:] = 0.0
-        np.add(source.torque, fading.left[size:], out=run.torque)
-        if K is not None:
-            run.torque += K @ self._error
-        clip(run.torque, -self.limit, self.limit)
+        compiled, error, left = kernels.compiled(), self._error, fading.left
+        joints, largest = compiled.off(source.state, left, run.state, error)
+        if self._starts_again(reference, K, joints, largest):
+            run.state += error
+            error[:] = 0.0
+        gain = self._no_gain if K is None else K
+        compiled.regulated(source.torque, left, gain, error, self.limit, run.torque)
 
     def _move(self, run, dt):
         """Advance a run's simulated arm, under its present torque."""
@@ -457,17 +453,20 @@ class ModelFeedforward(Feedforward):
         if self._first or dt <= 0.0 or reference.path is None:
             return None
         ahead = _Ahead(reference, dt, self.limit)
-        run = ahead.run = self._run.copy()
+        run = ahead.run = self._spare
+        run.take(self._run)
         self._move(run, dt)
         self._regulate(ahead, dt, run)
         self._ahead = ahead
         n, size = self.model.n_joints, run.state.size // 2
         return run.state[:n], run.state[size : size + n], ahead.acceleration
 
-    def _starts_again(self, reference, K):
-        """Whether the simulated arm is put on the wanted state: at first, when lost, and at rest when it is there."""
-        n, first = self.model.n_joints, self._first
-        self._first = False
-        if first or K is None or not np.abs(self._error[:n]).max() < LOST:  # NaN is lost, too
+    def _starts_again(self, reference, K, joints, largest):
+        """Whether the simulated arm is put on the wanted state: at first, when lost, and at rest when it is there.
+
+        `joints` and `largest` are the largest error of the joints and of all.
+        """
+        first, self._first = self._first, False
+        if first or K is None or not joints < LOST:  # NaN is lost, too
             return True
-        return not reference.velocity.any() and np.abs(self._error).max() < THERE
+        return largest < THERE and not some(reference.velocity)

@@ -37,6 +37,7 @@ from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
 
+from .. import kernels
 from ..trajectory.values import SECOND
 from .model import At, ModelFeedforward
 
@@ -71,6 +72,13 @@ class Plan:
     torque: np.ndarray  # at the grid's times, (k, n) [N m]
     step: float  # of the grid [s]
 
+    def state_at(self, elapsed):
+        """State (2 (n + m),) at a time since the start [s]."""
+        motion = self.motion
+        out = np.empty(motion.c.shape[2])
+        kernels.compiled().cubic(motion.c, motion.x, elapsed, out)
+        return out
+
     def torque_at(self, elapsed):
         """Torque (n,) at a time since the start [s]."""
         x = elapsed / self.step
@@ -98,7 +106,7 @@ class Preview(ModelFeedforward):
         way = path.followed
         elapsed = (stamp_ns - way.start_ns) / SECOND + offset
         # The torque is held over the coming period: that of its middle.
-        state, torque = plan.motion(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
+        state, torque = plan.state_at(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
         if path is way:
             return state, torque
         stop, motion = (self._on_manifold(At(p, stamp_ns, offset)) for p in (path, way))

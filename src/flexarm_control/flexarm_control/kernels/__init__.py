@@ -8,10 +8,11 @@ from functools import cache
 
 from flexarm_dynamics.kernels import load
 
-from . import readings
+from . import law, limits, readings
 
 
 @cache
 def compiled():
-    """The compiled functions of `readings`."""
-    return load.joined("readings", (load.source(readings),), inline=("larger",))
+    """The compiled functions of all modules here."""
+    sources = [load.source(module) for module in (law, limits, readings)]
+    return load.joined("control", sources, inline=("larger",))

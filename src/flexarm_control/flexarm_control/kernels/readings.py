@@ -214,6 +214,91 @@ def renew(value, pairs, lengths, rate, windows, ages):
                 restart(value, pairs, rate, windows, w, j)
 
 
+def low_passed(rows, weights, signal):
+    """Take a sample of several signals; `rows`, (5, N), and `weights`, (3, 5), are those of `low_pass.LowPass`."""
+    for i in range(signal.size):
+        last, y1, y2, y3 = rows[0, i], rows[2, i], rows[3, i], rows[4, i]
+        rows[0, i], rows[1, i] = signal[i], last
+        for k in range(3):
+            value = weights[k, 0] * signal[i] + weights[k, 1] * last
+            rows[2 + k, i] = value + weights[k, 2] * y1 + weights[k, 3] * y2 + weights[k, 4] * y3
+
+
+def mapped(strain, amplitude, project, rows, middle, half, out):
+    """Fill `out`, (2 g,), with the strains' part that amplitudes explain, and by how much the amplitudes' differ.
+
+    Whether all of it is finite, and no gauge at an end of its range.
+
+    Parameters
+    ----------
+    strain, middle, half : ndarray, shape (g,)
+        Readings, and their ranges.
+    amplitude : ndarray, shape (m,)
+    project : ndarray, shape (g, g)
+    rows : ndarray, shape (g, m)
+    out : ndarray, shape (2 g,)
+    """
+    g, good = strain.size, True
+    for i in range(g):
+        own, its = 0.0, 0.0
+        for j in range(g):
+            own += project[i, j] * strain[j]
+        for j in range(amplitude.size):
+            its += rows[i, j] * amplitude[j]
+        out[i], out[g + i] = own, its - own
+        good &= np.isfinite(own) and np.isfinite(its) and abs(strain[i] - middle[i]) < half[i]
+    return good
+
+
+def apart(rows, zero, corner, large, fast, keep):
+    """Largest difference of `mapped`'s second half to its zero, and how large and fast the first half is of late.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (5, 2 g)
+        Of the `low_pass.LowPass` of what `mapped` gives.
+    zero : ndarray, shape (2 g,)
+    corner : float
+        Of the low pass [rad/s].
+    large, fast, keep : float
+        Before this sample, and what is left of that.
+    """
+    g, difference = zero.size // 2, 0.0
+    large, fast = keep * large, keep * fast
+    for i in range(g):
+        difference = max(difference, abs(rows[4, g + i] - zero[g + i]))
+        large = max(large, abs(rows[4, i] - zero[i]))
+        fast = max(fast, abs(corner * (rows[3, i] - rows[4, i])))
+    return difference, large, fast
+
+
+def changed(readings, last, change):
+    """Fill `change` with how far readings are from the last ones, which they replace; whether one is the same."""
+    same = False
+    for i in range(readings.size):
+        change[i] = abs(readings[i] - last[i])
+        last[i] = readings[i]
+        same |= change[i] == 0.0
+    return same
+
+
+def less(smallest, change):
+    """Take what is smaller of the changes, NaN aside."""
+    for i in range(change.size):
+        if change[i] < smallest[i]:
+            smallest[i] = change[i]
+
+
+def all_well(strain, low, high, last):
+    """Whether all readings are within their ranges, and none is that before it; `last` is then replaced by them."""
+    for i in range(strain.size):
+        if not low[i] < strain[i] < high[i] or strain[i] == last[i]:
+            return False
+    for i in range(strain.size):
+        last[i] = strain[i]
+    return True
+
+
 def restart(value, pairs, rate, windows, w, j):
     """Begin window w of pair j with this sample."""
     windows[START, w, j], windows[FIRST, w, j] = value[pairs[0, j]], rate[j]

@@ -14,6 +14,8 @@ import numpy as np
 
 from flexarm_dynamics.parameters import parameter
 
+from .. import kernels
+
 #: Answers that the reported torque may belong to.
 SENT = 64
 #: A contradiction that lasts for this long is a refusal [s]: several of the driver's timeouts, since a machine that is
@@ -41,7 +43,7 @@ class Applied:
     """
 
     def __init__(self, model, settings, limit):
-        self._names = model.joint_names
+        self._names, self._kernels = model.joint_names, kernels.compiled()
         self._sent = np.zeros((SENT, model.n_joints))
         self.configure(settings, limit)
         self.forget()
@@ -113,7 +115,7 @@ class Applied:
     def _mismatch(self, reported):
         """The joint whose reported torque is none of those sent; None where all are, or are unknown."""
         tolerance, last = self._tolerance, self._sent[self._at]
-        if tolerance is None or (np.abs(reported - last) <= tolerance).all():
+        if tolerance is None or self._kernels.alike(reported, last, tolerance):
             return None
         low, high = self._sent.min(axis=0) - tolerance, self._sent.max(axis=0) + tolerance
         wrong = (reported < low) | (reported > high)  # false for NaN, which means unknown

@@ -6,6 +6,7 @@ import numpy as np
 from flexarm_dynamics.errors import DesignError, FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
+from ..arrays import finite
 from ..payload import estimator
 from ..payload.estimator import PayloadEstimator
 from ..trajectory import ReferenceGenerator, Streaming, Verdict, refuse_torque, streams, validate
@@ -205,7 +206,7 @@ class ArmController:
             self.payload.discard(f"a sensor is in doubt: {self._doubt}")
             self.payload.restart()
             return
-        known = np.isfinite(sample.torque).all()
+        known = finite(sample.torque)
         self.payload.note(
             sample.position, sample.amplitude, sample.torque if known else self.torque, dt
         )

@@ -21,6 +21,7 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
+from .. import kernels
 from ..arrays import clip
 
 #: Of the torque limit: an arm that is taken over with less than this needs no ramp.
@@ -78,6 +79,7 @@ class Authority:
         self._rates = torque_rates(model)
         self.torque, self._weight = np.zeros((2, model.n_joints))
         self._elapsed, self._first = np.inf, False
+        self._kernels = kernels.compiled()
         self.configure(settings)
 
     def configure(self, settings):
@@ -86,10 +88,8 @@ class Authority:
         wanted = np.array(settings["torque_rate_limit"])
         self.rate = np.where(wanted > 0.0, wanted, self._rates)
         self.rate[wanted >= NO_RATE] = np.inf
-        self._least, self._time = -self.limit, settings["return_time"]
+        self._time = settings["return_time"]
         self._small = np.where(np.isfinite(self.limit), SMALL * self.limit, 0.0)
-        self._bounded = np.isfinite(self.rate)
-        self._any_bounded = bool(self._bounded.any())
 
     def limits_of(self, settings):
         """Torque limits that settings ask for, (n,) [N m]; never above the arm file's."""
@@ -105,7 +105,7 @@ class Authority:
         """Torque returns, to an arm at q (n,) [rad]: the ramp begins at the torque that holds its weight there."""
         self._elapsed, self._first = 0.0, True
         self._weight[:] = self._holding(q)
-        clip(self._weight, self._least, self.limit)
+        clip(self._weight, -self.limit, self.limit)
         self.torque[:] = self._weight
 
     def _holding(self, q):
@@ -137,7 +137,7 @@ class Authority:
         bool
             Whether a limit was met.
         """
-        torque, wanted = self.torque, u
+        torque, part = self.torque, 1.0
         if self._first:
             self._first = False
             if (np.abs(u - self._weight) <= self._small).all():
@@ -146,15 +146,5 @@ class Authority:
                 return False
         if self._elapsed < self._time:
             self._elapsed += dt
-            a = min(1.0, (self._elapsed / self._time) ** 2)
-            wanted = self._weight + a * (u - self._weight)
-        if self._any_bounded:
-            # Not inf * dt, which is NaN at a start, where dt is 0.
-            step = np.multiply(self.rate, period, out=np.full_like(u, np.inf), where=self._bounded)
-            low, high = torque - step, torque + step
-            np.copyto(torque, wanted)
-            clip(torque, low, high)
-        else:
-            np.copyto(torque, wanted)
-        clip(torque, self._least, self.limit)  # last: the size holds whatever comes before
-        return bool((torque != wanted).any())
+            part = min(1.0, (self._elapsed / self._time) ** 2)
+        return self._kernels.sent(u, self._weight, part, self.rate, period, self.limit, torque)

@@ -29,6 +29,8 @@ from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
+from .. import kernels
+
 #: A limit that is exceeded by this factor is a fault at once.
 FAULT_RATIO = 1.5
 #: Deceleration of a joint whose torque has no limit [rad/s^2].
@@ -138,6 +140,7 @@ class Supervisor:
         bounds = np.cumsum([0, *(len(names) for _, names, _ in watched)])
         self._parts = [slice(a, b) for a, b in pairwise(bounds)]
         self._ratio, self._value = np.zeros((2, len(self._names)))
+        self._no_error, self._kernels = np.zeros(model.n_joints), kernels.compiled()
         self._rows = gauge_rows(model, model.arm.gauges)
         self.forget()
         self.configure(settings, torque_limit)
@@ -173,14 +176,15 @@ class Supervisor:
             ]
         )
         self.settings = dict(settings)
-        # Range, braking deceleration and margin of each joint, plain: numbers one by one are faster than short arrays.
+        # Range, braking deceleration and margin of each joint.
         low, high = arm.position_limits.T
         margin = limit[self._parts[2]]
         able = np.maximum(able, np.finfo(float).tiny)
-        self._ranges = np.stack([low, high, able, 0.99 * FAULT_RATIO * margin], axis=1).tolist()
-        self._watches_places = margin[0] < np.inf
+        ranges = np.stack([low, high, able, 0.99 * FAULT_RATIO * margin], axis=1)
+        self._ranges = ranges[: n if margin[0] < np.inf else 0]
         self._limit, self._inverse = limit, 1.0 / limit
-        self._watches_strain = bool(np.isfinite(limit[self._parts[4]]).any())
+        watches_strain = np.isfinite(limit[self._parts[4]]).any()
+        self._watched_rows = self._rows[: None if watches_strain else 0]
         self.deceleration = np.where(wanted > 0.0, wanted, finite)
         self.deceleration_given = wanted > 0.0
 
@@ -265,21 +269,20 @@ class Supervisor:
             STOPPING: bring the arm to rest; FAULT: no torque; None: go on.
         reason : str
         """
-        value, (errors, speeds, places, bends, strains, _) = self._value, self._parts
-        self._saturated_for = self._saturated_for + dt if saturated else 0.0
-        if error is None:
-            value[errors] = 0.0
-        else:
-            np.abs(error, out=value[errors])
-        np.abs(qd, out=value[speeds])
-        if self._watches_places:
-            value[places] = self._outside(q, qd)
-        np.abs(amplitude, out=value[bends])
-        if self._watches_strain:
-            np.abs(self._rows @ amplitude, out=value[strains])
-        value[-1] = self._saturated_for
-        np.multiply(value, self._inverse, out=self._ratio)
-        if self._ratio.max() <= 1.0:
+        value = self._value
+        value[-1] = self._saturated_for = self._saturated_for + dt if saturated else 0.0
+        error = self._no_error if error is None else error
+        if not self._kernels.watched(
+            error,
+            q,
+            qd,
+            amplitude,
+            self._ranges,
+            self._watched_rows,
+            self._inverse,
+            value,
+            self._ratio,
+        ):
             self._exceeded_for = 0.0
             return None, ""
         self._exceeded_for += dt
@@ -290,18 +293,6 @@ class Supervisor:
         if self._exceeded_for > self.settings["limit_patience"]:
             return State.FAULT, f"{text}, for {self._exceeded_for:.3g} s in spite of the stop"
         return State.STOPPING, text
-
-    def _outside(self, q, qd):
-        """How far each joint is out of its range, or will be with all brakes on, [rad]."""
-        out = []
-        for position, speed, (low, high, able, most) in zip(
-            q.tolist(), qd.tolist(), self._ranges, strict=True
-        ):
-            reach = position + speed * abs(speed) / (2.0 * able)
-            # What only will be is reason to stop, not yet a fault.
-            will_be = min(max(low - reach, reach - high), most)
-            out.append(max(0.0, low - position, position - high, will_be))
-        return out
 
     def _text(self, i):
         """What limit was exceeded."""

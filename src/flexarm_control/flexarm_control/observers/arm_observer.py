@@ -7,6 +7,7 @@ from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import check_all, parameter
 
+from ..arrays import finite, some
 from ..component import make
 from ..loop.samples import WRAP, ArmSample, SampleOrder
 from . import gauge_health
@@ -267,7 +268,7 @@ class ArmObserver:
         )
         if self.settings["delay"] and observer.converged:
             x = self._predicted(x, sample.torque, self.settings["delay"])
-        if not np.isfinite(x).all():
+        if not finite(x):
             # It would stay so for ever.
             observer.reset()
             name = type(observer).__name__
@@ -310,7 +311,7 @@ class ArmObserver:
             problem = f"can't be mapped: the arm file of {self.model.arm.name} has no gauges"
             raise MessageError(problem, field="strain")
         wild = np.abs(sample.torque) >= MAX_TORQUE  # false for NaN, which means unknown
-        if wild.any():
+        if some(wild):
             i = int(np.argmax(wild))
             raise MessageError(
                 "is beyond any arm's torque",

@@ -7,6 +7,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import MessageError
 
+from ..arrays import finite
 from ..component import Component
 
 
@@ -93,7 +94,7 @@ class Observer(Component, ABC):
 
 def need_torque(torque, what, hint):
     """Refuse a sample without torque, (n,): `what` predicts with it."""
-    if not np.isfinite(torque).all():
+    if not finite(torque):
         raise MessageError(
             f"is unknown (NaN), and {what} predicts with it",
             field="joint_torque",

@@ -30,6 +30,9 @@ import numpy as np
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import parameter
 
+from .. import kernels
+from ..arrays import some
+
 #: As in flexarm_msgs/ObserverState.
 GOOD, MISSING, STUCK, SATURATED, SUSPECT = range(5)
 WORDS = ("good", "missing", "stuck", "saturated", "suspect")
@@ -112,6 +115,7 @@ class GaugeHealth:
         )
         self._redundant = bool(redundant.any())
         self._mapped = np.zeros(len(strain_map.mode_names))
+        self._kernels = kernels.compiled()
         self.health = np.zeros(len(gauges), np.uint8)
         self.doubted = np.zeros(len(gauges), bool)
         self.reset()
@@ -133,20 +137,34 @@ class GaugeHealth:
     def update(self, strain):
         """Judge the readings, shape (gauges,), of a new sample, on the control path."""
         self.health[:] = GOOD
+        if self._all_well(strain):
+            return
         outside = ~((strain > self._low) & (strain < self._high))  # NaN too
         self.health[self._stuck(strain, outside)] = STUCK
-        if outside.any():
+        if some(outside):
             self.health[outside] = SATURATED
             self.health[~np.isfinite(strain)] = MISSING
-        if self.doubted.any():
+        if some(self.doubted):
             self.health[self.doubted & (self.health == GOOD)] = SUSPECT
-        if self._holding or self.health.any():
+        if self._holding or some(self.health):
             self._hold -= 1
             np.maximum(self._hold, 0, out=self._hold)
             self._hold[self.health != GOOD] = self.stuck_samples
             self._holding = bool(self._hold.any())
         if self._redundant and not self._holding:
             self._judge_residual(strain)
+
+    def _all_well(self, strain):
+        """Whether all is well, as in nearly all samples; if so, the readings are taken note of."""
+        if self._holding or np.count_nonzero(self.doubted):
+            return False
+        if not self._kernels.all_well(strain, self._low, self._high, self._last):
+            return False
+        self._same[:] = 0
+        self._max_seen[:] = self._min_seen[:] = strain
+        if self._redundant:
+            self._judge_residual(strain)
+        return True
 
     def _stuck(self, strain, bad):
         moved = strain != self._last
@@ -176,7 +194,7 @@ class GaugeHealth:
         residual = strain - strain_map.bias
         residual -= strain_map.rows @ strain_map.amplitudes(strain, self._mapped)
         self._square += (residual**2 * self._weight - self._square) / self.stuck_samples
-        if not (self._square > self.RESIDUAL**2).any():
+        if not np.count_nonzero(self._square > self.RESIDUAL**2):
             return
         # A wrong gauge spoils the others' residuals too, so only the largest of its link and direction is suspect.
         largest = np.where(self._mates, self._square, 0.0).max(axis=1)

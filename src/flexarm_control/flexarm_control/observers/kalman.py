@@ -157,7 +157,9 @@ class Kalman(Observer):
 
     def _advance(self, torque, dt):
         """Predict over dt [s] and correct by `_measured`."""
-        before = np.diagonal(self.covariance)[self._p : 2 * self._p].copy()
+        before = (
+            None if self.converged else self.covariance.diagonal()[self._p : 2 * self._p].copy()
+        )
         x, step = self._predict(torque, dt)
         # Nothing is assigned before everything is computed: a failure changes nothing.
         innovation = self._measured - self._output(x)
@@ -171,7 +173,7 @@ class Kalman(Observer):
         self._publish()
         self._elapsed += dt
         if not self.converged:
-            after = np.diagonal(self.covariance)[self._p : 2 * self._p]
+            after = self.covariance.diagonal()[self._p : 2 * self._p]
             self.converged = bool(np.all(after >= (1.0 - self.SETTLED) * before))
 
     def _start(self, sample):
@@ -215,7 +217,7 @@ class Kalman(Observer):
         P = P - gain.T @ seen
         P -= (self._output(P.T).T - gain.T @ R) @ gain
         P = 0.5 * (P + P.T)
-        variance, last = np.diagonal(P), np.diagonal(self.covariance)
+        variance, last = P.diagonal(), self.covariance.diagonal()
         same = np.all(np.abs(variance - last) <= self.STEADY * variance)
         self._steady = bool(same) and step is self._step
         self._step, self._root, self._gain_transposed = step, root, gain
@@ -232,7 +234,7 @@ class Kalman(Observer):
         n, p, x = self._n, self._p, self.state
         self.joint_position[:], self.amplitude[:] = x[:n], x[n:p]
         self.joint_velocity[:], self.rate[:] = x[p : p + n], x[p + n : 2 * p]
-        m, variance = p - n, np.diagonal(self.covariance)
+        m, variance = p - n, self.covariance.diagonal()
         self.covariance_diagonal[:m] = variance[n:p]
         self.covariance_diagonal[m:] = variance[p + n : 2 * p]
 

@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 
+from .. import kernels
 from .values import SECOND
 
 #: Places of a polynomial at which its acceleration and jerk are looked at, as fractions of its length.
@@ -140,10 +141,8 @@ class Path:
         # Coefficients of the current segment, for position, velocity and acceleration side by side,
         # so that one Horner scheme evaluates all three. d/dx of sum c_i x^i has (i + 1) c_{i+1}.
         self._stack = np.zeros((order, 3, n))
-        self._rows = tuple(self._stack[::-1])
         self._once = np.arange(1.0, order)[:, None]
         self._twice = self._once[:-1] * self._once[1:]
-        self._x = np.zeros(())
         # The last evaluated state: most stamps are evaluated twice, ahead of time and when sampled.
         self._last = np.zeros((3, n))
         self._forget_segment()
@@ -312,13 +311,7 @@ class Path:
         return True
 
     def _horner(self, x, out):
-        self._x[()] = x
-        rows = self._rows
-        np.multiply(rows[0], self._x, out)
-        for row in rows[1:-1]:
-            np.add(out, row, out)
-            np.multiply(out, self._x, out)
-        np.add(out, rows[-1], out)
+        kernels.compiled().horner(self._stack, x, out)
 
     def _enter_segment(self, elapsed_ns):
         """Find the segment of a time before the end, and lay out its coefficients."""

@@ -19,6 +19,7 @@ s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a
 import numpy as np
 
 from ... import kernels
+from ...arrays import some
 from ...kernels import readings
 
 #: Lengths of the windows in samples; the short one is quick, the long one sees slow motion and coarse encoders.
@@ -91,7 +92,7 @@ class Agreement:
         ndarray of int or None
             Pairs for which there is evidence; None in nearly all samples.
         """
-        if not np.isfinite(value[self.pairs[1]]).any():  # none is given
+        if not some(np.isfinite(value[self.pairs[1]])):  # none is given
             self._begun = False
             return None
         if not self._begun:

@@ -14,8 +14,11 @@ largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` sam
 evidence. Which of the two is wrong does not show.
 """
 
+from math import exp
+
 import numpy as np
 
+from ... import kernels
 from .agreement import LATE
 from .low_pass import LowPass
 from .strain_law import corner_of
@@ -47,7 +50,7 @@ class SourceAmplitudes:
         c = self._channels = channels
         self._rows, self._project = strain_map.rows, strain_map.rows @ strain_map.inverse
         self._floor = ZERO * max(g.full_scale for g in c.model.arm.gauges)
-        self._low = LowPass(2 * c.g, corner_of(c.model))
+        self._low, self._kernels = LowPass(2 * c.g, corner_of(c.model)), kernels.compiled()
         self._now = np.zeros(2 * c.g)
         self.reset()
 
@@ -74,32 +77,26 @@ class SourceAmplitudes:
         bool
             Whether amplitudes and strains contradict each other.
         """
-        c, g, now = self._channels, self._channels.g, self._now
+        c, now = self._channels, self._now
         strain, amplitude = value[c.strain], value[c.amplitude]
         if amplitude[0] != amplitude[0]:  # NaN, as most sources have it
             if self._count:
                 self.reset()
             return False
-        np.dot(self._project, strain, out=now[:g])
-        np.dot(self._rows, amplitude, out=now[g:])
-        if not np.isfinite(now).all() or c.at_end(strain).any():
+        if not self._kernels.mapped(strain, amplitude, self._project, self._rows, *c.range, now):
             self.reset()
             return False
-        now[g:] -= now[:g]
         if self._count == 0:
             self._low.start(now)
         else:
             self._low.update(now, dt)
-        signal = self._low.signal
         self._count += 1
         self._age += dt
         if self._age <= LEARNT:
-            self._zero += (signal - self._zero) / self._count
-        keep = np.exp(-dt / KEPT)
-        left = np.abs(signal - self._zero)
-        self._large = max(keep * self._large, float(left[:g].max()))
-        self._fast = max(keep * self._fast, float(np.abs(self._low.first[:g]).max()))
-        self.difference = float(left[g:].max())
+            self._zero += (self._low.signal - self._zero) / self._count
+        self.difference, self._large, self._fast = self._kernels.apart(
+            self._low.rows, self._zero, self._low.corner, self._large, self._fast, exp(-dt / KEPT)
+        )
         self.bound = self._floor + SHARE * self._large + LATE * self._fast
         self._beyond = self._beyond + 1 if self.difference > self.bound else 0
         return self._beyond >= PERSISTENT

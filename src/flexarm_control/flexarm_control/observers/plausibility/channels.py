@@ -52,6 +52,8 @@ class Channels:
         Velocities and modal rates.
     noise : ndarray, shape (N,)
         Rms.
+    range : tuple of ndarray, shape (g,)
+        Middle, and half of the width, of the gauges' ranges [strain].
     fastest : float
         Highest frequency of the model's modes; 0 for a rigid arm [rad/s].
     count : ndarray, shape (n,)
@@ -91,7 +93,7 @@ class Channels:
         self.count = np.divide(2.0 * np.pi, counts, out=np.zeros(n), where=counts > 0.0)
         self.strength = np.array([max(j.limits.torque, j.brake_torque or 0.0) for j in arm.joints])
         ends = np.array([g.range for g in arm.gauges]).reshape(-1, 2)
-        self._middle, self._half = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
+        self.range = ends.mean(axis=1), 0.5 * np.ptp(ends, axis=1)
         self.fastest = float(self.model.frequencies().max(initial=0.0))
         self.noise = self._noise(strain_map)
         self.gain, self.push = self._accelerations(strain_map)
@@ -138,7 +140,8 @@ class Channels:
 
     def at_end(self, strain):
         """Which of the gauges' readings, (g,), are at an end of their range; not those that are NaN."""
-        return np.abs(strain - self._middle) >= self._half
+        middle, half = self.range
+        return np.abs(strain - middle) >= half
 
     def read(self, sample, out):
         """The readings of an `ArmSample` into `out`, shape (N,)."""

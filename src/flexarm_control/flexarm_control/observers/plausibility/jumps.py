@@ -22,6 +22,7 @@ from math import exp, sqrt
 import numpy as np
 
 from ... import kernels
+from ...arrays import finite, some
 from ...kernels import readings
 
 #: Samples in a row whose reading is replaced; at the next one the jump is taken for lasting.
@@ -112,7 +113,7 @@ class Jumps:
         self._dt, self._steps = dt, steps
         self._late = abs(dt - steps * self.period) if self.period else 0.0
         self._outliers = self._lasting = None
-        if not torque.any() or not np.isfinite(torque).all():
+        if not some(torque) or not finite(torque):
             self._new_change = c.strength
             self._new_torque = None
         else:
@@ -201,12 +202,12 @@ class Jumps:
         )  # fmt: skip
         if self._outliers is not None:
             replaced[:] = False
-        if self._grace.any():
+        if some(self._grace):
             self._grace[self._grace > 0] -= 1
-        if self._often.any():
+        if some(self._often):
             self._often *= np.exp(-dt / RARE_TIME)
         if self._outliers is None:
-            if self._run.any():
+            if some(self._run):
                 self._run[:] = 0
             return
         run = self._run.copy()
@@ -240,4 +241,4 @@ class Jumps:
     @property
     def frequent(self):
         """Indices of the readings that were replaced too often of late."""
-        return np.flatnonzero(self._often > FREQUENT) if self._often.any() else ()
+        return np.flatnonzero(self._often > FREQUENT) if some(self._often) else ()

@@ -16,6 +16,8 @@ from math import exp
 
 import numpy as np
 
+from ... import kernels
+
 #: Coefficients are kept while h changes by less than this ratio [-].
 SAME = 1e-3
 
@@ -33,25 +35,22 @@ class LowPass:
 
     def __init__(self, size, corner):
         self.corner = corner
-        self._rows = np.zeros((5, size))  # input, the last one, y_1, y_2, y_3
+        self.rows, self._kernels = np.zeros((5, size)), kernels.compiled()
         self._weights, self._dt = np.zeros((3, 5)), 0.0
 
     def start(self, signal):
         """Take it for the past, shape (N,): as if it had stood still until now."""
-        self._rows[:] = signal
+        self.rows[:] = signal
 
     def clear(self, part):
         """Signals that have been zero until now: a slice."""
-        self._rows[:, part] = 0.0
+        self.rows[:, part] = 0.0
 
     def update(self, signal, dt):
         """Take a new sample, shape (N,), `dt` [s] after the last."""
         if abs(dt - self._dt) > SAME * dt:
             self._weigh(dt)
-        rows = self._rows
-        rows[1] = rows[0]
-        rows[0] = signal
-        rows[2:] = self._weights @ rows
+        self._kernels.low_passed(self.rows, self._weights, signal)
 
     def _weigh(self, dt):
         x = self.corner * dt
@@ -74,15 +73,15 @@ class LowPass:
     @property
     def signal(self):
         """y_3, shape (N,)."""
-        return self._rows[4]
+        return self.rows[4]
 
     @property
     def first(self):
         """Its derivative, shape (N,)."""
-        return self.corner * (self._rows[3] - self._rows[4])
+        return self.corner * (self.rows[3] - self.rows[4])
 
     @property
     def second(self):
         """Its second derivative, shape (N,)."""
-        rows = self._rows
+        rows = self.rows
         return self.corner**2 * (rows[2] - 2.0 * rows[3] + rows[4])

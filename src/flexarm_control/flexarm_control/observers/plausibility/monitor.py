@@ -22,6 +22,7 @@ import numpy as np
 
 from flexarm_dynamics.parameters import parameter
 
+from ...arrays import some
 from ...loop.samples import ArmSample
 from .agreement import Agreement
 from .amplitudes import SourceAmplitudes
@@ -262,7 +263,7 @@ class Monitor:
         self.doubts.expire(stamp)
         if (
             self._gauges is not None
-            and self._gauges.doubted.any()
+            and some(self._gauges.doubted)
             and not self.doubts.about_any("strain of")
         ):
             self._gauges.doubted[:] = False
@@ -290,7 +291,7 @@ class Monitor:
         compared, wiring = False, None
         if self._law is not None and self._has_strain:
             strain = self._value[c.strain]
-            if c.at_end(strain).any():  # cut off, it follows no law
+            if some(c.at_end(strain)):  # cut off, it follows no law
                 self._law.reset()
             else:
                 compared, wiring = self._law.update(sample.position, strain, sample.velocity, dt)
@@ -326,7 +327,7 @@ class Monitor:
     def _compare_amplitudes(self, stamp):
         """Amplitudes that the source's own strains contradict."""
         c, check = self.channels, self._amplitudes
-        if self._gauges is not None and self._gauges.doubted.any():
+        if self._gauges is not None and some(self._gauges.doubted):
             check.reset()
         elif check.update(self._value, self._dt):
             modes = [c.model.mode_names[i] for i in range(c.m)]
@@ -342,7 +343,7 @@ class Monitor:
         c, law = self.channels, self._law
         drift = law.drift
         if not drift.found.size:
-            if drift.doubted.any() and not self.doubts.about_any(DRIFT):
+            if some(drift.doubted) and not self.doubts.about_any(DRIFT):
                 drift.doubted[:] = False
             return
         worst = drift.found[np.argmax((np.abs(drift.residual) / drift.bound)[drift.found])]
@@ -371,7 +372,7 @@ class Monitor:
         inverse : ndarray, shape (m, g)
             Of the strain map, that made them.
         """
-        if self._law is not None and self._law.drift.correction.any():
+        if self._law is not None and some(self._law.drift.correction):
             amplitude -= inverse @ self._law.drift.correction
 
     def calibrated(self):

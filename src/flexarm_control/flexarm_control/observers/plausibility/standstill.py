@@ -22,6 +22,8 @@ is a simulated arm that is exactly at rest; therefore stillness alone is no evid
 import numpy as np
 from scipy.special import erf
 
+from ... import kernels
+from ...arrays import finite, some
 from .channels import UNSTATED_POSITION
 from .jumps import DEVIATIONS
 
@@ -67,6 +69,7 @@ class Standstill:
         self._gravity = any(model.arm.gravity)
         self._amplitude_noise = DEVIATIONS * c.noise[c.amplitude]
         self._gauges = slice(c.n, c.n + c.g)
+        self._change, self._kernels = np.zeros(size), kernels.compiled()
         self.reset()
 
     def reset(self):
@@ -110,39 +113,41 @@ class Standstill:
         if self._last is None:
             self._last = readings.copy()
             return NONE, NONE, NONE, False
-        change = np.abs(readings - self._last)
-        self._last[:] = readings
+        change = self._change
+        if not self._kernels.changed(readings, self._last, change):
+            return self._all_moved(change)
         same = change == 0.0
         # A gauge at the end of its range stands still, too: `GaugeHealth` says what it is.
         same[self._gauges] &= ~self.channels.at_end(readings[self._gauges])
-        if not same.any():
-            self.still[:] = 0
-            self._smallest = np.fmin(self._smallest, change)
-            self._remember(change, None)
-            self._inertia = None
-            return NONE, NONE, NONE, False
+        if not some(same):
+            return self._all_moved(change)
         self.still += 1
         self.still[~same] = 0
         np.fmin(self._smallest, change, out=self._smallest, where=~same)
         self._remember(change, same)
         return self._judge(readings, torque, noise, dt, amplitude)
 
+    def _all_moved(self, change):
+        """What `update` gives for readings of which none stands still."""
+        self.still[:] = 0
+        self._kernels.less(self._smallest, change)
+        self._changes[self._next] = change
+        self._next = (self._next + 1) % BEFORE
+        self._inertia = None
+        return NONE, NONE, NONE, False
+
     def _remember(self, change, same):
         """Keep the changes before a reading became still; those of a still one are kept as they are."""
-        row = self._changes[self._next]
-        if same is None:
-            row[:] = change
-        else:
-            np.copyto(row, change, where=~same)
+        np.copyto(self._changes[self._next], change, where=~same)
         self._next = (self._next + 1) % BEFORE
 
     def _judge(self, readings, torque, noise, dt, amplitude):
         still, n, end = self.still, self.channels.n, self.channels.n + self.channels.g
         joints = NONE
-        if still[:n].any():
+        if some(still[:n]):
             joints = self._unmoved(readings[:n], torque, dt, amplitude)
         quiet = still >= ABRUPT
-        if not quiet.any():
+        if not some(quiet):
             return joints, NONE, NONE, False
         mean = self._changes.mean(axis=0)
         abrupt = quiet & (mean > TIMES * self._smallest) & (mean > self._tiny)
@@ -156,7 +161,7 @@ class Standstill:
     def _unmoved(self, position, torque, dt, amplitude):
         """Joints that the torque should have moved since they have been still."""
         still = self.still[: self.channels.n]
-        if not np.isfinite(torque).all():
+        if not finite(torque):
             return NONE
         if self._inertia is None:
             terms = self.channels.model.terms(position, np.zeros(position.size))
@@ -167,12 +172,12 @@ class Standstill:
             self._pushed, self._bent = across @ terms.f2 * self._gravity, across @ terms.K2
             self._noise = np.linalg.norm(self._bent * self._amplitude_noise, axis=1)
         bent = 0.0 * self._weight
-        if amplitude is not None and np.isfinite(amplitude).all():
+        if amplitude is not None and finite(amplitude):
             bent = self._pushed + self._bent @ amplitude
         unsure = self._friction + WEIGHT * (np.abs(self._weight) + np.abs(bent)) + self._noise
         wanted = self._inertia @ (torque - self._weight + bent)
         left = np.maximum(np.abs(wanted) - np.abs(self._inertia) @ unsure, 0.0)
-        if not torque.any():
+        if not some(torque):
             left[:] = 0.0  # nothing acts, or brakes do
         began = still <= 1
         self._speed[began] = self._moved[began] = 0.0

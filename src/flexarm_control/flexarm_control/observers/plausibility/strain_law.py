@@ -35,6 +35,7 @@ from itertools import combinations
 
 import numpy as np
 
+from ...arrays import some
 from .low_pass import LowPass
 from .zero_drift import TOLERANCE, ZeroDrift, law_matrices
 
@@ -206,7 +207,7 @@ class StrainLaw:
         doubtful = self._clear(total) & (misfit > MISFIT * total)
         self._run[~doubtful] = 0
         self._run[doubtful] += 1
-        if self._number < self._kept or not (self._run >= PERSISTENT).any():
+        if self._number < self._kept or not some(self._run >= PERSISTENT):
             return None
         return self._decide()
 

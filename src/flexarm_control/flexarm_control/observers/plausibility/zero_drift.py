@@ -36,6 +36,8 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.models import model as models
 
+from ...arrays import some
+
 #: Change of a zero that is none, as a fraction of full scale [-]; margin of what a payload does [-].
 ZERO, MARGIN = 0.006, 1.2
 #: By which fraction a payload may differ from the arm file's where nothing else is stated [-].
@@ -117,8 +119,8 @@ class ZeroDrift:
         turned = np.abs(position - self._start).sum()
         self.bound = self._floor + self._moving + min(turned, 2.0) * self._weight
         wrong = np.abs(self.residual) > self.bound
-        self.found = np.flatnonzero(wrong) if not learns and wrong.any() else NONE
-        if self.doubted.any() or self.correction.any():
+        self.found = np.flatnonzero(wrong) if not learns and some(wrong) else NONE
+        if some(self.doubted) or some(self.correction):
             wanted = np.where(self.doubted, residual - self._zero, 0.0)
             self.correction += (1.0 - np.exp(-dt / CORRECTED)) * (wanted - self.correction)
             self.correction[np.abs(self.correction) < NOTHING * self._floor] = 0.0

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `composite.law` computes of every sample once slow law, motion and gains are known: see there."""
+
+import numpy as np
+
+
+def about_motion(q, qd, position, velocity, torque, nominal, response, amplitude, rate, slow, bar):
+    """Slow torque about a feed-forward's motion, and the deflections that go with it.
+
+    Parameters
+    ----------
+    q, qd : ndarray, shape (n,)
+        Of the joints [rad], [rad/s].
+    position, velocity, torque, nominal : ndarray, shape (n,)
+        Of the motion, and what the slow law gives on it [rad], [rad/s], [N m].
+    response : ndarray, shape (2m + n, 2n)
+        Of deflections, rates and torque to the tracking error.
+    amplitude, rate : ndarray, shape (m,)
+        The motion's deflections and their rates.
+    slow : ndarray, shape (n,)
+        The slow law's torque [N m]; what else belongs to it is added.
+    bar : ndarray, shape (2m,)
+        Filled with z_bar.
+    """
+    n, m, size = q.size, amplitude.size, bar.size
+    for i in range(size):
+        value = 0.0
+        for j in range(n):
+            value += response[i, j] * (q[j] - position[j])
+            value += response[i, n + j] * (qd[j] - velocity[j])
+        bar[i] = (amplitude[i] if i < m else rate[i - m]) + value
+    for i in range(n):
+        value = 0.0
+        for j in range(n):
+            value += response[size + i, j] * (q[j] - position[j])
+            value += response[size + i, n + j] * (qd[j] - velocity[j])
+        slow[i] += torque[i] - nominal[i] + value
+
+
+def deviation(delta, delta_d, delta_bar, rate_bar, quasi_steady, z_f):
+    """Fill z_f = z - z_bar, (2m,), and `quasi_steady` with the deflections of z_bar, all (m,)."""
+    m = quasi_steady.size
+    for i in range(m):
+        quasi_steady[i] = delta_bar[i]
+        z_f[i] = delta[i] - delta_bar[i]
+        z_f[m + i] = delta_d[i] - rate_bar[i]
+
+
+def cubic(coefficients, knots, t, out):
+    """Fill `out`, (n,), with a piecewise cubic at t; its first and last pieces go on beyond its ends.
+
+    Parameters
+    ----------
+    coefficients : ndarray, shape (4, k, n)
+        By the time since a piece's knot, those of the cubes first, as in scipy.
+    knots : ndarray, shape (k + 1,)
+    t : float
+    out : ndarray, shape (n,)
+    """
+    low, high = 0, knots.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if t < knots[middle]:
+            high = middle
+        else:
+            low = middle
+    s = t - knots[low]
+    for i in range(out.size):
+        c = coefficients[:, low, i]
+        out[i] = ((c[0] * s + c[1]) * s + c[2]) * s + c[3]
+
+
+def off(state, left, own, error):
+    """Fill `error`, (N,), with what a simulated arm's state lacks to the one wanted, its fading jump included.
+
+    Parameters
+    ----------
+    state, own : ndarray, shape (N,)
+        Wanted, and the simulated arm's.
+    left : ndarray, shape (N + n,)
+        Of the jumps of state and torque.
+    error : ndarray, shape (N,)
+
+    Returns
+    -------
+    float
+        Largest magnitude of the joints', the first n; NaN if one is.
+    float
+        Of all.
+    """
+    n, joints, largest = left.size - state.size, 0.0, 0.0
+    for i in range(state.size):
+        error[i] = state[i] + left[i] - own[i]
+        size = abs(error[i])
+        if size != size:
+            return np.nan, np.nan
+        largest = max(largest, size)
+        if i < n:
+            joints = max(joints, size)
+    return joints, largest
+
+
+def regulated(torque, left, gain, error, limit, out):
+    """Fill `out`, (n,), with a torque, its fading jump, and the regulator's, clipped to the limit; see `off`."""
+    first = error.size
+    for i in range(out.size):
+        value = 0.0
+        for j in range(first):
+            value += gain[i, j] * error[j]
+        value += torque[i] + left[first + i]
+        out[i] = min(max(value, -limit[i]), limit[i])
+
+
+def horner(coefficients, x, out):
+    """Fill `out`, (p, n), with polynomials at x; their coefficients, (k, p, n), the constant ones first."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            value = coefficients[-1, i, j]
+            for k in range(coefficients.shape[0] - 2, -1, -1):
+                value = value * x + coefficients[k, i, j]
+            out[i, j] = value
