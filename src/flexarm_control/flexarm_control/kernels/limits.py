@@ -16,7 +16,7 @@ def sent(u, weight, part, rate, dt, limit, torque):
     rate, limit : ndarray, shape (n,)
         Largest change per second, and size; infinite where there is none [N m/s], [N m].
     dt : float
-        Since the last torque [s].
+        In which the rate counts [s].
     torque : ndarray, shape (n,)
         That one; overwritten.
     """
