@@ -158,6 +158,24 @@ def test_the_memory_of_the_shared_noise_makes_predictions_better(arm, moved):
     assert rms[0] < 0.95 * rms[1]
 
 
+def test_past_innovations_make_predictions_better_and_leave_the_state_as_it_is(arm, moved):
+    """The filter takes the shared noise for white; its memory finds out."""
+    position, strain, *_ = moved
+    noisy = strain + noise_of(np.random.default_rng(4), len(strain), 2e-6)[:, None]
+    plain, learnt = (observer(arm, common_memory=[0.0], innovation_order=k) for k in (0, 4))
+    errors = []
+    for k, (q, e) in enumerate(zip(position, noisy, strict=True)):
+        for made in (plain, learnt):
+            made.update(sample_of(arm, q, e), H if k else 0.0)
+        errors.append((learnt.strain_innovation.copy(), learnt.strain_error.copy()))
+    alone, whole = np.sqrt(np.mean(np.array(errors)[200:] ** 2, axis=(0, 2)))
+    assert whole < 0.95 * alone
+    assert_allclose(learnt.state, plain.state, rtol=0)
+    assert_allclose(plain.strain_error, plain.strain_innovation)
+    learnt.update(sample_of(arm, position[-1], noisy[-1]), 3.0 * H)  # a gap: nothing follows
+    assert_allclose(learnt.strain_error, learnt.strain_innovation)
+
+
 @pytest.mark.parametrize("how", ["reads nothing", "is lost"])
 def test_a_gauge_that_is_left_out_has_no_part_in_the_estimate(arm, moved, how):
     position, strain, delta, _ = moved

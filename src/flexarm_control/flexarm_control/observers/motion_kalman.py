@@ -19,6 +19,9 @@ measured motion of the joints is the input; its noise is that of the encoders an
 `motion` and `kalman`. All gauges are used, also more than there are modes. One that is lost, or reads nothing, is left
 out.
 
+What past innovations tell about the next one (``innovation_order``, `innovation_memory`) makes predicted strains
+better, and leaves the state as it is.
+
 A bias and a slow deflection differ only by what the motion makes of them: at rest the filter can't tell them apart
 beyond ``bias_deviation``.
 """
@@ -32,12 +35,15 @@ from flexarm_dynamics.errors import MessageError, ModelError, ParameterError
 from flexarm_dynamics.linear import jacobian
 from flexarm_dynamics.parameters import parameter
 
+from .innovation_memory import InnovationMemory
 from .kalman import NOISE, UNSTATED_STRAIN, Kalman, position_uncertainty
 from .motion import DIFFERENCE, Motion, mass_matrix
 
 _OF_STRAINS = {p.name: p for p in NOISE if p.name in ("strain_noise", "position_noise")}
 #: Variance of a reading that is none, over that of the gauge's noise.
 NONE = 1e12
+#: Past innovations count for nothing after a step that is longer than the last one by this factor.
+GAP = 1.5
 
 
 class MotionKalman(Kalman):
@@ -49,6 +55,9 @@ class MotionKalman(Kalman):
         (q, delta, qd, delta_d, a, b, c).
     strain_innovation : ndarray, shape (g,)
         Measured minus predicted strain; NaN for a gauge that is left out.
+    strain_error : ndarray, shape (g,)
+        The same less what follows from past innovations.
+    memory : InnovationMemory
     parameters_estimated : dict
         Bias of each gauge beyond the arm file's.
     """
@@ -77,6 +86,9 @@ class MotionKalman(Kalman):
         ),
         parameter("bias_noise", 1e-6, "strain s^-0.5", 0.0, 1e-2).described(
             "Random walk of the bias, per root of a second; the arm file's drift where that is larger."
+        ),
+        parameter("innovation_order", 0, "-", 0, 64).described(
+            "Strains are also predicted from so many past innovations of all gauges, learnt on line; 0: from none."
         ),
     )
 
@@ -113,6 +125,9 @@ class MotionKalman(Kalman):
         self._full = np.square(noise)
         self.state, self.covariance = np.zeros(size), np.zeros((size, size))
         self._measured, self.strain_innovation = np.zeros(n + g), np.full(g, np.nan)
+        self.strain_error, self._last_dt = np.full(g, np.nan), np.inf
+        size_of_noise = np.sqrt(self._full[n:] + self._shared**2)
+        self.memory = InnovationMemory(size_of_noise, values["innovation_order"])
         self.innovation = np.zeros(0)
         self._left_out()
 
@@ -166,6 +181,9 @@ class MotionKalman(Kalman):
         if self._elapsed < 0.0:
             self._start(sample)
             return
+        if dt > GAP * self._last_dt:
+            self.memory.forget_past()
+        self._last_dt = dt
         self._advance(sample.torque, dt)
 
     def _start(self, sample):
@@ -194,6 +212,8 @@ class MotionKalman(Kalman):
         np.fill_diagonal(P[2 * p : 2 * p + n, 2 * p : 2 * p + n], self.START**2)
         np.fill_diagonal(P[bias.stop :, bias.stop :], 1.0)
         self.strain_innovation[:], self.innovation_squared = np.nan, float("nan")
+        self.strain_error[:] = np.nan
+        self.memory.forget_past()
         self._elapsed = 0.0
         self._publish()
 
@@ -205,6 +225,8 @@ class MotionKalman(Kalman):
         innovation[[self._n + i for i in self._out]] = 0.0
         self.strain_innovation[:] = innovation[self._n :]
         self.strain_innovation[list(self._out)] = np.nan
+        self.strain_error[:] = self.strain_innovation - self.memory.predict()
+        self.memory.take(self.strain_innovation)
 
     def _publish(self):
         super()._publish()
