@@ -664,6 +664,13 @@ LAWS = [
             TESTS + "test_motion_kalman.py",
         ),
         (
+            "innovation_memory",
+            "innovation_memory: one sample is remembered",
+            "np.concatenate([scaled, self._past[: -scaled.size]])",
+            "np.concatenate([scaled, 0.0 * self._past[: -scaled.size]])",
+            TESTS + "test_innovation_memory.py",
+        ),
+        (
             "gauge_health",
             "a gauge that is silent",
             "self.health[~np.isfinite(strain)] = MISSING",
