@@ -463,16 +463,18 @@ def test_a_stamp_far_ahead_of_its_number_is_named(arm_r):
 
 def test_a_moving_arm_is_taken_over_as_it_moves_and_brought_to_rest(arm_r):
     core = controller(arm_r, return_time=0.065)
+    for k in range(10):  # it is seen for 10 ms first
+        assert core.step(sample(k, 0.195 + 5e-4 * k, velocity=[0.5])) is False
     positions, speeds, torques = [], [], []
-    for k in range(2000):
+    for k in range(10, 2000):
         place, speed = (
-            (0.2, 0.5) if k == 0 else (positions[-1], speeds[-1])
+            (0.2, 0.5) if k == 10 else (positions[-1], speeds[-1])
         )  # it follows the reference
         assert core.step(sample(k, place, velocity=[speed]))
         positions.append(core.reference.position[0])
         speeds.append(core.reference.velocity[0])
         torques.append(core.torque[0])
-    assert (positions[0], speeds[0]) == (0.2, 0.5)
+    assert_allclose((positions[0], speeds[0]), (0.2, 0.5), rtol=1e-9)
     assert core.state == State.HOLDING and speeds[-1] == 0.0
     assert 0.25 < positions[-1] < 0.5
     assert np.abs(torques[:21]).max() <= 0.1 * FILE_LIMIT
@@ -495,6 +497,35 @@ def test_an_arm_whose_positions_rest_is_taken_over_at_rest_whatever_its_estimate
         assert core.step(sample(k, place(k), rate=rate, velocity=[0.1])) is (k == 10 == begins - 1)
     core.step(sample(begins, place(begins), velocity=[0.1]))
     assert core.state == state and core.enabled
+
+
+@pytest.mark.parametrize("velocity, begins", [(-1.6, 0.0), (1.6, 0.1), (0.08, 0.08)])
+def test_a_joint_that_swings_is_taken_over_no_faster_than_it_goes_on(arm_r, velocity, begins):
+    """Bent links turn a light joint to and fro; a reference with the speed of a swing would run away."""
+    core = controller(arm_r)
+    core.step(sample(0, velocity=[velocity]))
+    core.step(sample(10, 1e-3, velocity=[velocity]))
+    assert core.enabled
+    assert_allclose(core.reference.velocity, [begins], atol=1e-12)
+
+
+@pytest.mark.parametrize("numbers, begins", [((1, 101), 0.3), ((1, 2), 0.9)])
+def test_after_a_gap_the_arm_is_no_faster_than_it_was_on_the_mean_but_after_a_jump_of_the_clock(
+    arm_r, numbers, begins
+):
+    """A safe action has acted, of which an estimate knows nothing; over a jump of the clock the time says nothing."""
+    core = started(arm_r)
+    core.step(sample(numbers[0]))
+    core.step(sample(numbers[1], 0.03, velocity=[0.9], stamp_ns=stamp(101)))
+    assert core.interruptions == 1
+    assert_allclose(core.reference.velocity, [begins], rtol=1e-9)
+
+
+def test_a_law_that_asks_for_more_than_the_limit_returns_as_gently(arm_r):
+    core = controller(arm_r, Scripted(*[5.0 * FILE_LIMIT] * 21), return_time=0.065)
+    for k in range(21):
+        core.step(sample(k))
+    assert 0.09 * FILE_LIMIT < core.torque[0] <= 0.1 * FILE_LIMIT
 
 
 def test_at_a_low_rate_a_period_is_no_gap(arm_r):

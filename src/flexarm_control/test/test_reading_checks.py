@@ -60,9 +60,9 @@ def readings(arm, seconds, speed=3.0, amplitude=0.15, swing=0.0, seed=0):
 
 
 class Judged:
-    """The law of R's strains, fed with readings; what it found first."""
+    """The law of R's strains, fed with readings whose `noise` was seen; what it found first."""
 
-    def __init__(self, change, plant=None, begin=1.0, seconds=3.0, **motion):
+    def __init__(self, change, plant=None, begin=1.0, seconds=3.0, noise=0.0, **motion):
         m = models.build(known_arm())
         self.map = StrainMap(m)
         self.law = StrainLaw(Channels(m, self.map), self.map, 0.3)
@@ -72,7 +72,7 @@ class Judged:
             since = PERIOD * k - begin
             if since >= 0.0:
                 q, e = change(q.copy(), e.copy(), since)
-            _, wiring = self.law.update(q, e, np.zeros(1), PERIOD)
+            _, wiring = self.law.update(q, e, np.zeros(1), PERIOD, np.full(2, noise))
             drift = self.law.drift
             if drift.found.size and self.drifting is None:
                 self.drifting = since, drift.found.tolist(), drift.joint(self.law.drive)
@@ -170,10 +170,10 @@ def test_a_gap_keeps_the_zero_and_forgets_the_motion():
     law = StrainLaw(Channels(m, map_), map_, 0.3)
     zero = np.array([3e-5, 0.0])
     for _ in range(1000):
-        law.update(np.zeros(1), zero, np.zeros(1), PERIOD)
-    law.update(np.array([0.3]), zero, np.zeros(1), 0.05)
+        law.update(np.zeros(1), zero, np.zeros(1), PERIOD, np.zeros(2))
+    law.update(np.array([0.3]), zero, np.zeros(1), 0.05, np.zeros(2))
     for _ in range(1000):
-        law.update(np.array([0.3]), zero, np.zeros(1), PERIOD)
+        law.update(np.array([0.3]), zero, np.zeros(1), PERIOD, np.zeros(2))
     np.testing.assert_allclose(law.drift.residual, 0.0, atol=1e-12)
     assert not law.drift.found.size
 
@@ -204,6 +204,13 @@ def test_exchanged_gauges_are_named_although_what_they_read_fits_no_motion():
     assert since < 0.3
 
 
+def test_strains_that_are_small_beside_the_noise_that_was_seen_raise_no_question():
+    """A recording of a real arm, whose file states no noise: gauges that read 5 microstrain and 3 of noise."""
+    exchanged = {"change": lambda q, e, t: (q, e[::-1]), "speed": 4.0}
+    assert "exchanged" in Judged(**exchanged, noise=1e-6).wiring[1]
+    assert Judged(**exchanged, noise=1e-4).wiring is None
+
+
 def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
     """The only hypothesis has no other to be compared with."""
     text = arm_file.find("R").read_text().replace("modes: 2", "modes: 1")
@@ -215,7 +222,8 @@ def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
     gain = 9.0 / (terms.K2 - 9.0 * terms.M[1:, 1:])[0, 0] * terms.M[1, 0] * map_.rows[0, 0]
     for k in range(2000):
         swing = 0.2 * np.sin(3.0 * PERIOD * k)
-        _, wiring = law.update(np.array([swing]), np.array([-gain * swing]), np.zeros(1), PERIOD)
+        read = np.array([-gain * swing])
+        _, wiring = law.update(np.array([swing]), read, np.zeros(1), PERIOD, np.zeros(1))
         found.add(wiring)
     assert found == {None, 0}
 

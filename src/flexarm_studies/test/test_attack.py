@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lying driver: its gate, its lies, what a run measures; and lies that have to hold."""
 
+import itertools
 import json
 import re
 from dataclasses import replace
@@ -183,6 +184,17 @@ def test_the_honest_run_is_the_scale(honest):
     assert 0.002 * honest.limit < honest.step == steps < run.KICK * honest.limit
 
 
+def test_a_loop_that_swings_without_any_lie_is_not_attacked(monkeypatch, honest):
+    def swinging(driver):
+        trace = replace(honest.trace, velocity=honest.trace.velocity.copy())
+        trace.velocity[400] = 5.0
+        return trace
+
+    monkeypatch.setattr(run, "drive", swinging)
+    found = run.Honest(honest.case)
+    assert found.problem == "joint1 swings, up to 5.3 times as fast as the motion"
+
+
 def test_every_stop_of_a_motion_steps_less_than_twice_as_much_as_the_motion(honest):
     """Near the end of the motion, and after it, the motion's own end is part of the run that is stopped."""
     for moment in (0.75, 1.0):
@@ -314,6 +326,14 @@ def test_healthy_runs_take_turns_and_go_on_where_an_interrupted_study_ended(
     out.write_text("[1]\n[2]\n")
     with pytest.raises(FlexarmError, match="line 1 is not of healthy runs"):
         healthy.stored(out)
+
+
+def test_what_no_control_bears_is_no_healthy_run():
+    first = [case for case, _ in itertools.islice(healthy.planned(chosen(), 0), 100)]
+    assert {case.observer for case in first if case.arm == "long_reach"} == {"filtered_derivative"}
+    assert {case.observer for case in first if case.arm == "two_link"} == set(observers())
+    with pytest.raises(FlexarmError, match="has no case"):
+        command.attack(options("--arms", "long_reach", "--observers", "kalman", "--healthy", "1"))
 
 
 def test_some_runs_cover_every_lie_under_every_observer_and_on_every_arm():

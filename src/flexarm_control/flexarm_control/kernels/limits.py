@@ -22,7 +22,9 @@ def sent(u, weight, part, rate, dt, limit, torque):
     """
     met = False
     for i in range(u.size):
-        wanted = u[i] if part == 1.0 else weight[i] + part * (u[i] - weight[i])
+        wanted = u[i]
+        if part < 1.0:  # a law may ask for more than the limit, or against the weight
+            wanted = weight[i] + part * min(max(u[i] - weight[i], -limit[i]), limit[i])
         value = wanted
         if rate[i] < np.inf:
             step = rate[i] * dt

@@ -23,7 +23,7 @@ FAST_RAMP = 0.1
 
 #: A source that restarts during operation must find each joint within this of where it was [rad], and at rest [rad/s].
 SAME_PLACE, AT_REST = 0.01, 0.05
-#: Before its first torque an arm that has hardly moved in so long rests, whatever its estimated velocity [s].
+#: An arm that seems to move is seen for so long before its first torque: a velocity may be noise, or a swing [s].
 SEEN = 0.01
 #: So many periods without a state are no interruption, however long.
 PERIODS_OF_GAP = 5.0
@@ -416,13 +416,14 @@ class ArmController:
         gap, away = dt, self._applied.back_after(sample, self.controller_id)
         known, self._period = self._period, dt / self._count
         if gap > self._resume_gap and gap > PERIODS_OF_GAP * known:
-            what = f"no state for {gap:.3g} s"
+            what, since = f"no state for {gap:.3g} s", (self._last_ns, self._position)
             if gap > PERIODS_OF_GAP * known * self._count > 0.0:
                 what = (
                     f"header.stamp: {gap:.3g} s after the last state, and {self._count - 1} states are missing: the"
                     " source stood still, or its clock jumped"
                 )
-            self._interrupted(sample, what)
+                since = None
+            self._interrupted(sample, what, since)
             dt = 0.0
         elif away > self._resume_gap:
             self._interrupted(sample, f"the driver has applied no torque for {away:.3g} s")
@@ -590,9 +591,9 @@ class ArmController:
             return "modal_amplitude is not known yet"
         if sample.rate is None and self.law.needs_rates:
             return "modal_rate is not known yet"
-        # An observer that has just begun: whether its first velocity is noise shows in the positions.
-        if self._waiting and verdict != SampleOrder.RESTART and _moves(sample):
-            return "whether the arm moves is not known yet" if self._seen_for(sample) < SEEN else ""
+        begins = verdict == SampleOrder.RESTART or not self.supervisor.running
+        if begins and _moves(sample) and self._seen_for(sample, verdict) < SEEN:
+            return "how the arm moves is not known yet"
         return ""
 
     def _wait(self, sample, verdict, reason):
@@ -619,12 +620,15 @@ class ArmController:
         if keeps and (given_up := self._left_behind(sample)):
             self._trajectory_reason = given_up
             keeps = False
-        self._return(sample, keeps)
+        self._return(sample, self._seen[0] if self._waiting else None, keeps)
 
-    def _return(self, sample, keeps=False):
-        """Torque returns in a ramp; the reference begins where the arm is, and brakes it where it moves."""
+    def _return(self, sample, since, keeps=False):
+        """Torque returns in a ramp; the reference begins where the arm is, and brakes it where it moves.
+
+        `since` are the stamp [ns] and the positions (n,) [rad] of an earlier sample; None: its mean speed says nothing.
+        """
         if not keeps:
-            self._take_over(sample)
+            self._take_over(sample, since)
         self._waiting, self._repeats = False, 0
         self.supervisor.begin()
         self._authority.begin(sample.position)
@@ -632,37 +636,30 @@ class ArmController:
         self.torque_delay.begin()
         self.law.reset()
 
-    def _take_over(self, sample):
+    def _take_over(self, sample, since):
         """The reference begins where the arm is, and brakes it from how it moves."""
         position, stamp, velocity = sample.position, sample.stamp_ns, None
-        if _moves(sample) and not self._seen_resting(sample):
-            velocity = sample.velocity
+        if _moves(sample):
+            velocity = sample.velocity if since is None else _steady_velocity(sample, *since)
         deceleration = np.minimum(GENTLE, self.supervisor.deceleration)
         try:
             self.reference.start(position, stamp, velocity, deceleration)
         except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
             self.reference.start(position, stamp)
 
-    def _seen_for(self, sample):
+    def _seen_for(self, sample, verdict):
         """For how long positions have been seen while the controller waited, `SEEN` or a little more [s]."""
-        return 1e-9 * (sample.stamp_ns - self._seen[0][0])
+        waiting = self._waiting and verdict != SampleOrder.RESTART
+        return 1e-9 * (sample.stamp_ns - self._seen[0][0]) if waiting else 0.0
 
-    def _seen_resting(self, sample):
-        """Whether the positions of the last `SEEN` show that the arm rests, whatever an estimated velocity says."""
-        if not self._waiting:
-            return False
-        # An arm that has begun to move is twice as fast as its mean.
-        moved = 2.0 * np.abs(sample.position - self._seen[0][1]).max()
-        return bool(moved <= AT_REST * self._seen_for(sample))
-
-    def _interrupted(self, sample, what):
-        """The driver took its safe action for a time, for the reason `what`."""
+    def _interrupted(self, sample, what, since=None):
+        """The driver took its safe action for a time, for the reason `what`; `since` as in `_return`."""
         moved = self.reference.active or self.reference.pending
         self.interruptions += 1
         self._trajectory_reason = f"{what}: torque returns in a ramp" + (
             ", the motion was given up: send it again" if moved else ""
         )
-        self._return(sample)
+        self._return(sample, since)
 
     def _restarted(self, sample):
         """Why a new session of the source is a fault; empty for an arm that rests where it did."""
@@ -705,6 +702,19 @@ class ArmController:
             name = self.model.joint_names[int(np.argmax(moved))]
             return f"{name} moved {moved.max():.3g} rad while the observer converged: send it again"
         return ""
+
+
+def _steady_velocity(sample, stamp_ns, position):
+    """Joint velocities without what is noise or a swing, (n,) [rad/s]: no faster than the mean since an earlier sample.
+
+    An estimate that has just begun, or that knows nothing of a safe action, and light joints, which bent links turn
+    to and fro, have velocities with which the arm does not go anywhere.
+    """
+    time = 1e-9 * (sample.stamp_ns - stamp_ns)
+    mean = (sample.position - position) / max(time, 1e-9)
+    along = np.sign(mean) == np.sign(sample.velocity)
+    found = np.where(along, np.sign(mean) * np.minimum(np.abs(mean), np.abs(sample.velocity)), 0.0)
+    return found if np.abs(found).max() > 0.5 * AT_REST else np.zeros_like(found)
 
 
 def _moves(sample):

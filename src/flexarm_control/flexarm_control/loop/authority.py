@@ -6,7 +6,8 @@ it is found,
 
 .. math:: u_{sent} = u_g + a(t)\,(u - u_g), \qquad a = \min(1, (t/T)^2),
 
-so that torque and stiffness grow together. With T = `return_time` of 65 ms, a is below a tenth for the first 20 ms.
+so that torque and stiffness grow together; u - u_g is bounded by the torque limit. With T = `return_time` of 65 ms, a
+is below a tenth for the first 20 ms.
 Without gravity u_g is zero. Where u begins within `SMALL` of u_g, at rest, there is nothing to return from: no ramp.
 
 The rate is bounded in any case; lost samples add nothing to what the next one may change, since an estimate is at its

@@ -15,6 +15,8 @@ import numpy as np
 MOVING, HOLDING = (0.5,), (1.15,)
 #: `~/stop` and the limits come at these.
 MANY = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+#: Those at which the links are bent: in the middle they are not, and the limit would be one of noise.
+BENT = (0.25, 0.75, 0.95)
 
 #: Kinds of lies, by what has to come of them.
 LASTING, SINGLE, INTERRUPTION, STOP, HEALTHY = (
@@ -302,14 +304,12 @@ def _actions():
         Lie("a fault: the safe action alone", INTERRUPTION, action="fail"),
         Lie("~/stop", STOP, action="stop", moments=MANY),
         Lie("stop at the limit of tracking", STOP, action="limit_tracking", moments=MANY[1:-1]),
-        Lie(
-            "stop at the limit of strain", STOP, action="limit_strain", moments=MANY[1:-1], gauges=1
-        ),
+        Lie("stop at the limit of strain", STOP, action="limit_strain", moments=BENT, gauges=1),
         Lie(
             "stop at the limit of deflection",
             STOP,
             action="limit_deflection",
-            moments=MANY[1:-1],
+            moments=BENT,
             gauges=1,
         ),
         Lie("the observer asks for a stop", STOP, action="asked_to_stop", moments=MANY),

@@ -45,6 +45,10 @@ KICK = 0.02
 SOON = 0.02
 #: Beyond this the arm is lost [rad].
 LOST = 20.0
+#: A joint that is this many times as fast as the motion asks for swings: the loop is no good without any lie [-].
+SWINGS = 3.0
+#: Largest speed of a quintic motion over its mean [-].
+QUINTIC = 1.875
 
 #: Of a measure that may reach its criterion.
 ROUNDING = 1e-9
@@ -229,6 +233,10 @@ class Honest:
         self.speed = np.maximum(speed, MIN_SCALE * speed.max())
         self.strain = np.abs(trace.strain[moving]).max(initial=0.0)
         self.low, self.high = trace.position[moving].min(axis=0), trace.position[moving].max(axis=0)
+        asked = QUINTIC * (self.high - self.low) / MOTION
+        if not self.problem and (swings := self.speed > SWINGS * asked).any():
+            names = ", ".join(np.array(self.model.joint_names)[swings])
+            self.problem = f"{names} swings, up to {(self.speed / asked).max():.2g} times as fast as the motion"
         limit = self.model.arm.torque_limits
         self.limit = np.where(np.isfinite(limit), limit, np.nanmax(np.abs(trace.torque[moving])))
         steps = np.abs(np.diff(trace.torque[trace.since(START)], axis=0)).max(axis=0)

@@ -294,7 +294,9 @@ class Monitor:
             if some(c.at_end(strain)):  # cut off, it follows no law
                 self._law.reset()
             else:
-                compared, wiring = self._law.update(sample.position, strain, sample.velocity, dt)
+                compared, wiring = self._law.update(
+                    sample.position, strain, sample.velocity, dt, noise
+                )
         self._watch_rate(stamp)
         if self._samples < LEARNT:
             return

@@ -16,8 +16,8 @@ gauge nor an unknown payload's weight counts. (`zero_drift` judges z and p witho
 is 0 where they fit, 1 where they have nothing in common, 2 where the sign is wrong; a payload that is 30 % off
 makes 0.03. When r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are
 judged under each hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the
-smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their own noise
-raise no question.
+smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their noise,
+stated or seen, raise no question.
 
 A hypothesis T may have begun a moment ago. The low pass is linear, so with the strains that it was given since the
 moment, :math:`F[\varepsilon 1_{t\ge t_0}]`, it would have given
@@ -126,7 +126,7 @@ class StrainLaw:
         self._low.start(self._now)  # an arm that moves looks as if it had been hit
         self._settling = SETTLED / self.corner
 
-    def update(self, position, strain, velocity, dt):
+    def update(self, position, strain, velocity, dt, noise):
         """Take the readings of a new sample.
 
         Parameters
@@ -135,6 +135,8 @@ class StrainLaw:
         strain : ndarray, shape (g,)
         dt : float
             Since the last sample [s].
+        noise : ndarray, shape (g,)
+            Rms of the gauges' readings so far; counts where it is above the stated one.
 
         Returns
         -------
@@ -145,6 +147,7 @@ class StrainLaw:
         """
         g, n, now = self.channels.g, self.channels.n, self._now
         now[:g], now[g : g + n] = strain, position
+        self._noise = noise
         if self.channels.heavy:
             now[self._young].reshape(ONSETS, g)[:] = strain
         if self._inertia is None or dt > GAP / self.corner:
@@ -224,7 +227,8 @@ class StrainLaw:
     def _clear(self, total):
         """Whether z and p, summed over a link's gauges, are larger than noise makes them, by gauge."""
         c, w = self.channels, self.corner
-        gauge = (WHITE**2 * w * self._interval) * c.noise[c.strain] ** 2
+        rms = np.maximum(c.noise[c.strain], self._noise)
+        gauge = (WHITE**2 * w * self._interval) * rms**2
         encoder = (STEP * c.count) ** 2 / 12.0
         encoder += (WHITE**2 * w * self._interval) * c.noise[c.position] ** 2
         noise = gauge + w**4 * (self._load**2 @ gauge + self.drive**2 @ encoder)
