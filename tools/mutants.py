@@ -876,8 +876,14 @@ LIMITS = [
         (
             "arm_controller",
             "a moving arm: taken over as if at rest",
-            "            velocity = sample.velocity\n",
-            "            pass\n",
+            "        if _moves(sample):\n            velocity = ",
+            "        if False:\n            velocity = ",
+        ),
+        (
+            "arm_controller",
+            "a swing: the reference is as fast as it",
+            "np.minimum(np.abs(mean), np.abs(sample.velocity))",
+            "np.abs(sample.velocity)",
         ),
         (
             "authority",
