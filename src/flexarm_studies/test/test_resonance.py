@@ -5,12 +5,16 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 from scipy.integrate import solve_ivp
 
 from flexarm_control.motions import shapers
 from flexarm_control.motions.profiles import quintic, sample
+from flexarm_control.shaping import modes
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.parameters import check_all
 from flexarm_studies.resonance import effect, recommendation, time_law, windows
+from flexarm_studies.resonance import study as studies
 from flexarm_studies.resonance.families import dependence, families
 from flexarm_studies.resonance.fit import Fit, Mode
 from flexarm_studies.resonance.recommendation import Spread, recommend
@@ -264,6 +268,38 @@ def test_the_least_exciting_law_keeps_limits_and_leaves_what_integration_finds()
     for hertz in (2.8, 2.93, 3.2):
         left = vibration(lambda t: np.interp(t, time, acceleration), duration, hertz, 0.01)
         assert left < 0.055 * 4.0 * 4.0 / (2.0 * np.pi * hertz) ** 2
+
+
+def study_of(rings, n):
+    """The study of windows, of an arm of n joints."""
+    names = tuple(f"joint{k + 1}" for k in range(n))
+    found = windows.Channels(
+        ("a",), ("strain",), np.zeros((2, 1)), 0.0, 0.01, np.zeros((2, n)), names
+    )
+    return studies.of_windows(found, rings, studies.Wishes())
+
+
+def node_of(made):
+    """The modes that the node `shaper` makes of the lines to paste."""
+    given = yaml.safe_load("\n".join(studies.yaml_lines(made)))["shaper"]["ros__parameters"]
+    names = given.pop("joint_names")
+    own = {key.removeprefix("shaper."): value for key, value in given.items()}
+    return modes.Modes(check_all(modes.PARAMETERS, own, {"joints": len(names)}), len(names)), own
+
+
+def test_the_lines_are_parameters_of_the_node_and_its_shaper_is_the_one_recommended():
+    made = study_of([window([0.0, 0.0], (3.0, 0.01, 1.0)), window([0.1, 0.0], (3.5, 0.02, 1.0))], 2)
+    node, own = node_of(made)
+    assert "configurations" not in own
+    assert node.max_duration == pytest.approx(made.recommendation.chosen.delay, rel=0.01)
+
+
+def test_where_the_frequency_goes_with_a_joint_the_node_gets_it_by_configuration():
+    places = np.column_stack([np.linspace(-1.0, 1.0, 7), np.cos(np.arange(7.0))])
+    rings = [window(q, (3.0 + 0.4 * q[0], 0.01, 1.0)) for q in places]
+    node, own = node_of(study_of(rings, 2))
+    assert np.shape(own["configurations"]) == (14,) and len(own["frequencies"]) == 7
+    assert node.at(places[2:3])[0, 0] == pytest.approx(3.0 + 0.4 * places[2, 0], rel=1e-3)
 
 
 # Trajectories ----------------------------------------------------------------------------------

@@ -109,9 +109,12 @@ def families(windows, quantities):
     if not all_modes:
         return []
     squares = np.array([_deflections(mode, quantities) ** 2 for mode, _ in all_modes])
-    # Channels count alike, whatever their units are.
-    size = squares.sum(axis=0)
-    parts = (squares[:, size > 0.0] / size[size > 0.0]).mean(axis=1)
+    # Quantities count alike, whatever their units are, and within one the channel that rings more counts more.
+    size = {
+        q: squares[:, [k for k, of in enumerate(quantities) if of == q]].sum() for q in quantities
+    }
+    weight = np.array([1.0 / max(size[q], 1e-300) for q in quantities]) / len(size)
+    parts = squares @ weight
     groups = _groups(all_modes, list(range(len(all_modes))))
     return [
         Family(

@@ -30,6 +30,8 @@ MAX_WIDTH = 0.1
 MIN_PART = 0.02
 #: ... and below so many times what noise of the same density would make in its place in every channel [-].
 OVER_NOISE = 20.0
+#: Poles of a sweep that are nearer than this to each other, over their size, are one mode [-].
+SWEPT_TWIN = 0.08
 #: Most modes, and lines of the spectrum over which that of the residuals is smoothed.
 MAX_MODES, SMOOTHED = 6, 4
 #: Samples per period of the highest frequency; more are averaged.
@@ -90,7 +92,7 @@ class Fit:
     fitted: np.ndarray
 
 
-def fit(values, period, low=0.0, high=HIGHEST, motion=None) -> Fit:
+def fit(values, period, low=0.0, high=HIGHEST, motion=None, direct=None) -> Fit:
     """Find the modes of a window.
 
     Parameters
@@ -103,6 +105,8 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None) -> Fit:
         Frequencies [Hz].
     motion : ndarray, shape (s, m), optional
         What moves the arm, say accelerations of the joints; None: nothing does.
+    direct : ndarray, shape (s, d), optional
+        What the channels have in them by themselves beside the motion, say its speed and its way.
 
     Returns
     -------
@@ -112,6 +116,7 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None) -> Fit:
     block = max(int(1.0 / (PER_PERIOD * high * period)), 1)
     values, period = averaged(values, block), block * period
     motion = None if motion is None else averaged(motion, block)
+    direct = None if direct is None else averaged(direct, block)
     count, time = len(values), period * np.arange(len(values))
     low, high = max(low, MIN_PERIODS / (period * max(count, 1))), min(high, 0.45 / period)
     about = _about_line(values)
@@ -119,7 +124,7 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None) -> Fit:
     live = size > 1e-9 * np.abs(values).max(axis=0, initial=1e-30)
     if count < MIN_SAMPLES or high <= low or not live.any():
         return Fit((), np.zeros(len(size)), time, values, values - about)
-    problem = _Problem(values[:, live] / size[live], period, motion)
+    problem = _Problem(values[:, live] / size[live], period, motion, direct)
     start = pencil.stable_poles(problem.ringing(), period, low, high, MAX_DAMPING)[:MAX_MODES]
     solution = _select(problem, start, low, high)
     fitted, explained = values - about, np.zeros(len(size))
@@ -143,12 +148,14 @@ def _about_line(values):
 class _Problem:
     """The linear part of the fit at given poles."""
 
-    def __init__(self, values, period, motion):
+    def __init__(self, values, period, motion, direct):
         self.values, self.period, self.motion = values, period, motion
         self.time = period * np.arange(len(values))
         self.weight = np.ones(values.shape[1])
         line = [np.ones(len(values)), np.linspace(-1.0, 1.0, len(values))]
-        self.fixed = np.column_stack(line if motion is None else [*line, motion])
+        self.fixed = np.column_stack(
+            [*line, *(part for part in (motion, direct) if part is not None)]
+        )
 
     @property
     def per_mode(self):
@@ -268,8 +275,10 @@ def _odd(problem, solution, low, high):
     if bad.any():
         return int(np.argmax(bad))
     close = np.abs(np.subtract.outer(poles, poles)) + np.diag(np.full(len(poles), np.inf))
-    twin = close < 0.5 * pencil.SAME * np.abs(poles)[:, None]
-    return int(np.argmax(twin.any(axis=1))) if twin.any() else None
+    # What a sweep makes of its own mode by a delay or a drive that is not in the model is a twin with more damping.
+    same = 0.5 * pencil.SAME if problem.motion is None else SWEPT_TWIN
+    twin = (close < same * np.abs(poles)[:, None]).any(axis=1)
+    return int(np.argmax(np.where(twin, ratio, -1.0))) if twin.any() else None
 
 
 def _power(problem, solution):

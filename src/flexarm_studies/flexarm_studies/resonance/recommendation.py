@@ -29,6 +29,8 @@ POINTS = 41
 WIDTHS, PERIODS = 400, 5.0
 #: The shaper by a linear programme, how long it may be in periods of the lowest mode, and steps to find that.
 ROBUST, SHORTEST, LONGEST, HALVINGS = "robust", 0.25, 3.0, 6
+#: Frequencies may be off by this fraction at most, as the node has it [-].
+WIDEST = 0.5
 #: Names of the smooth ones, and how many boxes they are.
 SMOOTH = {"jerk_limited": 1, "snap_limited": 2}
 BY_PROGRAMME = "least_exciting"
@@ -203,7 +205,7 @@ def _robust(spreads, residual):
 
 def _robust_for(modes, spreads, residual):
     shaped = [spreads[k] for k in modes]
-    spread = min(max((s.high - s.low) / (s.high + s.low) for s in shaped), 0.5)
+    spread = min(max((s.high - s.low) / (s.high + s.low) for s in shaped), WIDEST)
 
     def made(periods):
         train = train_of(ROBUST, shaped, spread, periods)

@@ -10,7 +10,7 @@ from flexarm_dynamics.errors import FlexarmError
 from . import effect, windows
 from .families import dependence, families
 from .fit import HIGHEST
-from .recommendation import BY_PROGRAMME, ROBUST, Spread, recommend, widened
+from .recommendation import BY_PROGRAMME, LONGEST, ROBUST, WIDEST, Spread, recommend, widened
 from .time_law import Move
 
 #: A mode that takes part in less than this fraction of the vibration's energy is not shaped for [-].
@@ -272,7 +272,8 @@ def yaml_lines(made):
         lines.insert(2, f"    joint_names: [{', '.join(made.channels.joint_names)}]")
     if chosen.kind == ROBUST:
         # Upwards: the printed number covers what was found.
-        spread, periods = (float(np.ceil(1e3 * v)) / 1e3 for v in (chosen.spread, chosen.periods))
+        up = lambda value, most: min(float(np.ceil(1e3 * value)) / 1e3, most)  # noqa: E731
+        spread, periods = up(chosen.spread, WIDEST), up(chosen.periods, LONGEST)
         lines += [f"    shaper.spread: {spread}", f"    shaper.periods: {periods}"]
     if places:
         flat = [float(q) for place, _ in places for q in place]
@@ -317,7 +318,7 @@ def _modes_text(made):
         (low, high), (least, _, most) = family.frequencies, family.dampings
         yield (
             f"  {low:.3f} to {high:.3f} Hz, damping {least:.4f} to {most:.4f}, in {len(family.modes)} of "
-            f"{len(made.windows)} windows, {100.0 * family.part:.2g} % of the vibration"
+            f"{len(made.windows)} windows, {100.0 * family.part:.3g} % of the vibration"
         )
         law = dependence(family, made.windows)
         if law is not None:

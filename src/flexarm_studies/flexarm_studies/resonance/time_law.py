@@ -23,6 +23,8 @@ PER_PERIOD, FEWEST, MOST = 10, 40, 160
 #: Poles of each mode that are looked at, and steps of the bisection.
 POLES, STEPS = 12, 9
 _SIDES = 8
+#: Timeout of one programme, which takes some 10 ms [s].
+PATIENCE = 10.0
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,8 @@ def solve(move, poles, wanted, duration):
     made = linprog(
         np.append(np.zeros(count - 1), 1.0), A_ub=upper, b_ub=bound, A_eq=equal, b_eq=[0.0, move.distance / unit],
         bounds=[(-1.0, 1.0)] * (count - 1) + [(0.0, None)],
+        # The dual simplex method cycles where nothing need be left, in times that are long enough.
+        method="highs-ipm", options={"time_limit": PATIENCE},
     )  # fmt: skip
     if made.x is None:
         return None

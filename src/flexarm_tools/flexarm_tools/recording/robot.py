@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what any robot publishes from a bag: `sensor_msgs/JointState` and `sensor_msgs/Imu`. No ROS."""
+"""Reads what any robot publishes: `sensor_msgs/JointState` and `sensor_msgs/Imu`, and strains of `ArmState`. No ROS."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +9,11 @@ import numpy as np
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.recordings import streams
 
-from .bag import Source, bag_path
+from .bag import KINDS, Source, bag_path
 from .serialised import Decoder
 
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+STATE = KINDS["arm_state"]
 #: Numbers after the joint names in a message, to what they are.
 _FIELDS = {"position": "position", "velocity": "velocity", "effort": "torque"}
 
@@ -67,7 +68,7 @@ def of_messages(topic, kind, messages, notes):
     ----------
     topic : str
     kind : str
-        `JOINTS` or `IMU`.
+        `JOINTS`, `IMU` or, for its strains, `STATE`.
     messages : list of bytes
     notes : list of str
         To which it adds what was left out.
@@ -81,7 +82,9 @@ def of_messages(topic, kind, messages, notes):
     groups = sorted(decoder.groups(messages), key=lambda g: g[0][0])
     if decoder.broken:
         notes.append(f"{topic}: {decoder.broken} messages can't be read, and are left out")
-    return (_joints if kind == JOINTS else _imu)(topic, groups)
+    if not groups:
+        raise FlexarmError("has no message that can be read", field=topic)
+    return {JOINTS: _joints, IMU: _imu, STATE: _strains}[kind](topic, groups)
 
 
 def _wanted(topic, kind, inside):
@@ -103,7 +106,7 @@ def _in_order(parts):
 
 def _joints(topic, groups):
     """A `Stream` of joint states; messages with other joints than the first are left out."""
-    names = groups[0][1].names["name"] if groups else ()
+    names = groups[0][1].names["name"]
     if not names:
         raise FlexarmError("has no joint names in its first message", field=topic)
     groups = [g for g in groups if sorted(g[1].names["name"]) == sorted(names)]
@@ -125,8 +128,6 @@ def _joints(topic, groups):
 
 def _imu(topic, groups):
     """A `Stream` of an IMU; what it marks as not measured (covariance -1) is left out."""
-    if not groups:
-        raise FlexarmError("has no message that can be read", field=topic)
     time = _in_order([(rows, _stamps(layout, block)) for rows, layout, block in groups])
     found = []
     for field in ("linear_acceleration", "angular_velocity"):
@@ -137,3 +138,18 @@ def _imu(topic, groups):
             parts.append((rows, np.where(unknown[:, None], np.nan, values)))
         found.append(_in_order(parts))
     return streams.of_imu(topic, time, *found)
+
+
+def _strains(topic, groups):
+    """A `Stream` of an arm's strains; messages with other gauges than the first are left out."""
+    names = groups[0][1].names["gauge_names"]
+    groups = [
+        g
+        for g in groups
+        if g[1].names["gauge_names"] == names and g[1].numbers["strain"][2] == len(names)
+    ]
+    if not names or not groups:
+        raise FlexarmError("has no strains", field=topic)
+    time = _in_order([(rows, _stamps(layout, block)) for rows, layout, block in groups])
+    strain = _in_order([(rows, layout.column(block, "strain")) for rows, layout, block in groups])
+    return streams.Stream(topic, time, {"strain": strain}, {"gauge": names})

@@ -2,13 +2,17 @@
 """``flexarm resonance``: the modes that ring in a recording, with intervals, and the shaper that takes them out."""
 
 import json
+import sys
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_studies.commands.options import numbers
+from flexarm_studies.commands.options import chosen, numbers
 from flexarm_studies.identification.recording import SIGNALS
 from flexarm_studies.recordings import mapping as mappings
+from flexarm_studies.recordings import streams
 from flexarm_studies.resonance import study as studies
+from flexarm_studies.resonance.measured import rings, save
+from flexarm_studies.resonance.motion import STEP, SWEEP, Bounds, design, measure
 from flexarm_studies.resonance.time_law import Move
 
 from ..identification import recording as recordings
@@ -17,6 +21,14 @@ from ..recording.bag import KINDS
 
 STATE = KINDS["arm_state"]
 DEFAULT = studies.Wishes()
+#: Bounds that are options, and what they are.
+BOUNDS = {
+    "travel": "the motion stays this near to where the arm stands [rad]",
+    "velocity": "its speed [rad/s]",
+    "acceleration": "its acceleration [rad/s^2]",
+    "stop_travel": "a measured joint this far from there stops it [rad]",
+    "stop_velocity": "and one as fast as this [rad/s]",
+}
 
 
 def add_arguments(parser):
@@ -26,6 +38,8 @@ def add_arguments(parser):
         "recommends the shaper that leaves as little as is wanted at the least delay. No arm file is needed."
     )
     parser.epilog = (
+        "example: flexarm resonance --simulate one_link --kind sweep\n"
+        "example: flexarm resonance --allow-motion --topic arm_controller/joint_trajectory --imu imu --out tip.csv\n"
         "example: flexarm resonance run.csv --mapping my_mapping.yaml --figure results/resonance.png\n"
         "example: flexarm resonance results/bag --residual 0.02 --trajectory motion.csv"
     )
@@ -33,8 +47,8 @@ def add_arguments(parser):
     add(
         "recordings",
         metavar="FILE",
-        nargs="+",
-        help="a bag's directory, or a CSV file; several of one arm, in several configurations",
+        nargs="*",
+        help="a bag's directory, or a CSV file; several of one arm, in several configurations; none: the arm is moved",
     )
     mappings.add_option(parser)
     add("--namespace", default="", help="of the topics in a bag")
@@ -83,6 +97,59 @@ def add_arguments(parser):
         help="draw decay and fit, spectra, modes, and what each shaper leaves",
     )
     add("--json", action="store_true", help="print JSON, in SI")
+    _add_motion(
+        parser.add_argument_group("measuring by a small motion, in place of FILE").add_argument
+    )
+
+
+def _add_motion(add):
+    add("--allow-motion", action="store_true", help="stand clear: the arm will move")
+    add(
+        "--simulate",
+        metavar="ARM",
+        help="move the simulated arm of this arm file, behind a position loop",
+    )
+    add("--at", metavar="q1,q2,...", help="where the simulated arm stands [rad] (default 0)")
+    add(
+        "--kind",
+        choices=(STEP, SWEEP),
+        default=STEP,
+        help="there and back, or a sweep (default step)",
+    )
+    add("--joints", metavar="A,B", help="which joints move, one after the other (default: all)")
+    for name, what in BOUNDS.items():
+        default = getattr(Bounds, name)
+        add(
+            f"--{name.replace('_', '-')}",
+            type=float,
+            default=default,
+            help=f"{what} (default {default:g})",
+        )
+    add("--rest", type=float, default=4.0, help="free ringing after each motion [s] (default 4)")
+    add(
+        "--sweep",
+        default="1:15",
+        metavar="LOW:HIGH",
+        help="frequencies of a sweep [Hz] (default 1:15)",
+    )
+    add("--sweep-duration", type=float, default=10.0, help="of a sweep [s] (default 10)")
+    add(
+        "--topic", default="joint_trajectory", help="of the trajectories (default joint_trajectory)"
+    )
+    add(
+        "--joint-states",
+        default="joint_states",
+        help="topic of the joint states (default joint_states)",
+    )
+    add(
+        "--imu",
+        action="append",
+        default=[],
+        metavar="TOPIC",
+        help="topic of an IMU, as often as there are",
+    )
+    add("--arm-state", default="", metavar="TOPIC", help="topic of an ArmState, for its strains")
+    add("--out", metavar="F", help="keep what was measured in a CSV file")
 
 
 def resonance(options):
@@ -94,11 +161,14 @@ def resonance(options):
         For what can't be read, where nothing rings, and for options that are no numbers or out of range.
     """
     wishes = wishes_of(options)
-    mapping = mappings.of_options(options)
-    measured = [
-        read(path, mapping, options.namespace, wishes.quantities) for path in options.recordings
-    ]
-    made = studies.study(measured, wishes)
+    if options.recordings:
+        mapping = mappings.of_options(options)
+        given = [
+            read(path, mapping, options.namespace, wishes.quantities) for path in options.recordings
+        ]
+        made = studies.study(given, wishes)
+    else:
+        made = by_motion(options, wishes)
     motion = studies.of_trajectory(made, options.trajectory) if options.trajectory else None
     found = {"recordings": [str(path) for path in options.recordings]} | studies.plain(made)
     if motion is not None:
@@ -114,6 +184,61 @@ def resonance(options):
     if "figure" in found:
         print(f"figure: {found['figure']}")
     return found
+
+
+def by_motion(options, wishes):
+    """The `Study` of an arm that is moved, a running one or a simulated one.
+
+    Parameters
+    ----------
+    options : Namespace
+    wishes : Wishes
+
+    Raises
+    ------
+    FlexarmError
+        Without ``--allow-motion`` or ``--simulate``, for motions beyond their bounds, and where the measurement was
+        stopped.
+    """
+    bounds = Bounds(**{name: getattr(options, name) for name in BOUNDS})
+    if options.simulate:
+        from flexarm_studies.resonance.simulated import SimulatedArm
+
+        return _moved(SimulatedArm(options.simulate, _place(options)), options, wishes, bounds)
+    if not options.allow_motion:
+        hint = "give a FILE to look at; or stand clear, and give --allow-motion"
+        raise FlexarmError("this moves the arm", hint=hint)
+    from flexarm_ros.session import Session
+
+    from .live import RunningArm
+
+    with Session("resonance", namespace=options.namespace) as session:
+        topics = options.topic, options.joint_states, options.imu, options.arm_state
+        return _moved(RunningArm(session, *topics), options, wishes, bounds)
+
+
+def _place(options):
+    return None if options.at is None else numbers("--at", options.at)
+
+
+def _moved(arm, options, wishes, bounds):
+    names = list(arm.joint_names)
+    moving = chosen("--joints", options.joints, names) if options.joints else names
+    joints, band = [names.index(name) for name in moving], _listed("--sweep", options.sweep, 2)
+    motion = design(
+        options.kind, joints, len(names), bounds, options.rest, tuple(band), options.sweep_duration
+    )
+    print(
+        f"moves {', '.join(moving)} for {motion.duration:.1f} s, within {bounds.travel:g} rad, "
+        f"{bounds.velocity:g} rad/s, {bounds.acceleration:g} rad/s^2; stops if a joint is "
+        f"{bounds.stop_travel:g} rad away or faster than {bounds.stop_velocity:g} rad/s", file=sys.stderr,
+    )  # fmt: skip
+    measure(arm, motion, bounds)
+    recording = streams.join(arm.streams())
+    if options.out:
+        save(recording, options.out)
+    found, windows = rings(recording, motion, arm.begin, wishes)
+    return studies.of_windows(found, windows, wishes)
 
 
 def read(path, mapping=None, namespace="", quantities=()):
