@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is computed of every sample: plain Python on arrays, which `load.joined` compiles with numba.
+"""What is computed very often: plain Python on arrays, which `load.joined` compiles with numba.
 
 The equations are in the modules whose arrays these functions work on.
 """
@@ -8,11 +8,11 @@ from functools import cache
 
 from flexarm_dynamics.kernels import load
 
-from . import law, limits, readings
+from . import eigenvectors, law, limits, readings
 
 
 @cache
 def compiled():
     """The compiled functions of all modules here."""
-    sources = [load.source(module) for module in (law, limits, readings)]
-    return load.joined("control", sources, inline=("larger",))
+    sources = [load.source(module) for module in (eigenvectors, law, limits, readings)]
+    return load.joined("control", sources, inline=("larger", "unit"))

@@ -20,10 +20,13 @@ see.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import eigvals
-from scipy.linalg.lapack import zgetrf, zgetrs
+from scipy.linalg import eigvals, hessenberg
+
+from ..kernels import compiled
 
 #: A pole counts as one that no gain moves below this change of v by one unit of all scaled gains.
 UNMOVED = 0.01
@@ -59,22 +62,45 @@ def eigenvalues(loop, K):
     return closed, z[(np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)]
 
 
-def gradient(loop, closed, z):
-    """Derivative of the real part of a pole s by the gains, shape of K; by inverse iteration."""
-    size = len(closed)
-    factors, pivots, _ = zgetrf(closed - (z * (1.0 + 1e-10) + 1e-14) * np.eye(size))
-    start = np.cos(1.0 + np.arange(size)).astype(complex)
-    right, left = start, start
-    # Where it is singular to the last bit, no slope is found: zero.
-    with np.errstate(all="ignore"):
-        for _ in range(2):
-            right = zgetrs(factors, pivots, right)[0]
-            right /= np.linalg.norm(right)
-            left = zgetrs(factors, pivots, left, trans=2)[0]
-            left /= np.linalg.norm(left)
-        across = loop.period * z * (left.conj() @ right)
-        found = -np.outer(left.conj() @ loop.G, loop.N @ right) / across
-    return np.nan_to_num(found.real)
+class Gradients:
+    """Derivatives of the real parts of a closed loop's poles by the gains.
+
+    The eigenvectors are found by inverse iteration on the loop's Hessenberg form, made once for all of its poles.
+
+    Parameters
+    ----------
+    loop : Loop
+    closed : ndarray, shape (N, N)
+        F - G K N.
+    """
+
+    def __init__(self, loop, closed):
+        self._loop, self._closed = loop, closed
+
+    @cached_property
+    def _reduced(self):
+        """The Hessenberg form, and G and N in its coordinates."""
+        H, Q = hessenberg(self._closed, calc_q=True, check_finite=False)
+        return np.ascontiguousarray(H), Q.T @ self._loop.G, self._loop.N @ Q
+
+    def __call__(self, z):
+        """That of a pole z, shape of K; not finite where the matrix is singular to the last bit."""
+        H, G, N = self._reduced
+        right, left = compiled().eigenvectors(H, complex(z))
+        left = left.conj()
+        across = self._loop.period * complex(z) * (left @ right)
+        return np.outer(left @ G, (N @ right) * (-1.0 / across)).real
+
+
+class Poles(NamedTuple):
+    """Poles of one loop, the largest v first."""
+
+    loop: object
+    gradients: Gradients
+    z: np.ndarray  # (k,)
+    s: np.ndarray  # (k,) [1/s]
+    asked: np.ndarray  # d, (k,) [1/s]
+    v: np.ndarray  # (k,) [-]
 
 
 class Slowest:
@@ -91,46 +117,47 @@ class Slowest:
     def __init__(self, loops, wanted, scale):
         self.loops, self.wanted, self.scale = loops, wanted, scale
         self.free = scale > 0.0
+        self._unit = scale[self.free]
 
     def gains(self, x):
         """K of scaled gains x."""
         K = np.zeros_like(self.scale)
-        K[self.free] = x * self.scale[self.free]
+        K[self.free] = x * self._unit
         return K
 
     def scaled(self, K):
         """Scaled gains x of K."""
-        return K[self.free] / self.scale[self.free]
+        return K[self.free] / self._unit
 
     def values(self, x, loops=None):
-        """Of each loop: its closed matrix, poles z and their v, the largest first."""
+        """The `Poles` of each loop, or of these loops, under scaled gains x."""
         K, found = self.gains(x), []
         for loop in self.loops if loops is None else loops:
             closed, z = eigenvalues(loop, K)
             s = np.log(z) / loop.period
-            v = s.real / self.wanted.decay(s, loop.fraction)
+            asked = self.wanted.decay(s, loop.fraction)
+            v = s.real / asked
             order = np.argsort(-v)
-            found.append((loop, closed, z[order], v[order]))
+            gradients = Gradients(loop, closed)
+            found.append(Poles(loop, gradients, z[order], s[order], asked[order], v[order]))
         return found
 
-    def worst(self, found):
-        """The largest v of poles that gains move, with loop, z and the gradient by x; unmoved ones are passed over.
+    def _slope(self, poles, i):
+        """Gradient of the v of pole i by the scaled gains; zero where none is found."""
+        with np.errstate(all="ignore"):
+            slope = poles.gradients(poles.z[i])[self.free] * (self._unit / poles.asked[i])
+        return slope if np.isfinite(slope).all() else np.zeros_like(slope)
 
-        `found` as `values` returns it. Returns v, gradient, loop, z, and the poles that were passed over.
+    def worst(self, found):
+        """The largest v of poles that gains move, with loop, s and the gradient by x; unmoved ones are passed over.
+
+        `found` as `values` returns it. Returns v, gradient, loop, s, and the poles that were passed over.
         """
-        candidates = [
-            (v, k, i)
-            for k, (_, _, _, all_v) in enumerate(found)
-            for i, v in enumerate(all_v[:MOST])
-        ]
+        candidates = [(v, k, i) for k, one in enumerate(found) for i, v in enumerate(one.v[:MOST])]
         candidates.sort(reverse=True)
         unmoved = []
         for v, k, i in candidates:
-            loop, closed, z, _ = found[k]
-            s = np.log(z[i]) / loop.period
-            slope = (gradient(loop, closed, z[i]) * self.scale)[self.free] / self.wanted.decay(
-                s, loop.fraction
-            )
+            loop, s, slope = found[k].loop, found[k].s[i], self._slope(found[k], i)
             if v > 1e-9 or np.linalg.norm(slope) > UNMOVED:
                 return v, slope, loop, s, unmoved
             unmoved.append((loop, s))
@@ -151,15 +178,13 @@ class Slowest:
                 w = width * max(1.0, abs(worst))
                 out = {(id(loop), s) for loop, s in unmoved}
                 total, slope = 0.0, np.zeros(x.size)
-                for loop, closed, z, v in found:
-                    for one, value in zip(z, v, strict=True):
+                for poles in found:
+                    for i, value in enumerate(poles.v):
                         if value < worst - 6.0 * w:
                             break
-                        s = np.log(one) / loop.period
-                        if (id(loop), s) in out:
+                        if (id(poles.loop), poles.s[i]) in out:
                             continue
-                        g = (gradient(loop, closed, one) * self.scale)[self.free]
-                        g /= self.wanted.decay(s, loop.fraction)
+                        g = self._slope(poles, i)
                         if value < 0.0 and np.linalg.norm(g) < UNMOVED:
                             continue
                         weight = np.exp((value - worst) / w)

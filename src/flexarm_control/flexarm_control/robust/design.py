@@ -304,7 +304,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     rows, left, slopes = [], [], []
     for one in slowest.values(x):
         v, slope, _, s, unmoved = slowest.worst([one])
-        rows.append((one[0].name, complex(s), float(v)))
+        rows.append((one.loop.name, complex(s), float(v)))
         slopes.append(float(np.linalg.norm(slope)))
         left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
     K = slowest.gains(x)
