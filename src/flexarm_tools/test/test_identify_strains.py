@@ -2,11 +2,13 @@
 """`flexarm identify` without torque: what is fitted, what is scored, what is written, and going on where it stopped."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from flexarm_dynamics.arm import arm_file
+from flexarm_studies.identification import strain_fit
 
 ARM = """
 name: geared
@@ -104,6 +106,34 @@ def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(iden
     assert "identified: +- " in line and "a guess" not in line
     assert "hub_inertia: 0.03            # assumed" in text
     assert "root delay" in text and plot.stat().st_size > 10_000
+
+
+def test_the_page_has_all_parts_every_number_and_nothing_from_the_network(
+    identify, folder, monkeypatch
+):
+    for name in ("START_STEPS", "PASS_STEPS", "PASSES"):  # the page, not the fit, is tested
+        monkeypatch.setattr(strain_fit, name, 1)
+    page = folder / "pages" / "fit.html"
+    code, printed, err = identify(
+        *HOLD, "--fit", "0:8", "--score", "8:12", "--json", "--report", page
+    )
+    assert code == 0, err
+    result, text = json.loads(printed), page.read_text(encoding="utf-8")
+    assert result["report"] == str(page)
+    for part in ("short", "overlays", "scores", "residuals", "parameters", "correlations", "next"):
+        assert f'<section id="{part}">' in text and f'href="#{part}"' in text
+    traces = json.loads(re.search(r'id="traces">(.*?)</script>', text, re.DOTALL).group(1))
+    assert [c["name"] for c in traces["channels"]] == ["root", "middle"]
+    assert traces["spans"] == [["fit", 0.0, 8.0], ["score", 8.0, 12.0]]
+    for channel in traces["channels"]:
+        measured, predicted = (np.array(channel[k], float) for k in ("measured", "predicted"))
+        assert len(measured) == len(predicted) == traces["time"][2] == 1200
+        rms = result["parts"]["score"][channel["name"]]["model"]["rms"]
+        assert np.std((measured - predicted)[800:]) == pytest.approx(1e6 * rms, rel=1e-3)
+    for row in result["parameters"]:
+        assert f'<th scope="row">{row["name"]}</th>' in text
+    assert text.count("<svg") == 2
+    assert "http://" not in text and "https://" not in text
 
 
 def test_without_parts_all_is_fitted_and_printed_for_people(identify):

@@ -53,8 +53,8 @@ def explained(measured, predicted, part, period, above):
         ``vaf``, ``vaf_above`` [%], ``rms`` [-], each (g,).
     """
     error = measured - predicted
-    filled = [_filled(values) for values in (measured, error)]
-    fast, fast_error = (high_passed(values, period, above)[part] for values in filled)
+    both = [filled(values) for values in (measured, error)]
+    fast, fast_error = (high_passed(values, period, above)[part] for values in both)
     known = np.isfinite(error[part])
     with np.errstate(divide="ignore", invalid="ignore"):
         variance = np.nanvar(np.where(known, measured[part], np.nan), axis=0)
@@ -64,8 +64,8 @@ def explained(measured, predicted, part, period, above):
     return {"vaf": 100.0 * vaf, "vaf_above": 100.0 * above_it, "rms": rms}
 
 
-def _filled(values):
-    """The columns with missing values filled in by straight lines."""
+def filled(values):
+    """The columns of `values` (s, g) with missing ones filled in by straight lines."""
     out, row = values.copy(), np.arange(len(values))
     for column in out.T:
         known = np.isfinite(column)
@@ -131,9 +131,9 @@ def ceiling(recording, measured, part, above):
     if found is None:
         return None
     quiet, noise, period = found.part, found.rms, recording.period
-    values = _filled(recording.strain)
+    values = filled(recording.strain)
     fast_noise = high_passed(values, period, above)[quiet].std(axis=0)
-    fast = high_passed(_filled(measured), period, above)[part]
+    fast = high_passed(filled(measured), period, above)[part]
     with np.errstate(divide="ignore", invalid="ignore"):
         return {
             "vaf": 100.0 * (1.0 - noise**2 / np.nanvar(measured[part], axis=0)),

@@ -15,10 +15,12 @@ from flexarm_studies.identification.fit import identify as fit
 from flexarm_studies.progress import Progress
 from flexarm_studies.recordings import mapping as mappings
 
+from . import page, strains
 from . import recording as recordings
-from . import strains
 
 UNDETERMINED = 0.5
+#: What the command writes.
+FILES = ("out", "plot", "report")
 
 
 def add_arguments(parser):
@@ -40,6 +42,11 @@ def add_arguments(parser):
     add("--namespace", default="", help="of the arm's topics")
     add("--out", metavar="FILE", help="write the arm file with the values found")
     add("--plot", metavar="FILE", help="draw measured, fitted and residual motion")
+    add(
+        "--report",
+        metavar="FILE",
+        help="write a page of HTML: overlays with zoom, residuals, parameters, correlations, what to measure next",
+    )
     add(
         "--hold",
         nargs="+",
@@ -98,6 +105,8 @@ def identify(options):
         result["out"] = str(out)
     if options.plot:
         result["plot"] = draw(found, measured, options.plot)
+    if options.report:
+        result["report"] = page.write(found, measured, found.predicted, result, options.report)
     if options.json:
         print(json.dumps(result, allow_nan=False))
     else:
@@ -118,11 +127,13 @@ def without_torque(options, arm, measured, progress, out):
         result["out"] = str(out)
     if options.plot:
         result["plot"] = strains.draw(found, run, predicted, result, options.plot)
+    if options.report:
+        result["report"] = page.write(found, run, predicted, result, options.report)
     if options.json:
         print(json.dumps(result, allow_nan=False))
     else:
         print("\n".join(strains.text_of(result, _line)))
-        for key in ("out", "plot"):
+        for key in FILES:
             if key in result:
                 print(f"{key}: {result[key]}")
         for warning in result["warnings"]:
@@ -201,7 +212,7 @@ def text_of(result):
     yield ""
     for name, row in result["residual_rms"].items():
         yield f"{'residual of ' + name:36} {row['value']:.3g} {row['unit']} rms"
-    for key in ("out", "plot"):
+    for key in FILES:
         if key in result:
             yield f"{key}: {result[key]}"
 

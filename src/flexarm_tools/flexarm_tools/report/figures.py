@@ -165,7 +165,7 @@ class _Paper:
         self._legend(figure, entries)
         if times is not None:
             self._times(times)
-        image = "" if self.png else _svg(figure, name)
+        image = "" if self.png else svg(figure, name)
         if self.png or len(image) > MAX_SVG:
             image = _png(figure, title)
         places = []  # known only after saving, which does the layout
@@ -483,7 +483,7 @@ def _darker(name):
     return tuple(0.6 * np.array(matplotlib.colors.to_rgb(name)))
 
 
-def _svg(figure, name):
+def svg(figure, name):
     """The figure as SVG for a page: without a header, without references to other files."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
