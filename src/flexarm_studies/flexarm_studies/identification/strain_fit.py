@@ -27,6 +27,7 @@ from scipy.optimize import least_squares
 from flexarm_dynamics.errors import FlexarmError
 
 from ..recordings.motion import CORNER
+from . import ring_damping
 from .fit import NORMAL, robust_covariance
 from .prescribed import MotionPredictor
 from .quantities import held
@@ -84,6 +85,8 @@ class Options:
         Of the low pass of the joint angles [Hz].
     lead : int
         Samples at the beginning that are predicted, but not compared.
+    ring_downs : bool
+        Whether damping is fitted to the decay of ring-downs in the end, see `ring_damping`.
     """
 
     hold: tuple = ()
@@ -92,6 +95,7 @@ class Options:
     starts: int = STARTS
     corner: float = CORNER
     lead: int = 0
+    ring_downs: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +197,9 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     if state is not None and state.best is not None:
         problem.take(state.best)
     problem.finish(report, state)
+    if options.ring_downs:
+        ring_damping.fit(problem, report)
+        problem.weigh()
     return problem.result(tuple(kept[k][0] for k in sorted(kept)))
 
 

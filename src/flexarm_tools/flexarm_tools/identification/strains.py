@@ -59,6 +59,11 @@ def add_arguments(parser):
         metavar="HZ",
         help=f"corner of the low pass of the joint angles ({CORNER:g})",
     )
+    add(
+        "--ring-downs",
+        action="store_true",
+        help="in the end, fit the damping to the decay of ring-downs: strains alone overestimate it",
+    )
     add("--free", nargs="+", action="extend", default=[], metavar="NAME",
         help="find these, too, which are held by default: 'gauges[*].position'")  # fmt: skip
     add(
@@ -86,6 +91,7 @@ def asked(options):
             options.score_file,
             options.free,
             options.state,
+            options.ring_downs,
         )
     )
 
@@ -124,6 +130,7 @@ def identify(options, arm, measured, progress):
         options.undetermined,
         options.starts,
         options.smooth,
+        ring_downs=options.ring_downs,
     )
     state = None
     if options.state:

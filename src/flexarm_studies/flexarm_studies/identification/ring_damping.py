@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""Damping from ring-downs: after a fit of strains, its damping parameters are fitted to the decay of free vibration.
+
+A sum of squares of strains overestimates damping. Where a model's frequency is off by a fraction s, model and arm are
+out of step after 1/2s periods, and from then on the sum is smaller the faster the model's vibration dies away. The
+decay itself does not depend on the phase. With the damping ratios :math:`\zeta_r` of ring-downs, found in measured and
+modelled strains alike, and the mean squares :math:`V_g` of the residuals of the gauges, this minimises
+
+.. math::
+    \sum_r \Bigl(\frac{\ln(\zeta_r/\hat\zeta_r)}{s_\zeta}\Bigr)^2 + \sum_g \Bigl(w\,\bigl(V_g/V_{g0} - 1\bigr)\Bigr)^2,
+
+:math:`V_{g0}` those of the fit: the damping may become right at the cost of a few per cent of the residuals. All other
+parameters stay as they are.
+"""
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from ..recordings import rest, ring_down
+
+#: Kinds of quantities that damp.
+DAMPING = (
+    "damping",
+    "transmission_damping",
+    "transmission_load_damping",
+    "transmission_play_damping",
+)
+#: Deviation of the logarithm of a damping ratio, s, and weight of the residuals, w.
+SPREAD, WEIGHT = 0.3, 4.0
+#: Smallest damping ratio that counts, and smallest and largest factor of a quantity.
+LEAST, LOW, HIGH = 1e-4, 0.01, 4.0
+#: Relative step of differences, and evaluations.
+STEP, EVALUATIONS = 0.03, 7
+#: Ring-downs that are needed.
+MIN_RING_DOWNS = 3
+
+
+def fit(problem, report):
+    """Change the free damping quantities of a fitted `problem` to those of its recording's ring-downs.
+
+    Parameters
+    ----------
+    problem : StrainProblem
+        After `finish`.
+    report : callable
+        ``report(label)`` says what is done.
+
+    Returns
+    -------
+    list of int
+        Indices of the quantities that were changed; none where there are too few ring-downs.
+    """
+    rings = _found(problem)
+    which = [
+        j
+        for j, q in enumerate(problem.found)
+        if q.kind in DAMPING and problem.free[j] and problem.values[j] > 0.0
+    ]
+    if len(rings) < MIN_RING_DOWNS or not which:
+        problem.warnings.append(
+            f"damping is not fitted to ring-downs: {len(rings)} were found, {MIN_RING_DOWNS} are needed"
+            if which
+            else "damping is not fitted to ring-downs: every damping is held"
+        )
+        return []
+    report(f"damping from {len(rings)} ring-downs")
+    base, first = problem.values.copy(), _strains(problem, problem.values)
+    before = _squares(problem, first)
+
+    def residuals(factor):
+        values = base.copy()
+        values[which] *= factor
+        made = _strains(problem, values)
+        if not np.isfinite(made).all():
+            return np.full(len(rings) + before.size, 1.0 / SPREAD)
+        logs = [np.log(_damping(problem, made, r) / r.damping) for r in rings]
+        return np.r_[np.array(logs) / SPREAD, WEIGHT * (_squares(problem, made) / before - 1.0)]
+
+    made = least_squares(
+        residuals, np.ones(len(which)), bounds=(LOW, HIGH), diff_step=STEP, max_nfev=EVALUATIONS
+    )
+    problem.values[which] = base[which] * made.x
+    return which
+
+
+def _strains(problem, values):
+    setup = problem.at(values)
+    return problem.strains(setup, problem.states(setup))
+
+
+def _squares(problem, made):
+    """Mean square of the residuals of each gauge that reads something."""
+    error = np.where(problem.known, problem.measured - made, np.nan)
+    return np.nanvar(error[:, problem.known.any(axis=0)], axis=0)
+
+
+def _found(problem):
+    run = problem.recording
+    rings = ring_down.find(run, rest.stretches(run), np.sqrt(np.diag(problem.covariance_of_new)))
+    return [r for r in rings if r.part.start >= problem.options.lead]
+
+
+def _damping(problem, made, ring):
+    modelled = ring_down.fit(made[ring.part, ring.gauge], problem.recording.period)
+    return max(modelled.damping, LEAST)
