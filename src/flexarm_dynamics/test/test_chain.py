@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 
 from flexarm_dynamics.arm.description import (
     Arm,
+    Body,
     Flexibility,
     Friction,
     Joint,
@@ -111,7 +112,11 @@ def random_arm(seed, layout, level="first order", friction=True, gravity=True):
             if d in flexible
         }  # fmt: skip
         pieces = varied(rng) if flexible.get("varied") else ()
-        links.append(Link(f"link{i + 1}", length, rho, stiffness, modes, polar, pieces))
+        bodies = carried(rng, length) if flexible.get("carries") else ()
+        root = tuple(rng.uniform(-0.2, 0.2, 3)) if flexible.get("carries") else (0.0,) * 3
+        links.append(
+            Link(f"link{i + 1}", length, rho, stiffness, modes, polar, pieces, bodies, root)
+        )
     payload = Payload(rng.uniform(0.1, 0.5), body(rng, 0.05), tuple(rng.uniform(-0.1, 0.1, 3)))
     weight = tuple(rng.uniform(-9.0, 9.0, 3)) if gravity else (0.0, 0.0, 0.0)
     arm = Arm("random", tuple(joints), tuple(links), payload, gravity=weight)
@@ -133,6 +138,14 @@ def varied(rng):
     return tuple(pieces)
 
 
+def carried(rng, length):
+    """Two bodies on a link."""
+    return tuple(
+        Body(x * length, rng.uniform(0.1, 0.5), body(rng, 0.05), tuple(rng.uniform(-0.1, 0.1, 3)))
+        for x in rng.uniform((0.2, 0.0), (0.5, 1.0))
+    )
+
+
 PROPERTIES = ("mass", "y", "z", "twist", "polar")
 FULL = {"y": (2, "loaded"), "z": (2, "clamped_free"), "twist": (1, "loaded")}
 
@@ -152,7 +165,7 @@ def layouts(draw, most=5):
             )
             for d in sorted(directions)
         }
-        links.append({**link, "varied": True} if changes else link)
+        links.append({**link, "varied": changes, "carries": draw(st.booleans())})
     return links
 
 
@@ -357,7 +370,8 @@ class Reference:
         level, end = level_of(self.arm), np.array([xi])
         y, z, _ = (v[:, 0] for v in self._shape(i, delta, end))
         length = self.arm.links[i].length
-        place = rows(length * xi - self._shortening(i, delta, end)[:, 0], y, z)
+        x, root = length * xi - self._shortening(i, delta, end)[:, 0], self.arm.links[i].root
+        place = rows(x + root[0], y + root[1], z + root[2])
         sy, sz, _ = (v[:, 0] for v in self._shape(i, delta, end, 1))
         twist = self._shape(i, delta, end)[2][:, 0]
         a, b = sy, sz
@@ -451,12 +465,18 @@ class Reference:
             at, weights = along(link)
             y, zz, twist = self._shape(i, delta, at)
             x = link.length * at - self._shortening(i, delta, at)
-            local = rows(x, y, zz)
+            local = rows(x, y, zz) + np.array(link.root)
             points = p[:, None] + local @ transposed(R)
             masses(link.mass * weights * link.factor("mass", at), points)
             polar = link.polar_inertia_per_length * link.length * weights
             polar = polar * link.factor("polar", at)
             wheels(polar, R, (1.0, 0.0, 0.0), twist.c[1], 2.0 * twist.c[2, -1])
+            for body in link.bodies:
+                place, turn = self.section(i, delta, body.position / link.length)
+                own = R @ turn
+                centre = p + turned(R, place) + turned(own, body.offset)
+                masses(np.array([body.mass]), centre[:, None])
+                inertia(np.array(body.inertia), own)
         _, R, p = frames[-1]
         payload = self.arm.payload
         masses(np.array([payload.mass]), (p + turned(R, payload.offset))[:, None])

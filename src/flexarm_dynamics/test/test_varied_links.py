@@ -19,6 +19,7 @@ from flexarm_dynamics.arm.units import FOOT, POUND_FORCE
 from flexarm_dynamics.arm.urdf import PieceChain
 from flexarm_dynamics.errors import ArmFileError, ModelError
 from flexarm_dynamics.models import beam, model
+from flexarm_dynamics.models.chain import Chain
 from flexarm_dynamics.models.varied_beam import BeamProblem, Body
 
 XI = np.linspace(0.0, 1.0, 41)
@@ -266,3 +267,126 @@ def test_the_urdf_has_the_mass_of_each_piece():
     beams = [m for m in masses if m > 0.0]
     expected = [link.moments(0.4 * k, 0.4 * (k + 1))[0] for k in range(5)]
     assert_allclose(beams[-5:], expected, rtol=1e-9)
+
+
+# --- bodies, roots, fixed joints ---------------------------------------------------------------
+
+BAR = {
+    "mass_per_length": 0.8,
+    "polar_inertia_per_length": 1e-3,
+    "EI_y": 40.0,
+    "EI_z": 70.0,
+    "GJ": 30.0,
+}
+BODY = {"mass": 0.7, "inertia": [0.01, 0.02, 0.03, 0.001, 0.002, 0.003], "offset": [0.05, 0.0, 0.0]}
+
+
+def test_a_body_at_the_tip_is_a_payload():
+    bending = {"flexible": {"y": {"modes": 3, "shape": "loaded"}}}
+    data = {
+        "name": "arm",
+        "joints": [{"name": "joint", "hub_inertia": 0.2}],
+        "gravity": [1.0, -9.0, 2.0],
+    }
+    link = {"name": "boom", "length": 2.0, **BAR, **bending}
+    with_body = {**data, "links": [{**link, "bodies": [{"position": 2.0, **BODY}]}]}
+    with_payload = {**data, "links": [link], "payload": BODY}
+    one, other = (model.build(arm_file.parse(yaml.safe_dump(d))) for d in (with_body, with_payload))
+    q, delta = np.array([0.4]), np.array([0.02, -0.01, 0.004])
+    assert_allclose(one.mass_matrix(q, delta), other.mass_matrix(q, delta), rtol=1e-9, atol=1e-12)
+    qd, rates = np.array([0.8]), np.array([0.3, 0.2, -0.1])
+    ours, theirs = (m.forces(q, qd, delta, rates) for m in (one, other))
+    assert_allclose(ours, theirs, rtol=1e-8, atol=1e-9 * np.abs(theirs).max())
+    assert_allclose(one.frequencies(q), other.frequencies(q), rtol=1e-9)
+
+
+def chain_of(layout):
+    """An arm of joints and links, (joint, link) each."""
+    joints = [{"name": f"joint{i}", **joint} for i, (joint, _) in enumerate(layout)]
+    links = [{"name": f"link{i}", **link} for i, (_, link) in enumerate(layout)]
+    payload = {"mass": 0.4, "inertia": [0.01, 0.02, 0.02, 0, 0, 0], "offset": [0.1, 0.02, 0.0]}
+    data = {"name": "chain", "joints": joints, "links": links, "payload": payload}
+    return arm_file.parse(yaml.safe_dump({**data, "gravity": [2.0, -3.0, -8.0]}))
+
+
+ORIGIN = {"xyz": [0.1, 0.05, -0.1], "rpy": [0.4, -0.3, 0.9]}
+TURNS = {"axis": [0.3, -0.4, 0.8], "hub_inertia": 0.05, "motor_mass": 0.3, "origin": ORIGIN,
+         "housing_inertia": [0.02, 0.03, 0.04, 0.001, 0.002, 0.003]}  # fmt: skip
+BENDS = {"length": 1.1, **BAR, "flexible": {d: {"modes": 1} for d in ("y", "z", "twist")}}
+RIGID = {"length": 0.4, "mass_per_length": 2.0, "polar_inertia_per_length": 1e-3,
+         "root": [0.02, 0.03, -0.01], "bodies": [{"position": 0.1, **BODY}]}  # fmt: skip
+LAYOUTS = {
+    "rigid before": ([TURNS, None, TURNS], [RIGID, BENDS, BENDS], 1),
+    "rigid behind": ([TURNS, None, TURNS], [BENDS, RIGID, BENDS], 1),
+    "two in a row": ([TURNS, None, None, TURNS], [BENDS, RIGID, RIGID, BENDS], 1),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("level", ["first order", "finite slope"])
+def test_a_fixed_joint_is_one_that_does_not_turn(layout, level):
+    joints, links, _ = LAYOUTS[layout]
+    free = {"axis": [0.0, 0.6, 0.8], "origin": ORIGIN}
+    fixed = {"type": "fixed", "origin": ORIGIN}
+    still = [i for i, joint in enumerate(joints) if joint is None]
+    arms = [
+        arm_file.replace(
+            chain_of([(joint or other, link) for joint, link in zip(joints, links, strict=True)]),
+            finite_slope=level == "finite slope",
+        )
+        for other in (free, fixed)
+    ]
+    whole = Chain(arms[0], compiled=False)
+    held = Chain(arms[1], compiled=False, shapes=whole._shapes)
+    n, m, size = whole.n_joints, whole.n_modes, held.n_joints + held.n_modes
+    rng = np.random.default_rng(3)
+    moves = np.setdiff1d(np.arange(n + m), still)
+    z, v = rng.uniform(-0.05, 0.05, n + m), rng.standard_normal(n + m)
+    z[:n] = rng.uniform(-2.0, 2.0, n)
+    z[still] = v[still] = 0.0
+    q, qd = z[moves][: n - len(still)], v[moves][: n - len(still)]
+    M = whole.mass_matrix(z[:n], z[n:])[np.ix_(moves, moves)]
+    assert held.mass_matrix(q, z[n:]).shape == (size, size)
+    assert_allclose(held.mass_matrix(q, z[n:]), M, rtol=1e-9, atol=1e-11)
+    force = whole.forces(z[:n], v[:n], z[n:], v[n:])[moves]
+    assert_allclose(held.forces(q, qd, z[n:], v[n:]), force, rtol=1e-9, atol=1e-9)
+    assert_allclose(held.tip_position(q, z[n:]), whole.tip_position(z[:n], z[n:]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "joints, links, words",
+    [
+        ([None, TURNS], [BENDS, BENDS], "the first joint is fixed"),
+        ([TURNS, None], [BENDS, BENDS], "both link0 and link1 bend"),
+        ([TURNS, None], [BENDS, RIGID], "ends the arm"),
+    ],
+)
+def test_fixed_joints_that_can_not_be_merged_are_refused(joints, links, words):
+    fixed = {"type": "fixed"}
+    with pytest.raises(ArmFileError, match=words):
+        chain_of([(joint or fixed, link) for joint, link in zip(joints, links, strict=True)])
+
+
+@pytest.mark.parametrize(
+    "link, field, words",
+    [
+        ({"bodies": [{"position": 2.1, "mass": 1.0}]}, "bodies[0].position", "0 to 2 m"),
+        ({"bodies": [{"position": 1.0}]}, "bodies[0].mass", "a mass, an inertia, or both"),
+        ({"bodies": [{"position": 1.0, "inertia": [1, 1, -1, 0, 0, 0]}]}, "bodies[0].inertia", "semi-definite"),
+        ({"root": [1.0, 2.0]}, "root", "3 numbers"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_bodies_is_named(link, field, words):
+    with pytest.raises(ArmFileError) as error:
+        arm_of({**BAR, **link})
+    assert error.value.field == f"links[0].{field}" and words in str(error.value)
+
+
+def test_the_urdf_has_all_bodies_where_they_are():
+    arm = chain_of(
+        [(TURNS, {**BENDS, "root": [0.1, 0.2, 0.0], "bodies": [{"position": 0.5, **BODY}]})]
+    )
+    text = PieceChain(Chain(arm, compiled=False), 4).urdf()
+    assert '<link name="link0_body1">' in text and '<link name="link0_root"' in text
+    masses = [float(part.split('"')[0]) for part in text.split('<mass value="')[1:]]
+    assert sum(masses) == pytest.approx(0.8 * 1.1 + 0.7 + 0.4)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from ..errors import ArmFileError
+from . import fixed_joints
 from .description import (
     DIRECTIONS,
     ENCODERS,
@@ -22,6 +23,7 @@ from .description import (
     SHAPES,
     TRANSMISSION,
     Arm,
+    Body,
     Flexibility,
     Friction,
     Gauge,
@@ -34,6 +36,7 @@ from .description import (
 )
 from .entries import MAX_NUMBER, Section, kind_of, read_yaml, value_error
 
+JOINT_TYPES = ("revolute", "fixed")
 #: Most parts of a link with sections of their own.
 MAX_SECTIONS = 40
 #: Largest resolution of a gauge's bridge [bit].
@@ -124,19 +127,30 @@ SAFE_NUMBERS = {
 }
 
 
+def _fixed_joint(s):
+    """A joint that does not turn: a name and an origin."""
+    joint = Joint(s.name(), **_origin(s))
+    s.done()
+    return joint
+
+
+def _origin(s):
+    if not s.has("origin"):
+        return {}
+    o = s.section("origin")
+    origin = {
+        "origin_xyz": o.vector("xyz", 3, "length", (0.0,) * 3),
+        "origin_rpy": o.vector("rpy", 3, "angle", (0.0,) * 3),
+    }
+    o.done()
+    return origin
+
+
 def _joint(s):
     axis = s.vector("axis", 3, default=(0.0, 0.0, 1.0))
     norm = math.hypot(*axis)
     if norm == 0.0:
         raise s.error("axis", "is of length zero", value=list(axis))
-    origin = {"xyz": (0.0,) * 3, "rpy": (0.0,) * 3}
-    if s.has("origin"):
-        o = s.section("origin")
-        origin = {
-            "xyz": o.vector("xyz", 3, "length", (0.0,) * 3),
-            "rpy": o.vector("rpy", 3, "angle", (0.0,) * 3),
-        }
-        o.done()
     optional = {
         key: s.number(key, dimension, low=0.0)
         for key, dimension in SAFE_NUMBERS.items()
@@ -145,8 +159,7 @@ def _joint(s):
     joint = Joint(
         name=s.name(),
         axis=tuple(a / norm for a in axis),
-        origin_xyz=origin["xyz"],
-        origin_rpy=origin["rpy"],
+        **_origin(s),
         hub_inertia=s.number("hub_inertia", "inertia", 0.0, low=0.0),
         motor_mass=s.number("motor_mass", "mass", 0.0, low=0.0),
         housing_inertia=_tensor(s, "housing_inertia"),
@@ -406,8 +419,27 @@ def _link(s):
             "missing",
             hint="a link that twists needs the polar inertia of its sections (rho I_p), or a section",
         )
+    bodies = tuple(_body(b, length) for b in s.sections("bodies"))
+    root = s.vector("root", 3, "length", (0.0,) * 3)
     s.done()
-    return Link(name, length, per_length, stiffness, flexible, polar, pieces)
+    return Link(name, length, per_length, stiffness, flexible, polar, pieces, bodies, root)
+
+
+def _body(s, length):
+    """A rigid body on a link of this length."""
+    body = Body(
+        position=s.number("position", "length", low=0.0),
+        mass=s.number("mass", "mass", 0.0, low=0.0),
+        inertia=_tensor(s, "inertia"),
+        offset=s.vector("offset", 3, "length", (0.0,) * 3),
+    )
+    s.done()
+    if body.position > length * (1.0 + 1e-12):
+        problem, limit = "m is not on the link", f"0 to {length:.6g} m"
+        raise s.error("position", problem, value=body.position, limit=limit)
+    if not body.mass and not any(map(any, body.inertia)):
+        raise s.error("mass", "missing", hint="a body has a mass, an inertia, or both")
+    return replace(body, position=min(body.position, length))
 
 
 def _tensor(s, key):
@@ -543,7 +575,9 @@ def parse(text, where="arm"):
     """
     top = Section(read_yaml(text, where), "", "si")
     top.system = top.text("units", "si", ("si", "imperial"))
-    joints = tuple(_joint(s) for s in top.sections("joints", required=True))
+    given = top.sections("joints", required=True)
+    fixed = {i for i, s in enumerate(given) if s.text("type", "revolute", JOINT_TYPES) == "fixed"}
+    joints = tuple(_fixed_joint(s) if i in fixed else _joint(s) for i, s in enumerate(given))
     links = tuple(_link(s) for s in top.sections("links", required=True))
     if not links:
         raise ArmFileError("links", "empty", hint="an arm has at least one link")
@@ -555,6 +589,7 @@ def parse(text, where="arm"):
         )
     _unique(joints, "joints")
     _unique(links, "links")
+    joints, links = fixed_joints.merged(joints, links, fixed)
     by_name = {link.name: link for link in links}
     gauges = tuple(_gauge(s, by_name) for s in top.sections("gauges"))
     _unique(gauges, "gauges")

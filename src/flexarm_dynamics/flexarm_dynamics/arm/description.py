@@ -152,6 +152,16 @@ class Piece:
 
 
 @dataclass(frozen=True)
+class Body:
+    """A rigid body on a section of a link."""
+
+    position: float  # [m] of the section, from the link's base
+    mass: float = 0.0  # [kg]
+    inertia: tuple = ((0.0,) * 3,) * 3  # [kg m^2] about its centre of mass, section's frame
+    offset: tuple = (0.0, 0.0, 0.0)  # [m] centre of mass from the section
+
+
+@dataclass(frozen=True)
 class Link:
     """A link along x; rigid where `flexible` says nothing, uniform where it has no `pieces`."""
 
@@ -163,6 +173,8 @@ class Link:
     flexible: dict = field(default_factory=dict)  # direction -> Flexibility
     polar_inertia_per_length: float = 0.0  # [kg m] rho I_p, for twist; with pieces: the mean
     pieces: tuple = ()  # Piece, from base to tip, without gaps
+    bodies: tuple = ()  # Body
+    root: tuple = (0.0, 0.0, 0.0)  # [m] of its base, from the joint
 
     @property
     def mass(self):
@@ -170,9 +182,16 @@ class Link:
         return self.mass_per_length * self.length
 
     @property
+    def total_mass(self):
+        """Mass of the beam and of what sits on it [kg]."""
+        return self.mass + sum(body.mass for body in self.bodies)
+
+    @property
     def breaks(self):
-        """Places where the section, or its first derivative, jumps, with both ends: from 0 to 1 [-]."""
-        return (0.0, *(piece.end for piece in self.pieces[:-1]), 1.0)
+        """Places where the section jumps or a body sits, with both ends: from 0 to 1 [-]."""
+        places = {piece.end for piece in self.pieces}
+        places |= {body.position / self.length for body in self.bodies}
+        return tuple(sorted({0.0, *places, 1.0}))
 
     def factor(self, name, xi):
         """A property along the link, in units of the link's own number; where it jumps, the value towards the base.
@@ -191,7 +210,8 @@ class Link:
         xi = np.asarray(xi, float)
         if not self.pieces:
             return np.ones_like(xi)
-        span = np.clip(np.searchsorted(self.breaks, xi) - 1, 0, len(self.pieces) - 1)
+        ends = [piece.end for piece in self.pieces[:-1]]
+        span = np.searchsorted(ends, xi)
         out = np.empty_like(xi)
         for k, piece in enumerate(self.pieces):
             here = span == k

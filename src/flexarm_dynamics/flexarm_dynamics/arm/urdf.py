@@ -183,14 +183,22 @@ class _Writer:
         body = self._link(link.name)
         self._visual(body, 3.0 * self.radius, 2.0 * self.radius, joint.axis, (0.0,) * 3, "hub")
         junctions = self.chain._junctions[i]
-        tip = f"{link.name}_tip"
+        tip, base = f"{link.name}_tip", link.name
+        if any(link.root):
+            base = f"{link.name}_root"
+            self._fixed(f"{base}_joint", link.name, base, link.root)
+            self._link(base)
         if junctions:
             if joint.hub_inertia:
                 self._inertial(body, 0.0, _about(joint))
-            self._pieces(link, junctions, tip)
+            self._pieces(link, base, junctions, tip)
         else:
-            self._beam(body, link, 0.0, link.length, _about(joint))
-            self._fixed(f"{tip}_joint", link.name, tip, (link.length, 0.0, 0.0))
+            if base != link.name and joint.hub_inertia:
+                self._inertial(body, 0.0, _about(joint))
+            more = _about(joint) if base == link.name else 0.0
+            self._beam(self._named(base), link, 0.0, link.length, more)
+            self._fixed(f"{tip}_joint", base, tip, (link.length, 0.0, 0.0))
+            self._bodies(link, base, 0.0, link.length)
         after = self.arm.joints[i + 1 : i + 2]
         end = self._link(tip)
         if after and (after[0].motor_mass or after[0].housed):
@@ -199,9 +207,21 @@ class _Writer:
             self._inertial(end, after[0].motor_mass, inertia, at)
         return tip
 
-    def _pieces(self, link, junctions, tip):
-        length = link.length / self.chain.pieces
-        parent, step = link.name, 0.0
+    def _named(self, name):
+        return next(e for e in self.root.iter("link") if e.get("name") == name)
+
+    def _bodies(self, link, parent, start, end):
+        """The bodies on a link's part whose frame is `parent`; the last part has those at the tip."""
+        for k, body in enumerate(link.bodies):
+            last = end >= link.length * (1.0 - 1e-12)
+            if start <= body.position < end or (last and body.position >= end):
+                name = f"{link.name}_body{k + 1}"
+                self._fixed(f"{name}_joint", parent, name, (body.position - start, 0.0, 0.0))
+                own = self._link(name)
+                self._inertial(own, body.mass, np.asarray(body.inertia), body.offset)
+
+    def _pieces(self, link, parent, junctions, tip):
+        length, step = link.length / self.chain.pieces, 0.0
         for k, junction in enumerate(junctions):
             last = len(junction.joints) - 1
             for j, (direction, name) in enumerate(junction.joints.items()):
@@ -216,6 +236,7 @@ class _Writer:
                 parent, step = child, 0.0
             if k < self.chain.pieces:
                 self._beam(self._link(parent), link, k * length, length)
+                self._bodies(link, parent, k * length, (k + 1) * length)
             step = length
 
     def _beam(self, body, link, start, length, more=0.0):

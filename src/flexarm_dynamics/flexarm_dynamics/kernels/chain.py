@@ -40,8 +40,8 @@ TWIST, Y, Z = 0, 1, 2
 FIRST_ORDER, FORESHORTENING, FINITE_SLOPE = 0, 1, 2
 #: Columns of `of_link`: integrals of s, its second derivative along delta_d and X^2 - x^2 over the mass; at the tip.
 SHORT, SHORT_DD, XX, SHORT_TIP, SHORT_TIP_DD = 0, 1, 2, 3, 4
-#: Columns of `of_mode`: of P_j, X P_j, y P_j, z P_j, y' P_j, z' P_j, s'' P_j, s phi_j, s' phi_j, s'' phi_j; at the tip.
-P, XP, YP, ZP, YDP, ZDP, SDDP, SPHI, SDPHI, SDDPHI, P_TIP = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10
+#: Columns of `of_mode`: of P_j, X P_j, y P_j, z P_j, y' P_j, z' P_j, s'' P_j, s phi_j, s' phi_j, s'' phi_j.
+P, XP, YP, ZP, YDP, ZDP, SDDP, SPHI, SDPHI, SDDPHI = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 
 #: Constants of an arm: N links, at most K modes each, G quadrature nodes. SI.
 DATA = {
@@ -88,6 +88,19 @@ DATA = {
         "G+1",
     ),  # of a function at the nodes: integrals from the base to each node and to the tip
     "bishop": ("N", "K", "K"),  # int phi_y'' phi_z' dx
+    "root": ("N", 3),  # where the link's axis begins, from its joint
+    "rooted": ("N",),  # whether that is off the joint
+    "root_mass": ("N",),  # mass of the beam, which begins there
+    "bodies": (),  # B rigid bodies on sections of links
+    "host": ("B",),  # the link of each
+    "body_node": ("B",),  # the quadrature node at its section
+    "body_x": ("B",),
+    "body_tip": ("B", "K"),  # of its section, as tip, slope and bishop of a link's tip
+    "body_slope": ("B", "K"),
+    "body_bishop": ("B", "K", "K"),
+    "body_mass": ("B",),
+    "body_moment": ("B", 3),  # in the section's frame, about the section
+    "body_inertia": ("B", 3, 3),
     "payload_mass": (1,),
     "payload_moment": (3,),  # in the tip's frame, about the tip
     "payload_inertia": (3, 3),
@@ -142,7 +155,10 @@ WORK = {
     "t": (12, 3),  # scratch
     "tm": (6, 3, 3),  # scratch
     "of_link": ("N", 5),  # see `integrals`: SHORT, SHORT_DD ...
-    "of_mode": ("N", "K", 11),  # P, XP ...
+    "of_mode": ("N", "K", 10),  # P, XP ...
+    "draws": ("N", "K"),  # P_j at the tip
+    "of_body": ("B", 2),  # of bodies' sections, as SHORT_TIP, SHORT_TIP_DD of a tip
+    "body_draws": ("B", "K"),
     "of_modes": ("N", "K", "K"),  # int P_j P_k dm for k <= j
     "bent": ("N", "K"),  # elastic force of bending at finite slopes
     "node": (4, "G+1"),  # integrands at the nodes and what they integrate to
@@ -278,9 +294,15 @@ def integrals(d, w, i, delta, delta_d):
     for j in range(K):
         for n in range(10):
             mode[j, n] = 0.0
-        mode[j, P_TIP] = w.node_partial[1, j, G]
+        w.draws[i, j] = w.node_partial[1, j, G]
         for k in range(K):
             modes[j, k] = 0.0
+    for b in range(d.bodies):
+        if d.host[b] == i:
+            g = d.body_node[b]
+            w.of_body[b, 0], w.of_body[b, 1] = w.node[2, g], w.node[3, g]
+            for j in range(K):
+                w.body_draws[b, j] = w.node_partial[1, j, g]
     for g in range(G):
         mass, x, s, sdd = d.node_mass[i, g], d.node_x[i, g], w.node[2, g], w.node[3, g]
         y, z, yd, zd, sd = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -536,14 +558,21 @@ def sums_at_nodes(data, work, state, out):
             out[place] = w.of_link[i, c]
             place += 1
         for j in range(d.count[i]):
-            for c in range(11):
+            for c in range(10):
                 out[place] = w.of_mode[i, j, c]
                 place += 1
             for k in range(j + 1):
                 out[place] = w.of_modes[i, j, k]
                 place += 1
-            out[place] = w.bent[i, j]
-            place += 1
+            out[place], out[place + 1] = w.draws[i, j], w.bent[i, j]
+            place += 2
+        for b in range(d.bodies):
+            if d.host[b] == i:
+                out[place], out[place + 1] = w.of_body[b, 0], w.of_body[b, 1]
+                place += 2
+                for j in range(d.count[i]):
+                    out[place] = w.body_draws[b, j]
+                    place += 1
 
 
 def slopes_and_bends(d, i, g, delta):
@@ -560,40 +589,48 @@ def slopes_and_bends(d, i, g, delta):
     return sy, sz, by, bz
 
 
-def tip(d, w, i, delta, delta_d, om):
-    """Link i's tip and what hangs on it: frame, partial velocities and biases, into row i + 1 of the work space."""
+def section(
+    d, w, i, x, deflection, slopes, bishop, short, short_dd, draws, delta, delta_d, om, carried
+):
+    """A section of link i: frame, partial velocities and biases, into row i + 1 of the work space.
+
+    It is at x along the link; `deflection`, `slopes` and `bishop` are what the modes give there. `short`, `short_dd`
+    and `draws` are the foreshortening, its second derivative along delta_d, and its partials; `carried` becomes the
+    section's angular velocity, in link coordinates.
+    """
     K, first, n = d.count[i], d.first[i], i + 1
-    arm, frame, t, tm = w.arm[n], w.frame[n], w.t, w.tm
-    short, short_d, short_dd = 0.0, 0.0, 0.0
-    if d.level != FIRST_ORDER and K > 0:
-        short, short_dd = w.of_link[i, SHORT_TIP], w.of_link[i, SHORT_TIP_DD]
+    arm, frame, t = w.arm[n], w.frame[n], w.t
+    short_d = 0.0
+    if d.level != FIRST_ORDER:
         for j in range(K):
             if d.direction[i, j] != TWIST:
-                short_d += w.of_mode[i, j, P_TIP] * delta_d[first + j]
-    arm[0], arm[1], arm[2] = d.length[i] - short, 0.0, 0.0
+                short_d += draws[j] * delta_d[first + j]
+    for k in range(3):
+        arm[k] = d.root[i, k]
+    arm[0] += x - short
     rate = t[0]
     rate[0], rate[1], rate[2] = -short_d, 0.0, 0.0
     sy, sz, syd, szd, twist, twist_d, twist_dd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for j in range(K):
         kind = d.direction[i, j]
-        x, v = delta[first + j], delta_d[first + j]
+        z, v = delta[first + j], delta_d[first + j]
         for k in range(3):
             w.partial[n, j, k] = 0.0
         if kind == TWIST:
-            twist += d.slope[i, j] * x
-            twist_d += d.slope[i, j] * v
+            twist += slopes[j] * z
+            twist_d += slopes[j] * v
             continue
-        arm[kind] += d.tip[i, j] * x
-        rate[kind] += d.tip[i, j] * v
-        w.partial[n, j, kind] = d.tip[i, j]
+        arm[kind] += deflection[j] * z
+        rate[kind] += deflection[j] * v
+        w.partial[n, j, kind] = deflection[j]
         if d.level != FIRST_ORDER:
-            w.partial[n, j, 0] = -w.of_mode[i, j, P_TIP]
+            w.partial[n, j, 0] = -draws[j]
         if kind == Y:
-            sy += d.slope[i, j] * x
-            syd += d.slope[i, j] * v
+            sy += slopes[j] * z
+            syd += slopes[j] * v
         else:
-            sz += d.slope[i, j] * x
-            szd += d.slope[i, j] * v
+            sz += slopes[j] * z
+            szd += slopes[j] * v
     # Angles a about z, b about -y, with derivatives by the slopes (y', z').
     a, b, ay, az, bz = sy, sz, 1.0, 0.0, 1.0
     add, bdd = 0.0, 0.0
@@ -613,7 +650,7 @@ def tip(d, w, i, delta, delta_d, om):
         # A beam that does not twist turns about its axis by -int a' sin b dx, at second order -int y'' z'.
         for j in range(K):
             for k in range(K):
-                g = d.bishop[i, j, k]
+                g = bishop[j, k]
                 twist -= g * delta[first + j] * delta[first + k]
                 twist_d -= g * (
                     delta_d[first + j] * delta[first + k] + delta[first + j] * delta_d[first + k]
@@ -638,7 +675,7 @@ def tip(d, w, i, delta, delta_d, om):
         cb * ct,
     )
     for j in range(K):
-        kind, slope = d.direction[i, j], d.slope[i, j]
+        kind, slope = d.direction[i, j], slopes[j]
         ga, gb, gt = 0.0, 0.0, 0.0
         if kind == Y:
             ga = ay * slope
@@ -648,7 +685,7 @@ def tip(d, w, i, delta, delta_d, om):
             gt = slope
         if d.level != FIRST_ORDER:
             for k in range(K):
-                gt -= (d.bishop[i, j, k] + d.bishop[i, k, j]) * delta[first + k]
+                gt -= (bishop[j, k] + bishop[k, j]) * delta[first + k]
         for k in range(3):
             w.turning[n, j, k] = gb * across[k] + gt * along[k]
         w.turning[n, j, 2] += ga
@@ -673,9 +710,114 @@ def tip(d, w, i, delta, delta_d, om):
         t[5, k] += 2.0 * rate[k]
     cross(om, t[5], bias_a)
     bias_a[0] -= short_dd
-    carried = t[6]
     for k in range(3):
         carried[k] = om[k] + spin[k]
+
+
+def attach(d, w, i, delta, delta_d, om):
+    r"""Add the rigid bodies on link i's sections to its integrals.
+
+    With a section's place rho, partial velocities P_j, W_j and biases, and a body's m, s, X about it, virtual power is
+
+    .. math:: n = n_s + \rho\times f_s, \quad f = f_s, \quad Q_j = W_j\cdot n_s + P_j\cdot f_s
+
+    with :math:`n_s = X\,al_s + s\times a_s + N_s`, :math:`f_s = m\,a_s + al_s\times s + F_s`.
+    """
+    n = i + 1
+    for b in range(d.bodies):
+        if d.host[b] != i:
+            continue
+        carried, s, t = w.t[6], w.t[10], w.t
+        section(
+            d, w, i, d.body_x[b], d.body_tip[b], d.body_slope[b], d.body_bishop[b],
+            w.of_body[b, 0], w.of_body[b, 1], w.body_draws[b], delta, delta_d, om, carried,
+        )  # fmt: skip
+        X, mass = w.tm[1], d.body_mass[b]
+        symmetric_congruence(w.frame[n], d.body_inertia[b], w.tm[0], X)
+        apply(w.frame[n], d.body_moment[b], s)
+        # Biases: of its own spin, and of the section's.
+        cross(carried, s, t[0])
+        cross(carried, t[0], t[1])
+        cross(w.bias_al[n], s, t[0])
+        apply(X, carried, t[2])
+        cross(carried, t[2], t[3])
+        apply(X, w.bias_al[n], t[2])
+        cross(s, w.bias_a[n], t[4])
+        for k in range(3):
+            t[1, k] += mass * w.bias_a[n, k] + t[0, k]
+            t[3, k] += t[2, k] + t[4, k]
+        for j in range(d.count[i]):
+            W, P = w.turning[n, j], w.partial[n, j]
+            # Force and moment at the section of a unit acceleration of mode j.
+            cross(W, s, t[7])
+            apply(X, W, t[8])
+            cross(s, P, t[9])
+            for k in range(3):
+                t[7, k] += mass * P[k]
+                t[8, k] += t[9, k]
+            for m in range(d.count[i]):
+                w.M[i, j, m] += dot(w.turning[n, m], t[8]) + dot(w.partial[n, m], t[7])
+            cross(w.arm[n], t[7], t[9])
+            for k in range(3):
+                w.p[i, j, k] += t[7, k]
+                w.l[i, j, k] += t[8, k] + t[9, k]
+            w.q[i, j] += dot(W, t[3]) + dot(P, t[1])
+        cross(w.arm[n], t[1], t[9])
+        for k in range(3):
+            w.F[i, k] += t[1, k]
+            w.N[i, k] += t[3, k] + t[9, k]
+        carry(w.arm[n], s, mass, w.J[i])
+        for j in range(3):
+            w.c[i, j] += s[j] + mass * w.arm[n, j]
+            for k in range(3):
+                w.J[i, j, k] += X[j, k]
+
+
+def carry(r, c, mass, J):
+    """Add to an inertia what it gains about a point from which its body is by r; first moment c about its own."""
+    both, square = 2.0 * dot(r, c), dot(r, r)
+    for j in range(3):
+        J[j, j] += both + mass * square
+        for k in range(3):
+            J[j, k] -= r[j] * c[k] + c[j] * r[k] + mass * r[j] * r[k]
+
+
+def from_root(d, w, i, om):
+    """Refer the integrals of link i, whose axis begins at its root, to its joint."""
+    r, mass, c, t = d.root[i], d.root_mass[i], w.c[i], w.t
+    # a = a0 + al x r + w x (w x r) at the root, n = n_r + r x f.
+    cross(om, r, t[0])
+    cross(om, t[0], t[1])
+    for j in range(d.count[i]):
+        cross(r, w.p[i, j], t[0])
+        for k in range(3):
+            w.l[i, j, k] += t[0, k]
+        w.q[i, j] += dot(w.p[i, j], t[1])
+    cross(c, t[1], t[0])
+    for k in range(3):
+        w.F[i, k] += mass * t[1, k]
+        w.N[i, k] += t[0, k]
+    cross(r, w.F[i], t[0])
+    for k in range(3):
+        w.N[i, k] += t[0, k]
+    carry(r, c, mass, w.J[i])
+    for k in range(3):
+        c[k] += mass * r[k]
+
+
+def tip(d, w, i, delta, delta_d, om):
+    """Link i's tip and what hangs on it: frame, partial velocities and biases, into row i + 1 of the work space."""
+    K, n = d.count[i], i + 1
+    arm, frame, t, tm = w.arm[n], w.frame[n], w.t, w.tm
+    short, short_dd = 0.0, 0.0
+    if d.level != FIRST_ORDER and K > 0:
+        short, short_dd = w.of_link[i, SHORT_TIP], w.of_link[i, SHORT_TIP_DD]
+    carried = t[6]
+    section(
+        d, w, i, d.length[i], d.tip[i], d.slope[i], d.bishop[i], short, short_dd, w.draws[i],
+        delta, delta_d, om, carried,
+    )  # fmt: skip
+    bias_al, bias_a = w.bias_al[n], w.bias_a[n]
     if n == d.links:
         apply_transposed(frame, carried, w.omega[n])
         for k in range(3):
@@ -756,6 +898,9 @@ def prepare(d, w, q, delta, qd, delta_d):
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
             body_foreshortened(d, w, i, delta, delta_d, w.omega[i])
+        if d.rooted[i]:
+            from_root(d, w, i, w.omega[i])
+        attach(d, w, i, delta, delta_d, w.omega[i])
         elastic_force(d, w, i, delta)
         tip(d, w, i, delta, delta_d, w.omega[i])
 

@@ -114,17 +114,27 @@ def given_sums(data, work, graph):
             put(work.of_link, (i, c), straight)
         for j, kind in enumerate(kinds):
             twists = kind == chain.TWIST
-            for c in range(11):
+            for c in range(10):
                 put(work.of_mode, (i, j, c), twists or c in missing)
             for k in range(j + 1):
                 put(work.of_modes, (i, j, k), twists or kinds[k] == chain.TWIST)
+            put(work.draws, (i, j), twists)
             put(work.bent, (i, j), twists or data.level != chain.FINITE_SLOPE)
+        for b in range(data.bodies):
+            if data.host[b] == i:
+                put(work.of_body, (b, 0), straight)
+                put(work.of_body, (b, 1), straight)
+                for j, kind in enumerate(kinds):
+                    put(work.body_draws, (b, j), kind == chain.TWIST)
     return place
 
 
 def room_for_sums(data):
     """Number of values that `chain.sums_at_nodes` gives."""
-    return sum(5 + k * 12 + k * (k + 1) // 2 for k in map(int, data.count) if k)
+    count = data.count.tolist()
+    links = sum(5 + k * 12 + k * (k + 1) // 2 for k in count if k)
+    hosts = (count[i] for i in data.host[: data.bodies])
+    return links + sum(2 + k for k in hosts if k)
 
 
 def _low_storage(graph, out, n, half, summed):

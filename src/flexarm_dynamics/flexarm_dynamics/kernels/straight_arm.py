@@ -27,6 +27,7 @@ UNUSED = {
         "node_ei",
         "cumulate",
         "bishop",
+        "body_bishop",
     ),
     *("transmission", "slip"),
 }

@@ -16,15 +16,19 @@ from .model import damping_matrix, rotation
 _KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST}
 
 #: Fields of the kernels' data that are whole numbers.
-INTEGERS = ("links", "level", "nodes", "count", "first", "direction", "spring", "housed")
+INTEGERS = (
+    *("links", "level", "nodes", "count", "first", "direction", "spring", "housed"),
+    *("rooted", "bodies", "host", "body_node"),
+)
 
 
 def _shape(spec, sizes):
     return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
 
 
-def _sizes(links, modes, nodes):
-    return {"N": links, "K": modes, "G": nodes, "N+1": links + 1, "G+1": nodes + 1}
+def _sizes(links, modes, nodes, bodies):
+    whole = {"N": links, "K": modes, "G": nodes, "B": bodies}
+    return whole | {"N+1": links + 1, "G+1": nodes + 1}
 
 
 def _capacity(value, steps):
@@ -37,12 +41,13 @@ def roomy(data):
         _capacity(data.links, (8, 32)),
         _capacity(data.s.shape[1], (16, 60)),
         _capacity(data.nodes, (92,)),
+        _capacity(data.body_x.size, (4,)),
     )
 
 
 def work_space(data, dtype=float, sizes=None):
     """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
-    sizes = sizes or _sizes(data.links, data.s.shape[1], data.nodes)
+    sizes = sizes or _sizes(data.links, data.s.shape[1], data.nodes, data.body_x.size)
     return kernel.Work(
         **{name: np.zeros(_shape(spec, sizes), dtype) for name, spec in kernel.WORK.items()}
     )
@@ -124,8 +129,15 @@ def _payload(arm):
     return Load(p.mass, p.mass * c, inertia)
 
 
+def _body(body):
+    """A body on a link, in its section's frame."""
+    c = np.asarray(body.offset)
+    inertia = np.asarray(body.inertia) + body.mass * (c @ c * np.eye(3) - np.outer(c, c))
+    return Load(body.mass, body.mass * c, inertia)
+
+
 def _straight(link, joint):
-    """A link's undeformed self with its hub and the motor at its base, in its base frame."""
+    """A link's undeformed beam with its hub and the motor at its base, in its base frame."""
     a = np.asarray(joint.axis)
     mass, first, second, polar = link.moments()
     return Load(
@@ -140,8 +152,12 @@ def outboard(arm):
     loads = [_payload(arm)]
     for link, joint in list(zip(arm.links, arm.joints, strict=True))[:0:-1]:
         rotor = Load(0.0, np.zeros(3), joint.rotor_inertia * np.outer(joint.axis, joint.axis))
-        beyond = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0]))
-        whole = beyond + _straight(link, joint) + rotor
+        whole = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0]))
+        for body in link.bodies:
+            whole += _body(body).moved(np.eye(3), np.array([body.position, 0.0, 0.0]))
+        motor = Load(joint.motor_mass, np.zeros(3), np.zeros((3, 3)))
+        whole += _straight(link, replace(joint, motor_mass=0.0))
+        whole = whole.moved(np.eye(3), np.array(link.root)) + motor + rotor
         whole += Load(0.0, np.zeros(3), np.asarray(joint.housing_inertia))
         whole = whole.moved(rotation(joint.origin_rpy), np.asarray(joint.origin_xyz))
         loads.insert(0, replace(whole, averaged=True))
@@ -157,7 +173,7 @@ def shapes_of(link, direction, flexibility, load):
     `flexibility` is the arm file's for that direction: kind of shape and number of modes.
     """
     L, rho, modes = link.length, link.mass_per_length, flexibility.modes
-    if link.pieces:
+    if link.pieces or (link.bodies and flexibility.shape != "from_frequencies"):
         return _varied_shapes(link, direction, flexibility, load)
     if direction == "twist":
         polar, GJ = link.polar_inertia_per_length, link.stiffness["twist"]
@@ -171,7 +187,8 @@ def shapes_of(link, direction, flexibility, load):
         return beam.from_frequencies(
             flexibility.frequencies[:modes], L, rho, link.stiffness[direction]
         )
-    mass, inertia, offset = _bending_load(load, direction)
+    mass, moment, inertia = _bending_load(load, direction)
+    offset = moment / mass if mass > 0.0 else 0.0
     return beam.loaded(modes, L, rho, mass, inertia - mass * offset**2, offset)
 
 
@@ -183,9 +200,10 @@ def _varied_shapes(link, direction, flexibility, load):
             field=f"shapes from_frequencies of {link.name}",
             hint="take shape loaded, and adjust the section's stiffness to the frequencies",
         )
-    twist, bodies = direction == "twist", []
+    twist = direction == "twist"
+    bodies = [_on_beam(link, direction, _body(b), b.position / link.length) for b in link.bodies]
     if flexibility.shape == "loaded":
-        bodies = [_tip_body(link, direction, load)]
+        bodies.append(_on_beam(link, direction, load, 1.0))
     problem = varied_beam.BeamProblem(
         link.breaks,
         lambda xi: link.factor(direction, xi),
@@ -196,42 +214,38 @@ def _varied_shapes(link, direction, flexibility, load):
     return problem.shapes(flexibility.modes)
 
 
-def _tip_body(link, direction, load):
-    """A load of a link's tip as its beam problem has it."""
+def _on_beam(link, direction, load, place):
+    """A load at a place of a link as its beam problem has it."""
     L = link.length
     if direction == "twist":
         own = link.polar_inertia_per_length * L
-        return varied_beam.Body(1.0, 0.0, 0.0, load.inertia[0, 0] / own)
-    mass, inertia, offset = _bending_load(load, direction)
+        return varied_beam.Body(place, 0.0, 0.0, load.inertia[0, 0] / own)
+    mass, moment, inertia = _bending_load(load, direction)
     m = link.mass
-    return varied_beam.Body(1.0, mass / m, mass * offset / (m * L), inertia / (m * L**2))
+    return varied_beam.Body(place, mass / m, moment / (m * L), inertia / (m * L**2))
 
 
 def _bending_load(load, direction):
-    """Mass, inertia about the tip, and distance along x of a load's centre of mass."""
+    """Mass, first moment along x and inertia about the section, of a load."""
     axis = 2 if direction == "y" else 1
-    offset = 0.0
-    if load.mass > 0.0 and not load.averaged:
-        offset = load.moment[0] / load.mass
-    return load.mass, load.inertia[axis, axis], offset
+    return load.mass, 0.0 if load.averaged else load.moment[0], load.inertia[axis, axis]
 
 
 def _clamped_mass(link, direction, shapes, load):
     """Modal mass of a link with its base held and its load at its tip: what modal damping refers to."""
-    if direction == "twist":
-        tip = shapes(1.0)
-        own = link.polar_inertia_per_length * link.length
-        return own * shapes.gram(weight=_along(link, "polar")) + load.inertia[0, 0] * np.outer(
-            tip, tip
-        )
-    mass, inertia, offset = _bending_load(load, direction)
-    tip, slope = shapes(1.0), shapes(1.0, 1) / link.length
-    centre = tip + offset * slope
-    return (
-        link.mass * shapes.gram(weight=_along(link, "mass"))
-        + mass * np.outer(centre, centre)
-        + (inertia - mass * offset**2) * np.outer(slope, slope)
-    )
+    twist = direction == "twist"
+    whole = link.polar_inertia_per_length * link.length if twist else link.mass
+    out = whole * shapes.gram(weight=_along(link, "polar" if twist else "mass"))
+    carried = [(_body(body), body.position / link.length) for body in link.bodies]
+    for body, place in (*carried, (load, 1.0)):
+        at, slope = shapes(place), shapes(place, 1) / link.length
+        if twist:
+            out += body.inertia[0, 0] * np.outer(at, at)
+            continue
+        mass, moment, inertia = _bending_load(body, direction)
+        cross = moment * np.outer(at, slope)
+        out += mass * np.outer(at, at) + cross + cross.T + inertia * np.outer(slope, slope)
+    return out
 
 
 def _along(link, name):
@@ -257,11 +271,14 @@ class Nodes:
         Gauss's points and weights in units of the length; points beyond the last span are at 0 and weigh nothing.
     cumulate : ndarray, shape (G, G + 1)
         Weights of the integrals from the base to each node and, last, to the end.
+    bodies : list of int
+        The nodes, without weight, at the sections of the link's bodies.
     """
 
     xi: np.ndarray
     weights: np.ndarray
     cumulate: np.ndarray
+    bodies: list
 
 
 def nodes_of(link, count, size, end=1.0):
@@ -276,7 +293,11 @@ def nodes_of(link, count, size, end=1.0):
         xi[own], w[own] = low + (high - low) * points, (high - low) * weights
         cumulate[own, own] = (high - low) * integrate
         cumulate[own, beyond] = w[own, None]
-    return Nodes(xi, w, cumulate)
+    first = (len(breaks) - 1) * count
+    for k, body in enumerate(link.bodies):
+        xi[first + k] = min(body.position / link.length, end)
+        cumulate[:first, first + k] = np.where(xi[:first] < xi[first + k], w[:first], 0.0)
+    return Nodes(xi, w, cumulate, list(range(first, first + len(link.bodies))))
 
 
 def bishop_integrals(data, index, weights):
@@ -300,7 +321,12 @@ def assemble(arm, shapes, loads):
     counts = [1] * N
     if level != kernel.FIRST_ORDER and most:
         counts = [node_count(link, most, level) for link in arm.links]
-    G = max(c * (len(link.breaks) - 1) for c, link in zip(counts, arm.links, strict=True))
+    G = max(
+        c * (len(link.breaks) - 1) + len(link.bodies)
+        for c, link in zip(counts, arm.links, strict=True)
+    )
+    bodies = [(i, body) for i, link in enumerate(arm.links) for body in link.bodies]
+    B = max(1, len(bodies))
     z = np.zeros
     a = {
         "links": N,
@@ -325,14 +351,21 @@ def assemble(arm, shapes, loads):
         "slope": z((N, K)), "node_x": z((N, G)), "node_mass": z((N, G)), "node_phi": z((N, G, K)),
         "node_slope": z((N, G, K)), "node_bend": z((N, G, K)), "node_ei": z((N, G, 2)),
         "cumulate": z((N, G, G + 1)), "bishop": z((N, K, K)),
+        "root": np.array([link.root for link in arm.links]), "root_mass": z(N),
+        "rooted": np.array([any(link.root) for link in arm.links], np.int64),
+        "bodies": len(bodies), "host": np.full(B, -1, np.int64), "body_node": np.zeros(B, np.int64),
+        "body_x": z(B), "body_tip": z((B, K)), "body_slope": z((B, K)), "body_bishop": z((B, K, K)),
+        "body_mass": z(B), "body_moment": z((B, 3)), "body_inertia": z((B, 3, 3)),
     }  # fmt: skip
     # An axis (0, 0, 1) of integers is another type, and would be another compilation.
     a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
         L = link.length
         body = _straight(link, joint)
-        a["mass"][i], a["moment"][i], a["inertia"][i] = body.mass, body.moment[0], body.inertia
+        a["mass"][i] = body.mass + link.total_mass - link.mass
+        a["moment"][i], a["inertia"][i], a["root_mass"][i] = body.moment[0], body.inertia, link.mass
         nodes = nodes_of(link, counts[i], G)
+        _fill_bodies(a, i, link, modes[i], nodes, bodies)
         a["node_x"][i] = L * nodes.xi
         a["node_mass"][i] = link.mass * nodes.weights * link.factor("mass", nodes.xi)
         a["cumulate"][i] = L * nodes.cumulate
@@ -371,7 +404,26 @@ def assemble(arm, shapes, loads):
     if level != kernel.FIRST_ORDER:
         for i in range(N):
             data.bishop[i] = bishop_integrals(data, i, data.cumulate[i, :, -1])
+        for b, (i, _) in enumerate(bodies):
+            weights = data.cumulate[i, :, data.body_node[b]]
+            data.body_bishop[b] = bishop_integrals(data, i, weights)
     return data
+
+
+def _fill_bodies(a, i, link, modes, nodes, bodies):
+    """The constants of the bodies on link i, which are among those of all links."""
+    own = [b for b, (host, _) in enumerate(bodies) if host == i]
+    for b, node in zip(own, nodes.bodies, strict=True):
+        body = bodies[b][1]
+        load, xi = _body(body), body.position / link.length
+        a["host"][b], a["body_node"][b], a["body_x"][b] = i, node, body.position
+        a["body_mass"][b], a["body_moment"][b] = load.mass, load.moment
+        a["body_inertia"][b] = load.inertia
+        for j, (shape, number, direction) in enumerate(modes):
+            twist = direction == "twist"
+            a["body_tip"][b, j] = 0.0 if twist else shape(xi)[number]
+            slope = shape(xi)[number] if twist else shape(xi, 1)[number] / link.length
+            a["body_slope"][b, j] = slope
 
 
 def _springs(joints, bending):

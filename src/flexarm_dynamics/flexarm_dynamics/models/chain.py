@@ -500,7 +500,8 @@ class Chain(ArmModel):
         modes = modes_of(link, self._shapes)
         if not modes:
             return d
-        nodes = nodes_of(link, d.nodes // (len(link.breaks) - 1), d.nodes, xi)
+        count = (d.nodes - len(link.bodies)) // (len(link.breaks) - 1)
+        nodes = nodes_of(link, count, d.nodes, xi)
         for j, (shapes, number, direction) in enumerate(modes):
             if direction != "twist":
                 node_slope[index, :, j] = shapes(nodes.xi, 1)[:, number] / link.length

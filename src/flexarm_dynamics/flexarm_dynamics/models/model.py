@@ -484,4 +484,5 @@ def damping_matrix(M22, K, ratios):
         problem, value = "is an eigenvalue that is not positive", float(squares.min())
         raise ModelError(problem, field="modal stiffness", value=value)
     left = M22 @ psi
-    return left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T
+    D = left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T
+    return 0.5 * (D + D.T)  # to the last bit: what is symmetric is one constant of recorded terms

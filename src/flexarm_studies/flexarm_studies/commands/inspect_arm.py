@@ -127,7 +127,9 @@ def describe(arm_model, q):
         {
             "name": link.name,
             "length": link.length,
-            "mass": link.mass,
+            "mass": link.total_mass,
+            "root": list(link.root),
+            "bodies": [asdict(body) for body in link.bodies],
             "stiffness": link.stiffness,
             "sections": [
                 {
@@ -147,7 +149,7 @@ def describe(arm_model, q):
         }
         for link in arm.links
     ]
-    mass = sum(link.mass for link in arm.links) + sum(j.motor_mass for j in arm.joints)
+    mass = sum(link.total_mass for link in arm.links) + sum(j.motor_mass for j in arm.joints)
     result = {
         "arm": arm.name,
         "description": arm.description,
@@ -268,6 +270,8 @@ def text(d):
             for k, v in link["flexible"].items()
         )
         yield f"{link['name']:18}{link['length']:10.4g}{link['mass']:10.4g}  {flexible or 'rigid'}"
+        for b in link["bodies"]:
+            yield f"{'':18}body of {b['mass']:.4g} kg at {b['position']:.4g} m"
         for part in link["sections"]:
             values = {"kg/m": part["mass_per_length"]}
             values |= {

@@ -50,7 +50,7 @@ class Shape:
         out = np.empty((len(self.links), POINTS, 3))
         for i, (along, across) in enumerate(zip(self._axial, self._across, strict=True)):
             local = np.column_stack([along, across[0] @ delta, across[1] @ delta])
-            out[i] = p[i] + local @ R[i].T
+            out[i] = p[i] + (local + self.links[i].root) @ R[i].T
         return out
 
     def view(self):
