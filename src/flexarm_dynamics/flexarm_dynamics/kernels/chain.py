@@ -595,8 +595,8 @@ def section(
     """A section of link i: frame, partial velocities and biases, into row i + 1 of the work space.
 
     It is at x along the link; `deflection`, `slopes` and `bishop` are what the modes give there. `short`, `short_dd`
-    and `draws` are the foreshortening, its second derivative along delta_d, and its partials; `carried` becomes the
-    section's angular velocity, in link coordinates.
+    and `draws` are the foreshortening, its second derivative along delta_d, and its partials; `om` is the link's
+    angular velocity, and `carried` becomes the section's, in link coordinates.
     """
     K, first, n = d.count[i], d.first[i], i + 1
     arm, frame, t = w.arm[n], w.frame[n], w.t
@@ -715,7 +715,7 @@ def section(
 
 
 def attach(d, w, i, delta, delta_d, om):
-    r"""Add the rigid bodies on link i's sections to its integrals.
+    r"""Add the rigid bodies on link i's sections to its integrals; om is the link's angular velocity.
 
     With a section's place rho, partial velocities P_j, W_j and biases, and a body's m, s, X about it, virtual power is
 
