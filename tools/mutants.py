@@ -140,8 +140,8 @@ KERNELS = of(
     (
         "chain",
         "foreshortening of the tip: sign",
-        "w.partial[n, j, 0] = -w.of_mode[i, j, P_TIP]",
-        "w.partial[n, j, 0] = w.of_mode[i, j, P_TIP]",
+        "w.partial[n, j, 0] = -draws[j]",
+        "w.partial[n, j, 0] = draws[j]",
     ),
     (
         "chain",
