@@ -47,6 +47,7 @@ dependencies = [{dependencies}]
 
 [project.optional-dependencies]
 cluster = [{cluster}]
+gym = ["gymnasium>=1.1"]
 
 [project.scripts]
 flexarm = "flexarm_bringup.cli:main"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many simulations in parallel: different initial states, torques or arms."""
+"""Many arms side by side, on all cores: different initial states, torques or arms; arrays in and out."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -13,8 +13,8 @@ from flexarm_dynamics.models import levels, model
 from . import integrators
 
 
-def simulate(models, states, starts, ends, step, substeps=1, method="rk4", workers=None):
-    """Simulate many arms, or one arm from many states.
+class Arms:
+    """Arms that are advanced together, interval by interval.
 
     Parameters
     ----------
@@ -23,8 +23,6 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
         its loads need, see `levels.simulated`.
     states : ndarray, shape (b, 2 (n + m))
         Initial (q, delta, qd, delta_d).
-    starts, ends : ndarray, shape (s, n) or (b, s, n)
-        Torque at both ends of each interval of ``substeps * step`` seconds, linear between them [N m].
     step : float
         [s]
     substeps : int
@@ -33,6 +31,111 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
         One of `integrators.METHODS`.
     workers : int, optional
         Number of threads; default: that of the cores. The compiled loops release the interpreter's lock.
+
+    Attributes
+    ----------
+    models : list of ArmModel
+        One each.
+    states : ndarray, shape (b, 2 (n + m))
+        The present ones; may be written to between two calls. Values that are not finite are beyond the range of the
+        model or the step.
+
+    Raises
+    ------
+    ShapeError
+        For arrays that do not fit the models.
+    """
+
+    def __init__(self, models, states, step, substeps=1, method="rk4", workers=None):
+        self.states = np.array(np.atleast_2d(states), float)
+        self.models = models_of(models, len(self.states))
+        _check(self.models, self.states.shape[1])
+        self.step, self.substeps = step, substeps
+        tableau, count = integrators.METHODS[method], len(self.models)
+        workers = min(workers or os.cpu_count() or 1, count) or 1
+        # Interleaved, the shares cost the same whatever the order of the arms; each thread has steppers of its own.
+        self._shares = []
+        for k in range(workers):
+            steppers = {id(m): m.stepper(tableau) for m in self.models[k::workers]}
+            share = range(k, count, workers)
+            self._shares.append([(i, steppers[id(self.models[i])]) for i in share])
+        self._pool = ThreadPoolExecutor(workers)
+        first = self.models[0] if self.models else models
+        self.n_joints = getattr(first, "n_joints", 0)
+
+    def advance(self, torque):
+        """Advance all arms by one interval under constant torque, (n,) or (b, n) [N m]; `states`."""
+        torque = np.asarray(torque, float)
+        wanted = (len(self.models), self.n_joints)
+        if torque.shape not in (wanted, wanted[1:]):
+            raise ShapeError("is a wrong shape", field="torque", value=torque.shape, limit=wanted)
+        torque = np.ascontiguousarray(np.broadcast_to(torque, wanted))
+
+        def run(share):
+            for i, advance in share:
+                advance(self.states[i], torque[i], self.step, self.substeps)
+
+        self._run(run)
+        return self.states
+
+    def follow(self, starts, ends):
+        """Advance all arms over many intervals.
+
+        Parameters
+        ----------
+        starts, ends : ndarray, shape (s, n) or (b, s, n)
+            Torque at both ends of each interval, linear between them [N m].
+
+        Returns
+        -------
+        ndarray, shape (b, s + 1, 2 (n + m))
+            From the present states on; the last ones are the present ones then.
+        """
+        n, count = self.n_joints, len(self.models)
+        starts, ends = (np.asarray(torque, float) for torque in (starts, ends))
+        if starts.shape != ends.shape or starts.ndim not in (2, 3) or starts.shape[-1] != n:
+            shapes = (starts.shape, ends.shape)
+            raise ShapeError("are wrong shapes", field="torque", value=shapes, limit=f"(..., {n})")
+        starts = np.ascontiguousarray(np.broadcast_to(starts, (count, *starts.shape[-2:])))
+        ends = np.ascontiguousarray(np.broadcast_to(ends, starts.shape))
+        out = np.empty((count, starts.shape[1] + 1, self.states.shape[1]))
+        out[:, 0] = self.states
+
+        def run(share):
+            for i, stepper in share:
+                stepper.trajectory(out[i], starts[i], ends[i], self.step, self.substeps)
+
+        self._run(run)
+        self.states[:] = out[:, -1]
+        return out
+
+    def _run(self, work):
+        """Call with the share of each thread."""
+        if len(self._shares) == 1:
+            work(self._shares[0])
+        else:
+            list(self._pool.map(work, self._shares))
+
+    def close(self):
+        """End the threads."""
+        self._pool.shutdown()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+def simulate(models, states, starts, ends, step, substeps=1, method="rk4", workers=None):
+    """Simulate many arms, or one arm from many states: `Arms.follow` in one call.
+
+    Parameters
+    ----------
+    models, states, step, substeps, method, workers
+        As of `Arms`.
+    starts, ends : ndarray, shape (s, n) or (b, s, n)
+        Torque at both ends of each interval of ``substeps * step`` seconds, linear between them [N m].
 
     Returns
     -------
@@ -44,48 +147,30 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
     ShapeError
         For arrays that do not fit the models.
     """
-    states = np.atleast_2d(np.asarray(states, float))
-    count, size = states.shape
-    if isinstance(models, (list, tuple)):
-        models = [_built(each) for each in models]
-    else:
-        models = _built(models)
-    each = list(models) if isinstance(models, (list, tuple)) else [models] * count
-    if len(each) != count:
-        raise ShapeError("must be one per state", field="models", value=len(each), limit=count)
-    for arm_model in each:
-        if 2 * (arm_model.n_joints + arm_model.n_modes) != size:
-            entries = 2 * (arm_model.n_joints + arm_model.n_modes)
+    with Arms(models, states, step, substeps, method, workers) as arms:
+        return arms.follow(starts, ends)
+
+
+def models_of(given, count):
+    """A list of `count` models, from what `Arms` takes; a `ShapeError` for another number of them."""
+    many = list(given) if isinstance(given, (list, tuple)) else [given] * count
+    if len(many) != count:
+        raise ShapeError("must be one per state", field="models", value=len(many), limit=count)
+    built = {id(one): _built(one) for one in many}  # one for all that are the same
+    return [built[id(one)] for one in many]
+
+
+def _check(models, size):
+    """Refuse models of which one does not have states of so many entries."""
+    for arm_model in models:
+        entries = 2 * (arm_model.n_joints + arm_model.n_modes)
+        if entries != size:
             raise ShapeError(
                 f"entries do not fit {arm_model.arm.name}",
                 field="states",
                 value=size,
                 limit=entries,
             )
-    first = models[0] if isinstance(models, (list, tuple)) and models else models
-    n = getattr(first, "n_joints", 0)
-    starts, ends = (np.asarray(torque, float) for torque in (starts, ends))
-    if starts.shape != ends.shape or starts.ndim not in (2, 3) or starts.shape[-1] != n:
-        shapes = (starts.shape, ends.shape)
-        raise ShapeError("are wrong shapes", field="torque", value=shapes, limit=f"(..., {n})")
-    starts = np.ascontiguousarray(np.broadcast_to(starts, (count, *starts.shape[-2:])))
-    ends = np.ascontiguousarray(np.broadcast_to(ends, starts.shape))
-    out = np.empty((count, starts.shape[1] + 1, size))
-    out[:, 0] = states
-    tableau = integrators.METHODS[method]
-
-    def run(chunk):
-        steppers = {}
-        for i in chunk:
-            if id(each[i]) not in steppers:
-                steppers[id(each[i])] = each[i].stepper(tableau)
-            steppers[id(each[i])].trajectory(out[i], starts[i], ends[i], step, substeps)
-
-    workers = min(workers or os.cpu_count() or 1, count) or 1
-    with ThreadPoolExecutor(workers) as pool:
-        # Interleaved chunks cost the same whatever the order of the runs.
-        list(pool.map(run, [range(k, count, workers) for k in range(workers)]))
-    return out
 
 
 def _built(given):

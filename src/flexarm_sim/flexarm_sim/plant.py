@@ -153,7 +153,7 @@ class Plant:
         if self._implicit:
             return 1
         n = self.model.n_joints
-        damped = self._terms().H[:n, :n] @ np.diag(damping)
+        damped = np.linalg.inv(self._mass_matrix())[:n, :n] @ np.diag(damping)
         fastest = np.abs(np.linalg.eigvals(damped)).max()
         return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
 
@@ -163,9 +163,14 @@ class Plant:
         # Not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
 
-    def _terms(self):
-        n = self.model.n_joints
-        return self.model.terms(np.zeros(n), np.zeros(n))
+    def _mass_matrix(self):
+        """Of the straight arm, (n + m, n + m)."""
+        model, none = self.model, np.zeros(self.model.n_joints)
+        if hasattr(
+            model, "mass_matrix"
+        ):  # of a chain: all terms would compile its recursion on complex numbers
+            return model.mass_matrix(none)
+        return model.terms(none, none).M
 
     def _inertia(self):
-        return np.diag(self._terms().M)[: self.model.n_joints]
+        return np.diag(self._mass_matrix())[: self.model.n_joints]
