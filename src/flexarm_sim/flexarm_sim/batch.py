@@ -53,26 +53,42 @@ class Arms:
         self.step, self.substeps = step, substeps
         tableau, count = integrators.METHODS[method], len(self.models)
         workers = min(workers or os.cpu_count() or 1, count) or 1
-        # Interleaved, the shares cost the same whatever the order of the arms; each thread has steppers of its own.
-        self._shares = []
+        # Interleaved, the parts cost the same whatever the order of the arms; each thread has steppers of its own.
+        self._parts = []
         for k in range(workers):
             steppers = {id(m): m.stepper(tableau) for m in self.models[k::workers]}
-            share = range(k, count, workers)
-            self._shares.append([(i, steppers[id(self.models[i])]) for i in share])
+            part = range(k, count, workers)
+            self._parts.append([(i, steppers[id(self.models[i])]) for i in part])
         self._pool = ThreadPoolExecutor(workers)
         first = self.models[0] if self.models else models
         self.n_joints = getattr(first, "n_joints", 0)
 
     def advance(self, torque):
-        """Advance all arms by one interval under constant torque, (n,) or (b, n) [N m]; `states`."""
+        """Advance all arms by one interval.
+
+        Parameters
+        ----------
+        torque : ndarray, shape (n,) or (b, n)
+            Constant meanwhile [N m].
+
+        Returns
+        -------
+        ndarray, shape (b, 2 (n + m))
+            `states`.
+
+        Raises
+        ------
+        ShapeError
+            For a torque of another shape.
+        """
         torque = np.asarray(torque, float)
         wanted = (len(self.models), self.n_joints)
         if torque.shape not in (wanted, wanted[1:]):
             raise ShapeError("is a wrong shape", field="torque", value=torque.shape, limit=wanted)
         torque = np.ascontiguousarray(np.broadcast_to(torque, wanted))
 
-        def run(share):
-            for i, advance in share:
+        def run(part):
+            for i, advance in part:
                 advance(self.states[i], torque[i], self.step, self.substeps)
 
         self._run(run)
@@ -90,6 +106,11 @@ class Arms:
         -------
         ndarray, shape (b, s + 1, 2 (n + m))
             From the present states on; the last ones are the present ones then.
+
+        Raises
+        ------
+        ShapeError
+            For torques of other shapes.
         """
         n, count = self.n_joints, len(self.models)
         starts, ends = (np.asarray(torque, float) for torque in (starts, ends))
@@ -101,8 +122,8 @@ class Arms:
         out = np.empty((count, starts.shape[1] + 1, self.states.shape[1]))
         out[:, 0] = self.states
 
-        def run(share):
-            for i, stepper in share:
+        def run(part):
+            for i, stepper in part:
                 stepper.trajectory(out[i], starts[i], ends[i], self.step, self.substeps)
 
         self._run(run)
@@ -110,11 +131,11 @@ class Arms:
         return out
 
     def _run(self, work):
-        """Call with the share of each thread."""
-        if len(self._shares) == 1:
-            work(self._shares[0])
+        """Call with the arms of each thread."""
+        if len(self._parts) == 1:
+            work(self._parts[0])
         else:
-            list(self._pool.map(work, self._shares))
+            list(self._pool.map(work, self._parts))
 
     def close(self):
         """End the threads."""
