@@ -197,6 +197,30 @@ def test_a_gain_that_is_kept_is_the_recursions(linear):
     assert_allclose(kept.covariance_diagonal, full.covariance_diagonal, rtol=1e-6)
 
 
+@pytest.mark.parametrize("event", ["nothing", "a longer step", "a lost gauge", "a new session"])
+def test_a_filter_that_computes_ahead_gives_the_same_to_the_last_bit(linear, event):
+    ahead, other = (design_observer("kalman", linear.model, NOISE) for _ in range(2))
+    computed, rng = [], np.random.default_rng(5)
+    corrected = ahead._corrected
+    ahead._corrected = lambda step: computed.append(step) or corrected(step)
+    for k in range(120):
+        h = 3e-3 if event == "a longer step" and k == 80 else H
+        s = sample(1e-3 * rng.standard_normal(6))
+        for observer in (ahead, other):
+            if event == "a lost gauge" and k == 80:
+                observer.measurement_covariance = 2.0 * observer.measurement_covariance
+            if event == "a new session" and k == 80:
+                observer.reset()
+            observer.update(s, 0.0 if k == 0 or (event == "a new session" and k == 80) else h)
+            assert_array_equal(observer.state, ahead.state)
+        assert_array_equal(ahead.covariance, other.covariance)
+        before = len(computed)
+        ahead.look_ahead()
+        assert len(computed) == before + (ahead.converged and not ahead._steady)
+    # Each sample's recursion was run once, but for those that came otherwise than foreseen.
+    assert len(computed) <= 123
+
+
 # --------------------------------------------------------------------------- noise levels
 
 

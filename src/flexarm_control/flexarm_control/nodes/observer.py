@@ -124,6 +124,7 @@ class ObserverNode(ArmNode):
                     sample, name, core.observer, sample.strain, core.gauges and core.gauges.health
                 )
             )
+        core.look_ahead()
 
     def _on_calibrate(self, request, response):
         """Service: set the gauges' bias from the last samples; answers at once."""

@@ -174,6 +174,10 @@ class ArmObserver:
             self.calibration.push(sample)
         return self.observer.converged
 
+    def look_ahead(self):
+        """Do beforehand what the next sample will need; call once the estimate is sent. Results are the same."""
+        self.observer.look_ahead()
+
     @property
     def _judges(self):
         return self.settings["plausibility"]

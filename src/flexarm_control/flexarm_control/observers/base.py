@@ -79,6 +79,9 @@ class Observer(Component, ABC):
         """Continue at rest with these amplitudes (m,): the gauges' bias has just been calibrated."""
         self.amplitude[:] = amplitude
 
+    def look_ahead(self):
+        """Compute ahead, between two samples, for the next one; changes no result."""
+
     @abstractmethod
     def update(self, sample, dt):
         """Take one sample.

@@ -25,6 +25,7 @@ The recursion of P does not depend on the measurements. Once it has settled, for
 gain and covariance are kept until either changes.
 """
 
+from contextlib import suppress
 from functools import lru_cache, partial
 
 import numpy as np
@@ -200,8 +201,26 @@ class Kalman(Observer):
         """C x: what is measured of a state (N,), or of the columns of a matrix (N, k)."""
         return x[: self._p]
 
+    def look_ahead(self):
+        step = self._step
+        if not self.converged or step is None or self._steady:
+            return
+        with suppress(MessageError):  # to be raised by the sample, if it comes so
+            self._ahead = step, self.measurement_covariance, self._corrected(step)
+
     def _recursion(self, step):
         """Covariance after a step and a measurement, and the gain."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead[0] is step and ahead[1] is self.measurement_covariance:
+            P, root, gain, same = ahead[2]
+        else:
+            P, root, gain, same = self._corrected(step)
+        self._steady = same and step is self._step
+        self._step, self._root, self._gain_transposed = step, root, gain
+        self.covariance[:] = P
+
+    def _corrected(self, step):
+        """Covariance, root of the innovation's, K^T, and whether the variances stay, after a step and a measurement."""
         R = self.measurement_covariance
         P = step.Phi @ self.covariance @ step.Phi.T
         P += step.Q
@@ -218,13 +237,12 @@ class Kalman(Observer):
         P -= (self._output(P.T).T - gain.T @ R) @ gain
         P = 0.5 * (P + P.T)
         variance, last = P.diagonal(), self.covariance.diagonal()
-        same = np.all(np.abs(variance - last) <= self.STEADY * variance)
-        self._steady = bool(same) and step is self._step
-        self._step, self._root, self._gain_transposed = step, root, gain
-        self.covariance[:] = P
+        same = bool(np.all(np.abs(variance - last) <= self.STEADY * variance))
+        return P, root, gain, same
 
     def _forget_gain(self):
         self._step, self._steady, self._root, self._gain_transposed = None, False, None, None
+        self._ahead = None  # the result of `look_ahead`
 
     def _judge(self):
         self._beyond += self.RECENT * (float(self.innovation_squared > self._bound) - self._beyond)
