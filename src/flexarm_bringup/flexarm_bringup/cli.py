@@ -135,6 +135,11 @@ COMMANDS = {
         "arms",
         "random arms under several controllers, on plants that are not their models: how many settle, and when",
     ),
+    "vibration": Command(
+        "flexarm_studies.vibration.command",
+        "vibration",
+        "arms behind a position loop: how much they swing after motions, shaped and not",
+    ),
     "publish": Command(
         "flexarm_tools.publish_trajectory",
         "publish",

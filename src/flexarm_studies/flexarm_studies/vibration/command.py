@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``flexarm vibration``: how much arms behind a position loop swing after motions, shaped and not."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from .. import workers
+from ..progress import Progress
+from ..store import Store, gather
+from . import cases, figure, report, study
+
+
+@dataclass(frozen=True)
+class Specification:
+    """What all results of a file have in common."""
+
+    seed: int
+    methods: tuple = study.METHODS
+
+
+def add_arguments(parser):
+    """Arguments of the sub-command."""
+    parser.description = (
+        "Measures how arms behind a position loop (125 Hz, 8 ms) ring, moves them by planners' motions and by shaped "
+        "ones, and compares what the tip swings afterwards: random arms, an elastic base, one link with payloads."
+    )
+    parser.epilog = "example: flexarm vibration --count 4 --out results/vibration.jsonl"
+    add = parser.add_argument
+    add("--count", type=int, default=20, help="random arms (20)")
+    add("--seed", type=int, default=0, help="of the arms and motions (0)")
+    workers.add_arguments(add)
+    add(
+        "--out",
+        metavar="FILE.jsonl",
+        help="write every result; those that are in it are not computed again",
+    )
+    add("--fresh", action="store_true", help="remove that file first: after a change of the code")
+    add("--write", metavar="FILE.md", help="write the tables between the markers of this file")
+    add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
+
+
+def vibration(options):
+    """Run the sub-command."""
+    if options.figure:
+        print(figure.draw(options.figure, options.seed))
+        return
+    if options.out and options.fresh:
+        Path(options.out).unlink(missing_ok=True)
+    rows = run(options.seed, options.count, options.out, options.workers, options.scheduler)
+    if options.write:
+        report.write(rows, options.write)
+    print(report.text(rows))
+
+
+def run(seed, count, path=None, processes=None, scheduler=None):
+    """Results of all cases.
+
+    Parameters
+    ----------
+    seed, count : int
+        Of the random arms.
+    path : str, optional
+        File of the results, see `Store`.
+    processes, scheduler
+        As of `workers.results`.
+
+    Returns
+    -------
+    list of dict
+        Rows as of `study.run`.
+    """
+    keep, progress = Store(path, Specification(seed)), Progress()
+    progress.step("arms behind a position loop")
+    names = list(cases.all_of(count, seed))
+    missing = [name for name in names if name not in keep.results]
+    calls = [(name, count, seed) for name in missing]
+    for done, _ in enumerate(gather(keep, _rows_of, calls, processes, scheduler), 1):
+        progress.fraction(done / len(missing))
+    progress.done()
+    return [row for name in names for row in keep.results[name]["rows"]]
+
+
+def _rows_of(name, count, seed):
+    """In a worker: the result of one case."""
+    return [{"sample": name, "rows": study.run(cases.all_of(count, seed)[name]())}]

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of residual vibration, for the terminal and for docs/vibration.md."""
+
+import numpy as np
+
+from ..markdown import table, write_between
+from .study import METHODS
+
+BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
+#: What is wanted of a method: residual over that of the trapezoid [-].
+WANTED = {"robust": 0.1, "zvd": 0.1, "robust -15 %": 0.2, "robust +15 %": 0.2}
+UNSHAPED = METHODS[0]
+COLUMNS = (
+    "method",
+    "median",
+    "90 %",
+    "largest",
+    "wanted",
+    "within it",
+    "worse than unshaped",
+    "added, periods",
+)
+
+
+def ratios(rows):
+    """Residual over that of the trapezoid, by method: dict of lists of (row, ratio)."""
+    unshaped = {(r["arm"], r["motion"]): r["residual"] for r in rows if r["method"] == UNSHAPED}
+    found = {method: [] for method in METHODS[1:]}
+    for row in rows:
+        if row["method"] in found:
+            found[row["method"]].append(
+                (row, row["residual"] / unshaped[row["arm"], row["motion"]])
+            )
+    return found
+
+
+def summary(rows):
+    """A row of `COLUMNS` for each method."""
+    out = []
+    for method, pairs in ratios(rows).items():
+        if not pairs:
+            continue
+        found = np.array([ratio for _, ratio in pairs])
+        wanted = WANTED.get(method)
+        within = None if wanted is None else f"{int((found <= wanted).sum())} of {found.size}"
+        added = float(np.median([row["added"] for row, _ in pairs]))
+        worse = f"{int((found > 1.0).sum())} of {found.size}"
+        spread = (float(f(found)) for f in (np.median, lambda x: np.quantile(x, 0.9), np.max))
+        out.append((method, *spread, wanted, within, worse, added))
+    return out
+
+
+def groups(rows):
+    """Rows by what kind of arm they are of, a dict."""
+    named = {"random arms": [], "elastic base": [], "one link, payload 0 to 3 times": []}
+    for row in rows:
+        kind = "elastic base" if row["arm"] == "elastic base" else "random arms"
+        kind = "one link, payload 0 to 3 times" if row["arm"].startswith("one link") else kind
+        named[kind].append(row)
+    return {name: found for name, found in named.items() if found}
+
+
+def missed(rows):
+    """Lines about each motion that is not within what is wanted."""
+    lines = []
+    for method, pairs in ratios(rows).items():
+        for row, ratio in pairs:
+            if method in WANTED and ratio > WANTED[method]:
+                found = ", ".join(f"{f:.2f}" for f in row["frequencies"])
+                where = f"{row['arm']}, motion {row['motion']}"
+                lines.append(f"- {method}: {ratio:.2f} of unshaped; {where}; measured {found} Hz")
+    return lines
+
+
+def text(rows):
+    """The tables, Markdown."""
+    lines = []
+    for name, found in groups(rows).items():
+        arms = {row["arm"] for row in found}
+        silent = {(r["arm"], r["motion"]) for r in found if not r["method"]}
+        lines += [f"**{name}** ({len(arms)}), three motions each", ""]
+        lines += [*table(COLUMNS, summary(found)), ""]
+        if silent:
+            lines += [f"No mode was found in the ringing of {len(silent)} motions.", ""]
+    lines += ["Not within what is wanted:", "", *(missed(rows) or ["- none"])]
+    return "\n".join(lines)
+
+
+def write(rows, path):
+    """Put the tables between the markers of a Markdown file."""
+    write_between(path, BEGIN, END, text(rows))

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Residual vibration of arms behind a position loop: shaped motions beside what planners make.
+
+What the shapers know is what a user can measure: frequencies and damping of the ringing after a small, short motion of
+the same simulated arm, behind the same drives. The arms' files are not looked at.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_control.motions.profiles import Motion
+from flexarm_control.shaping import modes as modes_module
+from flexarm_control.shaping.modes import Modes
+from flexarm_control.shaping.shaped_motion import ShapedMotion
+from flexarm_dynamics.models import model
+from flexarm_dynamics.parameters import check_all
+
+from ..resonance.fit import fit
+from .position_arm import PositionArm
+from .time_laws import jerk_limited, resampled, trapezoid
+
+#: The kick after which ringing is measured: so much of the way, in so many locked periods; for how many it is recorded.
+KICK, KICK_PERIODS, LISTEN = 0.05, 0.8, 14.0
+#: Window in which the residual is looked for, in locked periods.
+WINDOW = 1.5
+#: Modes that are shaped have at least this fraction of the largest amplitude, and at most this damping; how many.
+AUDIBLE, MAX_DAMPING, MAX_MODES = 0.03, 0.3, 3
+#: Modes closer than this fraction are one.
+SAME = 0.12
+#: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
+RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
+METHODS = (
+    "trapezoid",
+    "TOTG 0.1 s",
+    "jerk limit",
+    "jerk limit, one period",
+    "zvd",
+    "robust",
+    "robust -15 %",
+    "robust +15 %",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Modes found in ringing: frequencies [Hz], damping ratios [-], the one that rings most first."""
+
+    frequencies: np.ndarray
+    dampings: np.ndarray
+
+
+class Shaped(Motion):
+    """A `ShapedMotion` as a `Motion`."""
+
+    def __init__(self, shaped):
+        self._shaped = shaped
+        self.start, self.duration = shaped.motion.start, shaped.end
+        self.angle = shaped.motion.angle
+
+    def derivative(self, order, t):
+        return self._shaped.states(np.atleast_1d(t))[order]
+
+
+def measured(arm, at, way, period) -> Measured:
+    """Modes of an arm that rings after a kick.
+
+    Parameters
+    ----------
+    arm : PositionArm
+    at, way : (n,) ndarrays
+        Where the kick ends, and which way it goes [rad].
+    period : float
+        About that of the lowest mode [s].
+    """
+    kick = trapezoid(at - KICK * way, at, KICK_PERIODS * period)
+    swing = arm.follow(kick, LISTEN * period)
+    ringing = swing.ringing()
+    found = fit(ringing / np.abs(ringing).max(), float(swing.time[1] - swing.time[0]))
+    sizes = [(np.linalg.norm(m.amplitude), m.frequency, m.damping) for m in found.modes]
+    sizes = sorted((s for s in sizes if s[2] <= MAX_DAMPING), reverse=True)
+    kept = []
+    for size, frequency, damping in sizes:
+        apart = all(abs(frequency / f - 1.0) > SAME for f, _ in kept)
+        if apart and size >= AUDIBLE * sizes[0][0] and len(kept) < MAX_MODES:
+            kept.append((frequency, damping))
+    return Measured(*np.array(kept).reshape(-1, 2).T)
+
+
+def shaped(motion, kind, found, off=1.0):
+    """A motion shaped for measured modes.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+    kind : str
+        Shaper.
+    found : Measured
+    off : float
+        Factor of the frequencies: how wrong they are taken to be [-].
+    """
+    frequencies, dampings = found.frequencies * off, found.dampings
+    if kind != modes_module.ROBUST:
+        frequencies, dampings = frequencies[:1], dampings[:1]
+    settings = {"type": kind, "frequencies": frequencies.tolist(), "dampings": dampings.tolist()}
+    modes = Modes(check_all(modes_module.PARAMETERS, settings), motion.start.size)
+    return Shaped(ShapedMotion(motion, modes))
+
+
+def candidates(motion, found):
+    """The motion by each of `METHODS`, a dict."""
+    lowest = 1.0 / found.frequencies.min()
+    return {
+        "trapezoid": motion,
+        "TOTG 0.1 s": resampled(motion, RESAMPLE),
+        "jerk limit": jerk_limited(motion, RISE),
+        "jerk limit, one period": jerk_limited(motion, lowest),
+        "zvd": shaped(motion, "zvd", found),
+        "robust": shaped(motion, "robust", found),
+        "robust -15 %": shaped(motion, "robust", found, 1.0 - OFF),
+        "robust +15 %": shaped(motion, "robust", found, 1.0 + OFF),
+    }
+
+
+def run(case):
+    """Residuals of all motions of a case by all methods.
+
+    Parameters
+    ----------
+    case : cases.Case
+
+    Returns
+    -------
+    list of dict
+        A row for each motion and method.
+    """
+    known = model.build(case.known)
+    arm = PositionArm(known, model.build(case.plant), 2.0 * np.pi / case.period)
+    rows = []
+    for number, motion in enumerate(case.motions):
+        found = measured(arm, motion.end, motion.angle, case.period)
+        common = {
+            "arm": case.name,
+            "motion": number,
+            "frequencies": found.frequencies.tolist(),
+            "dampings": found.dampings.tolist(),
+        }
+        if not found.frequencies.size:
+            rows.append({**common, "method": ""})
+            continue
+        lowest = 1.0 / found.frequencies.min()
+        for method, given in candidates(motion, found).items():
+            swing = arm.follow(given, WINDOW * case.period)
+            rows.append(
+                {
+                    **common,
+                    "method": method,
+                    "residual": swing.residual(WINDOW * case.period),
+                    "added": float((given.duration - motion.duration) / lowest),
+                    "saturated": swing.saturated,
+                }
+            )
+    return rows

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms behind a position loop: planners' motions, what is measured, and what is left of the swing."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from flexarm_dynamics.models import model
+from flexarm_studies.vibration import cases, report, study
+from flexarm_studies.vibration.position_arm import PositionArm
+from flexarm_studies.vibration.time_laws import jerk_limited, resampled, trapezoid
+
+
+def test_planners_motions_have_the_shapes_that_they_are_named_for():
+    motion = trapezoid([0.0, 1.0], [1.5, 0.0], 3.0)
+    assert_allclose(
+        motion.velocity(np.array([0.5, 1.0, 1.5])), [[0.375, -0.25], [0.75, -0.5], [0.75, -0.5]]
+    )
+    assert_allclose(motion.end, [1.5, 0.0])
+    smooth = jerk_limited(motion, 0.4)
+    t = np.linspace(0.0, 3.4, 341)
+    delayed = np.mean([motion.position(t - d) for d in np.linspace(0.0, 0.4, 2001)], axis=0)
+    assert_allclose(smooth.position(t), delayed, atol=1e-4)
+    jerk = np.diff(smooth.acceleration(t), axis=0) / 0.01
+    assert np.abs(jerk[:, 0]).max() == pytest.approx(0.75 / 0.4, rel=1e-6)
+    assert_allclose(resampled(motion, 0.1).position(t), motion.position(t), atol=2e-3)
+
+
+def test_a_shaped_motion_leaves_a_tenth_of_the_swing_with_what_ringing_shows():
+    case = cases.payload(1.0)
+    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
+    motion = case.motions[0]
+    found = study.measured(arm, motion.end, motion.angle, case.period)
+    assert found.frequencies[0] == pytest.approx(1.0 / case.period, rel=0.05)
+    window = study.WINDOW * case.period
+    unshaped = arm.follow(motion, window).residual(window)
+    left = arm.follow(study.shaped(motion, "robust", found), window).residual(window)
+    off = arm.follow(study.shaped(motion, "robust", found, 0.85), window).residual(window)
+    assert left < 0.1 * unshaped
+    assert off < 0.2 * unshaped
+
+
+def test_the_table_counts_what_is_within_what_is_wanted():
+    common = {"arm": "x", "frequencies": [2.0], "added": 1.0}
+    rows = [
+        {**common, "motion": m, "method": method, "residual": r}
+        for m, found in enumerate([(1.0, 0.05), (1.0, 0.3)])
+        for method, r in zip(("trapezoid", "robust"), found, strict=True)
+    ]
+    (line,) = report.summary(rows)
+    assert line[0] == "robust"
+    assert line[3:7] == (pytest.approx(0.3), 0.1, "1 of 2", "0 of 2")
+    assert report.missed(rows) == ["- robust: 0.30 of unshaped; x, motion 1; measured 2.00 Hz"]
