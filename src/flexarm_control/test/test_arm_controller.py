@@ -414,7 +414,7 @@ def test_an_arm_under_gravity_is_held_from_the_first_sample_on(long_reach):
     sizes = {"joints": 4, "modes": long_reach.n_modes}
     authority = Authority(long_reach, check_all(PARAMETERS, {}, sizes))
     q = np.array([0.0, 1.2, 0.8, -0.8])
-    authority.begin(q)
+    authority.begin(q, True)
     a, B = slow_subsystem(long_reach.terms(q, np.zeros(4)))
     assert_allclose(a + B @ authority.torque, np.zeros(4), atol=1e-9)
     assert np.abs(authority.torque).max() > 50.0
@@ -519,6 +519,15 @@ def test_after_a_gap_the_arm_is_no_faster_than_it_was_on_the_mean_but_after_a_ju
     core.step(sample(numbers[1], 0.03, velocity=[0.9], stamp_ns=stamp(101)))
     assert core.interruptions == 1
     assert_allclose(core.reference.velocity, [begins], rtol=1e-9)
+
+
+def test_torque_returns_in_a_ramp_to_a_moving_arm_although_the_law_begins_with_none(arm_r):
+    """A law that has just been reset asks for nothing at first, and the next sample kicked."""
+    core = controller(arm_r, Scripted(0.0, *[5.0] * 20), return_time=0.065)
+    for k in range(31):
+        core.step(sample(k, 5e-4 * k, velocity=[0.5]))
+        assert abs(core.torque[0]) <= 5.0 * ((k - 10) / 65) ** 2 + 1e-12 or k < 10
+    assert core.torque[0] > 0.4
 
 
 def test_a_law_that_asks_for_more_than_the_limit_returns_as_gently(arm_r):

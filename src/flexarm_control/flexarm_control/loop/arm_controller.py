@@ -631,7 +631,7 @@ class ArmController:
             self._take_over(sample, since)
         self._waiting, self._repeats = False, 0
         self.supervisor.begin()
-        self._authority.begin(sample.position)
+        self._authority.begin(sample.position, not _moves(sample))
         self._applied.begin(self.torque)
         self.torque_delay.begin()
         self.law.reset()

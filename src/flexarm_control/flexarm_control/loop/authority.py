@@ -102,9 +102,9 @@ class Authority:
         """Whether all of the torque is there."""
         return self._elapsed >= self._time
 
-    def begin(self, q):
-        """Torque returns, to an arm at q (n,) [rad]: the ramp begins at the torque that holds its weight there."""
-        self._elapsed, self._first = 0.0, True
+    def begin(self, q, rests):
+        """Torque returns, to an arm at q (n,) [rad] that `rests` or not: first what holds its weight there."""
+        self._elapsed, self._first = 0.0, rests
         self._weight[:] = self._holding(q)
         clip(self._weight, -self.limit, self.limit)
         self.torque[:] = self._weight
