@@ -382,7 +382,7 @@ LAWS = [
             "integral[:, at_y : at_y + n] = -h",
         ),
         ("loop", "a late torque acts at once", "add(end, whole)", "add(end, 0)"),
-        ("decay", "the gradient's sign", "(-1.0 / across)", "found = np.outer("),
+        ("decay", "the gradient's sign", "(-1.0 / across)", "(1.0 / across)"),
         ("search", "the worst loops are not chosen", "if value > most and", "if value < most and"),
         (
             "decay",
