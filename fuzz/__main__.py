@@ -32,6 +32,7 @@ def readers():
         trajectories.Written,
         files.Arms,
         files.Models,
+        files.Archives,
         files.Parameters,
         files.ParameterFiles,
         files.Csv,

@@ -4,8 +4,10 @@
 import copy
 import csv
 import io
+import tempfile
 from array import array
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import yaml
@@ -13,7 +15,7 @@ from rclpy.serialization import serialize_message
 
 from flexarm_control.composite import assembly
 from flexarm_control.nodes import controller, observer
-from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm import arm_file, reduced
 from flexarm_dynamics.errors import ArmFileError, FlexarmError, ParameterError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
@@ -98,6 +100,51 @@ class Models(Arms):
         for name in ("M", "f1", "f2", "C1", "C2", "K1", "K2"):
             values = getattr(terms, name, None)
             demand(values is None or np.isfinite(values).all(), f"{name} is not finite")
+
+
+class Archives(Reader):
+    """`reduced.read` of archives of reduced matrices whose arrays or bytes are altered."""
+
+    name, weight, error = "reduced matrices", 0.5, ArmFileError
+
+    def __init__(self):
+        path = arm_file.arms_directories()[0] / "solid_boom.npz"
+        self.bytes = path.read_bytes()
+        with np.load(path) as archive:
+            self.arrays = dict(archive)
+        self.folder = Path(tempfile.mkdtemp(prefix="flexarm_fuzz_"))
+
+    def make(self, rng):
+        if rng.random() < 0.4:
+            return odd.mangled(rng, self.bytes)
+        arrays = dict(self.arrays)
+        for name in rng.sample(sorted(arrays), rng.randint(1, 3)):
+            value = arrays[name]
+            odd_ones = (
+                value[..., :1] if value.ndim else value[None],
+                -value if value.dtype.kind == "f" else value[:0],
+                value.astype(str),
+                np.full(value.shape, np.nan),
+                np.zeros(value.shape),
+                value[None],
+                np.array(1.0),
+            )
+            arrays[name] = rng.choice(odd_ones)
+            if rng.random() < 0.2:
+                del arrays[name]
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        return file.getvalue()
+
+    def read(self, given):
+        path = self.folder / "link.npz"
+        path.write_bytes(given)
+        return reduced.read(path, "links[0].reduced.file")
+
+    def check(self, given, result):
+        demand(1 <= result.modes <= reduced.MAX_MODES, "modes")
+        numbers = (v for v in result.arrays.values() if v.dtype.kind == "f")
+        demand(all(np.isfinite(v).all() for v in numbers), "not finite")
 
 
 def declared():

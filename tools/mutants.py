@@ -158,6 +158,12 @@ KERNELS = of(
     ("chain", "tip's angular acceleration: missing", "    bias_al[0] += ad * bd * ca\n", ""),
     (
         "chain",
+        "force of a body on a link, about the joint: missing",
+        "            w.N[i, k] += t[3, k] + t[9, k]\n",
+        "            w.N[i, k] += t[3, k]\n",
+    ),
+    (
+        "chain",
         "joint's offset from the tip: missing",
         "cross(carried, t[8], t[9])",
         "cross(om, t[8], t[9])",

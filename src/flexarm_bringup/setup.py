@@ -19,7 +19,10 @@ setup(
         (f"share/{name}/launch", sorted(glob("launch/*.py") + glob("launch/*.yaml"))),
         (f"share/{name}/layouts", sorted(glob("layouts/*"))),
         # `config` here is a link to the project's own: setuptools takes no file from above the package.
-        (f"share/{name}/config/arms", sorted(glob("config/arms/*.yaml"))),
+        (
+            f"share/{name}/config/arms",
+            sorted(glob("config/arms/*.yaml") + glob("config/arms/*.npz")),
+        ),
         (f"share/{name}/config/controllers", sorted(glob("config/controllers/*.yaml"))),
         (f"share/{name}/config/recordings", sorted(glob("config/recordings/*.yaml"))),
     ],

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm import arm_file, reduced
 from flexarm_dynamics.arm.description import Arm, Flexibility, Friction, Joint, Link, Payload
 from flexarm_dynamics.errors import ShapeError
+from flexarm_dynamics.models import reduction
 from flexarm_dynamics.models.chain import Chain
 from flexarm_sim import batch
 from flexarm_sim.integrators import METHODS, integrate, substeps
@@ -170,6 +171,50 @@ def test_tapered_links_follow_a_multibody_code(modes, limit):
     advance = chain.stepper(METHODS["rk4"], straight_line=False)
     advance.trajectory(states, torque[:-1], torque[1:], 1e-3 / count, count)
     within(errors(chain, states[::10], table), {"tip": limit, "elbow": limit})
+
+
+@pytest.mark.slow
+def test_a_boom_of_finite_elements_follows_a_multibody_code():
+    """Exudyn's floating frame with the same reduced body: without weight, friction, hub and damping."""
+    table = np.genfromtxt(DATA / "solid_boom.csv", delimiter=",", names=True)
+    arm = bare(arm_file.load("solid_boom").with_modes(8))
+    joint = replace(arm.joints[0], hub_inertia=0.0)
+    chain = Chain(replace(arm, joints=(joint,), gravity=(0.0, 0.0, 0.0)))
+    t = np.linspace(0.0, table["t"][-1], 50 * (table.size - 1) + 1)
+    torque = (20.0 * np.sin(3.0 * np.pi * t))[:, None]
+    states = np.zeros((t.size, 2 + 16))
+    count = substeps(chain, 2e-4)
+    advance = chain.stepper(METHODS["rk4"], straight_line=False)
+    advance.trajectory(states, torque[:-1], torque[1:], 2e-4 / count, count)
+    q, delta, _, _ = split(chain, states[::50])
+    tips = np.array([chain.tip_position(*z) for z in zip(q, delta, strict=True)])
+    far = np.linalg.norm(tips - np.column_stack([table[f"tip_{axis}"] for axis in "xyz"]), axis=1)
+    assert far.max() < 5e-6
+
+
+@pytest.mark.slow
+def test_reduced_matrices_of_tapered_links_follow_those_links():
+    """Both links of the shipped arm as archives, their second order included: stiffening, sinusoidal torques."""
+    beams = Chain(at_level(bare(arm_file.load("tapered")), "foreshortening"))
+    links = []
+    for link in beams.arm.links:
+        arrays = reduction.of_link(beams, link.name)
+        del arrays["modal_damping"]
+        made = reduced.of_arrays(arrays)
+        flexible = {"reduced": Flexibility(made.modes, "reduced")}
+        links.append(replace(link, stiffness={}, flexible=flexible, pieces=(), reduced=made))
+    arm = replace(beams.arm, links=tuple(links), gauges=(), observed_modes=())
+    t = np.linspace(0.0, 2.0, 2001)
+    torque = np.stack([8.0 * np.sin(np.pi * t), 0.8 * np.sin(1.6 * np.pi * t)], axis=1)
+    tips = []
+    for chain in (beams, Chain(arm)):
+        states = np.zeros((t.size, 12))
+        count = substeps(chain, 1e-3)
+        advance = chain.stepper(METHODS["rk4"], straight_line=False)
+        advance.trajectory(states, torque[:-1], torque[1:], 1e-3 / count, count)
+        q, delta, _, _ = split(chain, states[::10])
+        tips.append([chain.tip_position(*z) for z in zip(q, delta, strict=True)])
+    assert_allclose(tips[1], tips[0], atol=2e-6)
 
 
 def bare(arm):

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from ..errors import ArmFileError
-from . import fixed_joints
+from . import fixed_joints, reduced
 from .description import (
-    DIRECTIONS,
+    BEAM_DIRECTIONS,
     ENCODERS,
     MAX_MODES,
+    REDUCED,
     SAFE_ACTIONS,
     SHAPES,
     TRANSMISSION,
@@ -181,6 +182,22 @@ def _joint(s):
     return joint
 
 
+def _damping(s):
+    """Modal damping ratios."""
+    damping = ()
+    if s.has("damping"):
+        given = s.raw("damping")
+        damping = (
+            s.vector("damping", len(given))
+            if isinstance(given, list)
+            else (s.number("damping", low=0.0),)
+        )
+    if any(not 0.0 <= z < 1.0 for z in damping):
+        limit = "from 0 to below 1"
+        raise s.error("damping", "is out of range", value=list(damping), limit=limit)
+    return damping
+
+
 def _flexibility(s):
     shape = s.text("shape", "clamped_free", SHAPES)
     modes = s.integer("modes", low=1, high=MAX_MODES)
@@ -195,22 +212,12 @@ def _flexibility(s):
     if any(f <= 0.0 for f in frequencies) or list(frequencies) != sorted(set(frequencies)):
         problem = "must be positive and ascending"
         raise s.error("frequencies", problem, value=list(frequencies))
-    damping = ()
-    if s.has("damping"):
-        given = s.raw("damping")
-        damping = (
-            s.vector("damping", len(given))
-            if isinstance(given, list)
-            else (s.number("damping", low=0.0),)
-        )
-    if any(not 0.0 <= z < 1.0 for z in damping):
-        limit = "from 0 to below 1"
-        raise s.error("damping", "is out of range", value=list(damping), limit=limit)
+    damping = _damping(s)
     s.done()
     return Flexibility(modes, shape, frequencies, damping)
 
 
-#: Keys of a link's or a part's stiffnesses, in the order of `DIRECTIONS`.
+#: Keys of a link's or a part's stiffnesses, in the order of `BEAM_DIRECTIONS`.
 STIFFNESS_KEYS = ("EI_y", "EI_z", "GJ")
 #: What a part of a link has from the part before it unless it states its own.
 INHERITED = ("shape", "density", "youngs_modulus", "shear_modulus")
@@ -308,7 +315,7 @@ def _numbers(s, taper):
         read("mass_per_length", "mass_per_length"),
         {
             direction: read(key, "stiffness")
-            for direction, key in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True)
+            for direction, key in zip(BEAM_DIRECTIONS, STIFFNESS_KEYS, strict=True)
             if s.has(key)
         },
         read("polar_inertia_per_length", "mass", 0.0, low=0.0),
@@ -351,7 +358,7 @@ def _parts(s, length):
         if set(parts[-1][1].stiffness) != set(parts[0][1].stiffness):
             wanted = ", ".join(
                 k
-                for d, k in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True)
+                for d, k in zip(BEAM_DIRECTIONS, STIFFNESS_KEYS, strict=True)
                 if d in parts[0][1].stiffness
             )
             raise ArmFileError(
@@ -395,14 +402,48 @@ def _pieces(parts, length):
     return mass, stiffness, polar, pieces
 
 
-def _link(s):
+def _reduced_link(s, folder):
+    """A link given by reduced matrices."""
+    name, part = s.name(), s.section("reduced")
+    where = part.at("file")
+    file = part.text("file")
+    matrices = reduced.read(Path(folder or ".", file).expanduser(), where)
+    count = part.integer("modes", matrices.modes, low=1, high=matrices.modes)
+    damping = _damping(part)
+    if damping and "modal_damping" in matrices.arrays:
+        hint = "the archive has modal_damping: leave one of them out"
+        raise part.error("damping", "given twice", hint=hint)
+    part.done()
+    root = s.vector("root", 3, "length", (0.0,) * 3)
+    for key in (
+        "length",
+        "section",
+        "sections",
+        "flexible",
+        "bodies",
+        "mass_per_length",
+        *STIFFNESS_KEYS,
+    ):
+        if s.has(key):
+            raise s.error(key, "beside reduced matrices", hint="they hold all of it")
+    s.done()
+    length = float(np.linalg.norm(matrices["tip"]))
+    return Link(
+        name, length, float(matrices["mass"]) / length, {},
+        {REDUCED: Flexibility(count, REDUCED, (), damping)}, root=root, reduced=matrices,
+    )  # fmt: skip
+
+
+def _link(s, folder):
+    if s.has("reduced"):
+        return _reduced_link(s, folder)
     name = s.name()
     length = s.number("length", "length", positive=True)
     per_length, stiffness, polar, pieces = _pieces(_parts(s, length), length)
     flexible = {}
     if s.has("flexible"):
         f = s.section("flexible")
-        for direction, key in zip(DIRECTIONS, STIFFNESS_KEYS, strict=True):
+        for direction, key in zip(BEAM_DIRECTIONS, STIFFNESS_KEYS, strict=True):
             if f.has(direction):
                 flexible[direction] = _flexibility(f.section(direction))
                 if direction not in stiffness:
@@ -469,9 +510,7 @@ def _gauge(s, links):
     gauge = Gauge(
         name=name,
         link=link,
-        position=s.number("position", "length"),
-        direction=s.text("direction", "y", DIRECTIONS),
-        surface_distance=s.number("surface_distance", "length"),
+        **_gauge_place(s, links[link]),
         gain=s.number("gain", "none", 1.0),
         bias=s.number("bias", "none", 0.0),
         noise=s.number("noise", "none", 0.0, low=0.0),
@@ -480,9 +519,27 @@ def _gauge(s, links):
         drift=s.number("drift", "none", 0.0, low=0.0),
     )
     s.done()
+    if gauge.point:
+        return gauge
     _check_gauge(s, gauge, links[link].length)
     _check_jump(s, gauge, links[link])
     return gauge
+
+
+def _gauge_place(s, link):
+    """Where a gauge is: on a beam its place and direction; else a point that the archive names."""
+    if link.reduced is None:
+        return {
+            "position": s.number("position", "length"),
+            "direction": s.text("direction", "y", BEAM_DIRECTIONS),
+            "surface_distance": s.number("surface_distance", "length"),
+        }
+    points = tuple(map(str, link.reduced.arrays.get("strain_names", ())))
+    if not points:
+        hint = "add strain_names and strain to the archive"
+        raise s.error("link", "its archive has no points with strain", value=link.name, hint=hint)
+    point = s.text("point", choices=points)
+    return {"position": 0.0, "direction": REDUCED, "surface_distance": 1.0, "point": point}
 
 
 def _check_gauge(s, gauge, length):
@@ -554,7 +611,7 @@ def _observed(s, modes, gauges):
     return tuple(m.name for m in modes if m.name in names)
 
 
-def parse(text, where="arm"):
+def parse(text, where="arm", folder=None):
     """Read an arm from YAML text.
 
     Parameters
@@ -563,6 +620,8 @@ def parse(text, where="arm"):
         The file's content.
     where : str
         What to call it in messages about the YAML itself.
+    folder : Path, optional
+        Where files that it names are looked for; the working directory if not given.
 
     Returns
     -------
@@ -578,7 +637,7 @@ def parse(text, where="arm"):
     given = top.sections("joints", required=True)
     fixed = {i for i, s in enumerate(given) if s.text("type", "revolute", JOINT_TYPES) == "fixed"}
     joints = tuple(_fixed_joint(s) if i in fixed else _joint(s) for i, s in enumerate(given))
-    links = tuple(_link(s) for s in top.sections("links", required=True))
+    links = tuple(_link(s, folder) for s in top.sections("links", required=True))
     if not links:
         raise ArmFileError("links", "empty", hint="an arm has at least one link")
     if len(joints) != len(links):
@@ -693,7 +752,7 @@ def load(name):
     except (OSError, UnicodeDecodeError) as error:
         raise ArmFileError(str(path), f"can't be read: {error}") from None
     try:
-        return parse(text, path.name)
+        return parse(text, path.name, path.parent)
     except ArmFileError as error:
         error.field = f"{path.name}: {error.field}"
         raise error from None

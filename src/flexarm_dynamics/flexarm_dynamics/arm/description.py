@@ -13,8 +13,12 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from ..errors import ModelError
+from .reduced import DIRECTION as REDUCED
+from .reduced import Reduced
 
-DIRECTIONS = ("y", "z", "twist")
+#: Ways in which a beam is flexible, and all of them: links given by reduced matrices have one of their own.
+BEAM_DIRECTIONS = ("y", "z", "twist")
+DIRECTIONS = (*BEAM_DIRECTIONS, REDUCED)
 ENCODERS = ("motor", "link")
 SAFE_ACTIONS = ("brake", "damp", "zero")
 #: At most this many modes per direction: beyond, a slender beam is no longer the model to use.
@@ -175,6 +179,23 @@ class Link:
     pieces: tuple = ()  # Piece, from base to tip, without gaps
     bodies: tuple = ()  # Body
     root: tuple = (0.0, 0.0, 0.0)  # [m] of its base, from the joint
+    reduced: Reduced | None = None  # its matrices, where it is no beam
+
+    @property
+    def tip(self):
+        """Where its undeformed tip is, from its base, (3,) [m]."""
+        if self.reduced is not None:
+            return self.reduced["tip"]
+        return np.array([self.length, 0.0, 0.0])
+
+    def available(self, count):
+        """A number of modes, or as many as its matrices have."""
+        return count if self.reduced is None else min(count, self.reduced.modes)
+
+    @property
+    def uniform(self):
+        """Whether it is a beam of one section."""
+        return not self.pieces and self.reduced is None
 
     @property
     def mass(self):
@@ -244,6 +265,13 @@ class Link:
             Mass [kg], integrals of x [kg m] and x^2 [kg m^2] from the link's base, inertia about x [kg m^2].
         """
         high = self.length if high is None else high
+        if self.reduced is not None:
+            r, part = self.reduced, (high - low) / self.length
+            inertia = r["inertia"]
+            second = 0.5 * (inertia[1, 1] + inertia[2, 2])
+            return tuple(
+                part * float(v) for v in (r["mass"], r["first_moment"][0], second, inertia[0, 0])
+            )
         if not self.pieces:
             powers = ((high**k - low**k) / k for k in (1, 2, 3))
             mass, first, second = (self.mass_per_length * p for p in powers)
@@ -288,6 +316,7 @@ class Gauge:
     bits: int = 0  # [-] of the bridge's converter over full scale; 0: not quantised
     full_scale: float = 1000e-6  # [-] strain, the range's end on either side
     drift: float = 0.0  # [1/sqrt(s)] strain: rms change of the bias over a second, a random walk
+    point: str = ""  # on a link given by reduced matrices: its place, by the archive's name
 
     @property
     def step(self):
@@ -456,7 +485,7 @@ class Arm:
             replace(
                 link,
                 flexible={
-                    d: replace(f, modes=count, frequencies=f.frequencies[:count])
+                    d: replace(f, modes=link.available(count), frequencies=f.frequencies[:count])
                     for d, f in link.flexible.items()
                 },
             )
@@ -522,4 +551,5 @@ def _scaled_link(link, stiffness, damping):
         for d, f in link.flexible.items()
     }
     rigidity = {d: stiffness * v for d, v in link.stiffness.items()}
-    return replace(link, stiffness=rigidity, flexible=flexible)
+    reduced = link.reduced and link.reduced.scaled(stiffness, damping * root)
+    return replace(link, stiffness=rigidity, flexible=flexible, reduced=reduced)

@@ -44,7 +44,7 @@ def merged(joints, links, fixed):
             joints[i], links[i] = _before(joints[i - 1], links[i - 1], joints[i], links[i])
             del joints[i - 1], links[i - 1], names[i - 1]
             continue
-        if links[i].flexible:
+        if links[i].flexible or links[i - 1].reduced is not None:
             problem = f"both {links[i - 1].name} and {links[i].name} bend, one on either side"
             hint = "make them one link with sections, or a link given by reduced matrices"
             raise ArmFileError(place, problem, value="fixed", hint=hint)

@@ -45,6 +45,9 @@ def gauge_rows(model, gauges, mode_names=None):
             if (mode.link, mode.direction) != (gauge.link, gauge.direction):
                 continue
             shapes = model.mode_shapes(mode.link, mode.direction)
+            if gauge.point:
+                rows[i, j] = shapes.strain(gauge.point)[mode.number - 1]
+                continue
             if mode.direction == "twist":
                 value = shapes(gauge.position / length, 1)[mode.number - 1] / length
                 rows[i, j] = gauge.surface_distance * value

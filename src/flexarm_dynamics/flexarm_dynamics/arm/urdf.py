@@ -76,7 +76,7 @@ class PieceChain:
 
     def _of(self, link):
         """Junctions of a flexible link; none of a rigid one."""
-        directions = [d for d in AXES if d in link.flexible]
+        directions = [d for d in AXES if d in link.flexible or link.reduced is not None]
         count = self.pieces + 1 if directions else 0
         return [
             Junction(link.name, {d: f"{link.name}_{d}_joint{k + 1}" for d in directions})

@@ -36,7 +36,7 @@ import numpy as np
 JOINT_PARTS = True
 #: Deflection beyond the play, in parts of half of it, at which a transmission has half of its damping.
 ENGAGEMENT = 0.1
-TWIST, Y, Z = 0, 1, 2
+TWIST, Y, Z, REDUCED = 0, 1, 2, 3
 FIRST_ORDER, FORESHORTENING, FINITE_SLOPE = 0, 1, 2
 #: Columns of `of_link`: integrals of s, its second derivative along delta_d and X^2 - x^2 over the mass; at the tip.
 SHORT, SHORT_DD, XX, SHORT_TIP, SHORT_TIP_DD = 0, 1, 2, 3, 4
@@ -101,6 +101,20 @@ DATA = {
     "body_mass": ("B",),
     "body_moment": ("B", 3),  # in the section's frame, about the section
     "body_inertia": ("B", 3, 3),
+    # R links given by reduced matrices: see `arm.reduced`, whose symbols these are.
+    "reduced": ("N",),  # which of them each link is; -1: a beam
+    "red_first": ("R", 3),  # c0
+    "red_tip": ("R", 3),
+    "red_C": ("R", "K", 3),
+    "red_l": ("R", "K", 3),
+    "red_H": ("R", "K", 3, 3),
+    "red_G": ("R", "K", "K", 3, 3),
+    "red_C2": ("R", "K", "K", 3),
+    "red_H2": ("R", "K", "K", 3, 3),
+    "red_T": ("R", "K", 3),  # translation of the tip
+    "red_R": ("R", "K", 3),  # its rotation
+    "red_T2": ("R", "K", "K", 3),  # and second order
+    "red_R2": ("R", "K", "K"),  # about x
     "payload_mass": (1,),
     "payload_moment": (3,),  # in the tip's frame, about the tip
     "payload_inertia": (3, 3),
@@ -496,7 +510,7 @@ def elastic_force(d, w, i, delta):
     """Gradient of link i's elastic energy with respect to its modal amplitudes."""
     K, first = d.count[i], d.first[i]
     for j in range(K):
-        if d.level == FINITE_SLOPE and d.direction[i, j] != TWIST:
+        if d.level == FINITE_SLOPE and d.direction[i, j] != TWIST and d.reduced[i] < 0:
             w.elastic[i, j] = w.bent[i, j]
             continue
         acc = 0.0
@@ -540,7 +554,7 @@ def bend(d, w, i, delta):
 def at_nodes(d, w, delta, delta_d):
     """What is summed at the nodes of the links: functions of deflections and their rates alone."""
     for i in range(d.links):
-        if d.count[i] > 0:
+        if d.count[i] > 0 and d.reduced[i] < 0:
             integrals(d, w, i, delta, delta_d)
             if d.level == FINITE_SLOPE:
                 bend(d, w, i, delta)
@@ -552,7 +566,7 @@ def sums_at_nodes(data, work, state, out):
     half, place = state.size // 2, 0
     at_nodes(d, w, state[d.links : half], state[half + d.links :])
     for i in range(d.links):
-        if d.count[i] == 0:
+        if d.count[i] == 0 or d.reduced[i] >= 0:
             continue
         for c in range(5):
             out[place] = w.of_link[i, c]
@@ -589,6 +603,58 @@ def slopes_and_bends(d, i, g, delta):
     return sy, sz, by, bz
 
 
+def orient(w, n, a, b, twist, ad, bd, twist_d, add, bdd, twist_dd, om, carried):
+    """Frame Rz(a) Ry(-b) Rx(twist) of row n, its angular bias and, into `carried`, its angular velocity.
+
+    Of the angles, their rates ad, bd, twist_d, what their second derivatives have along delta_d (add, bdd, twist_dd),
+    and the link's angular velocity om. t[1] and t[2] become the axes about which b and the twist turn.
+    """
+    t, frame = w.t, w.frame[n]
+    sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
+    st, ct = np.sin(twist), np.cos(twist)
+    # The tangent, and the section's axes.
+    across, along = t[1], t[2]
+    across[0], across[1], across[2] = sa, -ca, 0.0  # -y axis after Rz(a)
+    along[0], along[1], along[2] = ca * cb, sa * cb, sb
+    frame[0, 0], frame[1, 0], frame[2, 0] = along[0], along[1], along[2]
+    frame[0, 1], frame[1, 1], frame[2, 1] = (
+        -sa * ct - ca * sb * st,
+        ca * ct - sa * sb * st,
+        cb * st,
+    )
+    frame[0, 2], frame[1, 2], frame[2, 2] = (
+        sa * st - ca * sb * ct,
+        -ca * st - sa * sb * ct,
+        cb * ct,
+    )
+    turn, spin = t[3], t[4]
+    for k in range(3):
+        turn[k] = bd * across[k]
+    turn[2] += ad
+    for k in range(3):
+        spin[k] = turn[k] + twist_d * along[k]
+    # al_bias = w x spin + (a'' z + b'' across + t'' along) + a' z x b' across + turn x t' along
+    bias_al = w.bias_al[n]
+    cross(om, spin, bias_al)
+    cross(turn, along, t[5])
+    for k in range(3):
+        bias_al[k] += bdd * across[k] + twist_dd * along[k] + twist_d * t[5, k]
+    bias_al[2] += add
+    bias_al[0] += ad * bd * ca
+    bias_al[1] += ad * bd * sa
+    for k in range(3):
+        carried[k] = om[k] + spin[k]
+
+
+def swing(w, n, om, rate):
+    """Acceleration w x (w x arm) + 2 w x rate of row n's section, its link turning with om, into its bias."""
+    t = w.t
+    cross(om, w.arm[n], t[5])
+    for k in range(3):
+        t[5, k] += 2.0 * rate[k]
+    cross(om, t[5], w.bias_a[n])
+
+
 def section(
     d, w, i, x, deflection, slopes, bishop, short, short_dd, draws, delta, delta_d, om, carried
 ):
@@ -599,7 +665,7 @@ def section(
     angular velocity, and `carried` becomes the section's, in link coordinates.
     """
     K, first, n = d.count[i], d.first[i], i + 1
-    arm, frame, t = w.arm[n], w.frame[n], w.t
+    arm, t = w.arm[n], w.t
     short_d = 0.0
     if d.level != FIRST_ORDER:
         for j in range(K):
@@ -657,23 +723,8 @@ def section(
                 )
                 twist_dd -= 2.0 * g * delta_d[first + j] * delta_d[first + k]
     ad, bd = ay * syd + az * szd, bz * szd
-    sa, ca, sb, cb = np.sin(a), np.cos(a), np.sin(b), np.cos(b)
-    st, ct = np.sin(twist), np.cos(twist)
-    # Columns of Rz(a) Ry(-b) Rx(t): the tangent, and the section's axes.
+    orient(w, n, a, b, twist, ad, bd, twist_d, add, bdd, twist_dd, om, carried)
     across, along = t[1], t[2]
-    across[0], across[1], across[2] = sa, -ca, 0.0  # -y axis after Rz(a)
-    along[0], along[1], along[2] = ca * cb, sa * cb, sb
-    frame[0, 0], frame[1, 0], frame[2, 0] = along[0], along[1], along[2]
-    frame[0, 1], frame[1, 1], frame[2, 1] = (
-        -sa * ct - ca * sb * st,
-        ca * ct - sa * sb * st,
-        cb * st,
-    )
-    frame[0, 2], frame[1, 2], frame[2, 2] = (
-        sa * st - ca * sb * ct,
-        -ca * st - sa * sb * ct,
-        cb * ct,
-    )
     for j in range(K):
         kind, slope = d.direction[i, j], slopes[j]
         ga, gb, gt = 0.0, 0.0, 0.0
@@ -689,29 +740,141 @@ def section(
         for k in range(3):
             w.turning[n, j, k] = gb * across[k] + gt * along[k]
         w.turning[n, j, 2] += ga
-    turn, spin = t[3], t[4]
+    swing(w, n, om, rate)
+    w.bias_a[n, 0] -= short_dd
+
+
+def body_reduced(d, w, i, delta, delta_d, om):
+    r"""Integrals of a link given by reduced matrices, polynomials of its amplitudes; om is its angular velocity.
+
+    The velocity terms are those of the kinetic energy that these polynomials make: with
+
+    .. math:: A_j = H_j + (G_{kj} + H2_{jk})\delta_k, \qquad J = J_0 + \mathrm{tr}(S) 1 - S, \quad
+       S = (H_j + H_j^T)\delta_j + (G_{jk} + H2_{jk})\delta_j\delta_k
+
+    (symmetric part), :math:`q_j = w^TA_jw - w^2\,\mathrm{tr}A_j + 2w\cdot\mathrm{vee}(G_{kj})\dot\delta_k`.
+    """
+    r, K, first, t, tm = d.reduced[i], d.count[i], d.first[i], w.t, w.tm
+    c, J, N, F = w.c[i], w.J[i], w.N[i], w.F[i]
+    S, rate, A = tm[1], tm[2], tm[3]  # S and its rate, not yet made symmetric
+    cd, pd, ld, spin = t[1], t[2], t[3], t[4]
     for k in range(3):
-        turn[k] = bd * across[k]
-    turn[2] += ad
+        c[k] = d.red_first[r, k]
+        cd[k], pd[k], ld[k], spin[k] = 0.0, 0.0, 0.0, 0.0
+        for n in range(3):
+            S[k, n], rate[k, n] = 0.0, 0.0
+    w2 = dot(om, om)
+    for j in range(K):
+        x, v = delta[first + j], delta_d[first + j]
+        p, moment = w.p[i, j], w.l[i, j]
+        whirl = 0.0
+        for a in range(3):
+            p[a] = d.red_C[r, j, a]
+            c[a] += d.red_C[r, j, a] * x
+            for b in range(3):
+                A[a, b] = d.red_H[r, j, a, b]
+                S[a, b] += d.red_H[r, j, a, b] * x
+        vee_d, own = t[5], t[7]
+        for a in range(3):
+            vee_d[a], own[a] = 0.0, 0.0
+        for k in range(K):
+            y, u = delta[first + k], delta_d[first + k]
+            G, H2 = d.red_G[r, k, j], d.red_H2[r, j, k]
+            w.M[i, j, k] = d.gram[i, j, k]
+            for a in range(3):
+                C2 = d.red_C2[r, j, k, a]
+                p[a] += C2 * y
+                c[a] += 0.5 * C2 * x * y
+                pd[a] += C2 * u * v
+                e, f = (a + 1) % 3, (a + 2) % 3
+                turned = G[e, f] - G[f, e]
+                drawn = H2[e, f] - H2[f, e]
+                own[a] += (turned + drawn) * y
+                vee_d[a] += (turned + drawn) * u
+                whirl += om[a] * turned * u
+                for b in range(3):
+                    A[a, b] += (G[a, b] + H2[a, b]) * y
+                    S[a, b] += 0.5 * (G[a, b] + H2[a, b]) * x * y
+        trace, square = A[0, 0] + A[1, 1] + A[2, 2], 0.0
+        for a in range(3):
+            moment[a] = d.red_l[r, j, a] + own[a]
+            cd[a] += p[a] * v
+            ld[a] += vee_d[a] * v
+            spin[a] += moment[a] * v
+            for b in range(3):
+                square += om[a] * A[a, b] * om[b]
+                rate[a, b] += A[a, b] * v
+        w.q[i, j] = square - w2 * trace + 2.0 * whirl
+    whole, change = (
+        2.0 * (S[0, 0] + S[1, 1] + S[2, 2]),
+        2.0 * (rate[0, 0] + rate[1, 1] + rate[2, 2]),
+    )
+    for a in range(3):
+        for b in range(3):
+            J[a, b] = d.inertia[i, a, b] - S[a, b] - S[b, a]
+        J[a, a] += whole
+    # N = J' w + l' delta' + w x (J w + l delta'); F = w x (w x c + 2 c') + p' delta'
+    apply(J, om, t[0])
     for k in range(3):
-        spin[k] = turn[k] + twist_d * along[k]
-    # al_bias = w x spin + (a'' z + b'' across + t'' along) + a' z x b' across + turn x t' along
-    bias_al, bias_a = w.bias_al[n], w.bias_a[n]
-    cross(om, spin, bias_al)
-    cross(turn, along, t[5])
+        t[0, k] += spin[k]
+    cross(om, t[0], N)
+    for a in range(3):
+        N[a] += change * om[a] + ld[a]
+        for b in range(3):
+            N[a] -= (rate[a, b] + rate[b, a]) * om[b]
+    cross(om, c, t[0])
     for k in range(3):
-        bias_al[k] += bdd * across[k] + twist_dd * along[k] + twist_d * t[5, k]
-    bias_al[2] += add
-    bias_al[0] += ad * bd * ca
-    bias_al[1] += ad * bd * sa
-    # a_bias = w x (w x arm) + 2 w x rate + r_dd
-    cross(om, arm, t[5])
+        t[0, k] += 2.0 * cd[k]
+    cross(om, t[0], F)
     for k in range(3):
-        t[5, k] += 2.0 * rate[k]
-    cross(om, t[5], bias_a)
-    bias_a[0] -= short_dd
+        F[k] += pd[k]
+
+
+def section_reduced(d, w, i, delta, delta_d, om, carried):
+    """As `section`, the tip of a link given by reduced matrices."""
+    r, K, first, n, t = d.reduced[i], d.count[i], d.first[i], i + 1, w.t
+    arm, rate = w.arm[n], t[0]
+    r_dd = t[7]
     for k in range(3):
-        carried[k] = om[k] + spin[k]
+        arm[k] = d.root[i, k] + d.red_tip[r, k]
+        rate[k], r_dd[k] = 0.0, 0.0
+    turn = t[8]  # rotation vector, to second order about x
+    turn_d, twist_dd = t[9], 0.0
+    for k in range(3):
+        turn[k], turn_d[k] = 0.0, 0.0
+    for j in range(K):
+        x, v = delta[first + j], delta_d[first + j]
+        for a in range(3):
+            part = d.red_T[r, j, a]
+            arm[a] += part * x
+            for k in range(K):
+                T2 = d.red_T2[r, j, k, a]
+                part += T2 * delta[first + k]
+                arm[a] += 0.5 * T2 * x * delta[first + k]
+                r_dd[a] += T2 * v * delta_d[first + k]
+            w.partial[n, j, a] = part
+            rate[a] += part * v
+            turn[a] += d.red_R[r, j, a] * x
+            turn_d[a] += d.red_R[r, j, a] * v
+        for k in range(K):
+            R2, y, u = d.red_R2[r, j, k], delta[first + k], delta_d[first + k]
+            turn[0] += 0.5 * R2 * x * y
+            turn_d[0] += R2 * v * y
+            twist_dd += R2 * v * u
+    orient(
+        w, n, turn[2], -turn[1], turn[0], turn_d[2], -turn_d[1], turn_d[0], 0.0, 0.0, twist_dd, om, carried
+    )  # fmt: skip
+    across, along = t[1], t[2]
+    for j in range(K):
+        gt = d.red_R[r, j, 0]
+        for k in range(K):
+            gt += d.red_R2[r, j, k] * delta[first + k]
+        for k in range(3):
+            w.turning[n, j, k] = gt * along[k] - d.red_R[r, j, 1] * across[k]
+        w.turning[n, j, 2] += d.red_R[r, j, 2]
+    swing(w, n, om, rate)
+    for k in range(3):
+        w.bias_a[n, k] += r_dd[k]
 
 
 def attach(d, w, i, delta, delta_d, om):
@@ -813,10 +976,13 @@ def tip(d, w, i, delta, delta_d, om):
     if d.level != FIRST_ORDER and K > 0:
         short, short_dd = w.of_link[i, SHORT_TIP], w.of_link[i, SHORT_TIP_DD]
     carried = t[6]
-    section(
-        d, w, i, d.length[i], d.tip[i], d.slope[i], d.bishop[i], short, short_dd, w.draws[i],
-        delta, delta_d, om, carried,
-    )  # fmt: skip
+    if d.reduced[i] >= 0:
+        section_reduced(d, w, i, delta, delta_d, om, carried)
+    else:
+        section(
+            d, w, i, d.length[i], d.tip[i], d.slope[i], d.bishop[i], short, short_dd, w.draws[i],
+            delta, delta_d, om, carried,
+        )  # fmt: skip
     bias_al, bias_a = w.bias_al[n], w.bias_a[n]
     if n == d.links:
         apply_transposed(frame, carried, w.omega[n])
@@ -894,7 +1060,9 @@ def prepare(d, w, q, delta, qd, delta_d):
         turn_joint(d, w, i, angle, rate)
         if JOINT_PARTS and d.housed[i]:
             turn_housing(d, w, i)
-        if d.level == FIRST_ORDER or d.count[i] == 0:
+        if d.reduced[i] >= 0:
+            body_reduced(d, w, i, delta, delta_d, w.omega[i])
+        elif d.level == FIRST_ORDER or d.count[i] == 0:
             body_first_order(d, w, i, delta, delta_d, w.omega[i])
         else:
             body_foreshortened(d, w, i, delta, delta_d, w.omega[i])
@@ -1440,7 +1608,7 @@ def potential_energy(data, work, q, delta, zero, modal_zero):
         apply(R[i], w.c[i], w.t[0])
         energy -= d.mass[i] * dot(d.gravity, p[i]) + dot(d.gravity, w.t[0])
         for j in range(d.count[i]):
-            if d.level != FINITE_SLOPE or d.direction[i, j] == TWIST:
+            if d.level != FINITE_SLOPE or d.direction[i, j] == TWIST or d.reduced[i] >= 0:
                 energy += 0.5 * w.elastic[i, j] * delta[d.first[i] + j]
         if d.level == FINITE_SLOPE:
             for g in range(d.nodes):

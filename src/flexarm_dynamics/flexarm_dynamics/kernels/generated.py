@@ -101,6 +101,8 @@ def given_sums(data, work, graph):
         place += 1
 
     for i in range(data.links):
+        if data.reduced[i] >= 0:
+            continue
         kinds = data.direction[i, : data.count[i]]
         if not kinds.size:
             continue
@@ -131,7 +133,7 @@ def given_sums(data, work, graph):
 
 def room_for_sums(data):
     """Number of values that `chain.sums_at_nodes` gives."""
-    count = data.count.tolist()
+    count = np.where(data.reduced[: data.links] < 0, data.count[: data.links], 0).tolist()
     links = sum(5 + k * 12 + k * (k + 1) // 2 for k in count if k)
     hosts = (count[i] for i in data.host[: data.bodies])
     return links + sum(2 + k for k in hosts if k)

@@ -7,18 +7,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.polynomial import legendre
 
-from ..arm.description import DIRECTIONS
+from ..arm.description import DIRECTIONS, REDUCED
+from ..arm.reduced import Shapes
 from ..errors import ModelError
 from ..kernels import chain as kernel
 from . import beam, varied_beam
 from .model import damping_matrix, rotation
 
-_KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST}
+_KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST, "reduced": kernel.REDUCED}
 
 #: Fields of the kernels' data that are whole numbers.
 INTEGERS = (
     *("links", "level", "nodes", "count", "first", "direction", "spring", "housed"),
-    *("rooted", "bodies", "host", "body_node"),
+    *("rooted", "bodies", "host", "body_node", "reduced"),
 )
 
 
@@ -26,8 +27,8 @@ def _shape(spec, sizes):
     return tuple(sizes[word] if isinstance(word, str) else word for word in spec)
 
 
-def _sizes(links, modes, nodes, bodies):
-    whole = {"N": links, "K": modes, "G": nodes, "B": bodies}
+def _sizes(links, modes, nodes, bodies, reduced):
+    whole = {"N": links, "K": modes, "G": nodes, "B": bodies, "R": reduced}
     return whole | {"N+1": links + 1, "G+1": nodes + 1}
 
 
@@ -42,12 +43,15 @@ def roomy(data):
         _capacity(data.s.shape[1], (16, 60)),
         _capacity(data.nodes, (92,)),
         _capacity(data.body_x.size, (4,)),
+        _capacity(len(data.red_tip), (1,)),
     )
 
 
 def work_space(data, dtype=float, sizes=None):
     """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
-    sizes = sizes or _sizes(data.links, data.s.shape[1], data.nodes, data.body_x.size)
+    sizes = sizes or _sizes(
+        data.links, data.s.shape[1], data.nodes, data.body_x.size, len(data.red_tip)
+    )
     return kernel.Work(
         **{name: np.zeros(_shape(spec, sizes), dtype) for name, spec in kernel.WORK.items()}
     )
@@ -139,6 +143,10 @@ def _body(body):
 def _straight(link, joint):
     """A link's undeformed beam with its hub and the motor at its base, in its base frame."""
     a = np.asarray(joint.axis)
+    if link.reduced is not None:
+        r = link.reduced
+        inertia = r["inertia"] + joint.hub_inertia * np.outer(a, a)
+        return Load(joint.motor_mass + link.mass, r["first_moment"], inertia)
     mass, first, second, polar = link.moments()
     return Load(
         joint.motor_mass + mass,
@@ -152,7 +160,7 @@ def outboard(arm):
     loads = [_payload(arm)]
     for link, joint in list(zip(arm.links, arm.joints, strict=True))[:0:-1]:
         rotor = Load(0.0, np.zeros(3), joint.rotor_inertia * np.outer(joint.axis, joint.axis))
-        whole = loads[0].moved(np.eye(3), np.array([link.length, 0.0, 0.0]))
+        whole = loads[0].moved(np.eye(3), link.tip)
         for body in link.bodies:
             whole += _body(body).moved(np.eye(3), np.array([body.position, 0.0, 0.0]))
         motor = Load(joint.motor_mass, np.zeros(3), np.zeros((3, 3)))
@@ -173,6 +181,9 @@ def shapes_of(link, direction, flexibility, load):
     `flexibility` is the arm file's for that direction: kind of shape and number of modes.
     """
     L, rho, modes = link.length, link.mass_per_length, flexibility.modes
+    if link.reduced is not None:
+        moment = np.zeros(3) if load.averaged else load.moment
+        return Shapes(link.reduced.loaded(load.mass, moment, load.inertia, modes))
     if link.pieces or (link.bodies and flexibility.shape != "from_frequencies"):
         return _varied_shapes(link, direction, flexibility, load)
     if direction == "twist":
@@ -317,7 +328,8 @@ def assemble(arm, shapes, loads):
         level = kernel.FORESHORTENING
     if arm.finite_slope:
         level = kernel.FINITE_SLOPE
-    most = max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
+    beams = [link for link in arm.links if link.reduced is None]
+    most = max((f.modes for link in beams for f in link.flexible.values()), default=0)
     counts = [1] * N
     if level != kernel.FIRST_ORDER and most:
         counts = [node_count(link, most, level) for link in arm.links]
@@ -326,7 +338,7 @@ def assemble(arm, shapes, loads):
         for c, link in zip(counts, arm.links, strict=True)
     )
     bodies = [(i, body) for i, link in enumerate(arm.links) for body in link.bodies]
-    B = max(1, len(bodies))
+    B, reduced = max(1, len(bodies)), [i for i, link in enumerate(arm.links) if link.reduced]
     z = np.zeros
     a = {
         "links": N,
@@ -353,6 +365,8 @@ def assemble(arm, shapes, loads):
         "cumulate": z((N, G, G + 1)), "bishop": z((N, K, K)),
         "root": np.array([link.root for link in arm.links]), "root_mass": z(N),
         "rooted": np.array([any(link.root) for link in arm.links], np.int64),
+        "reduced": np.array([reduced.index(i) if i in reduced else -1 for i in range(N)], np.int64),
+        **_reduced_constants([_matrices(arm.links[i], shapes) for i in reduced], K, level),
         "bodies": len(bodies), "host": np.full(B, -1, np.int64), "body_node": np.zeros(B, np.int64),
         "body_x": z(B), "body_tip": z((B, K)), "body_slope": z((B, K)), "body_bishop": z((B, K, K)),
         "body_mass": z(B), "body_moment": z((B, 3)), "body_inertia": z((B, 3, 3)),
@@ -362,6 +376,10 @@ def assemble(arm, shapes, loads):
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
         L = link.length
         body = _straight(link, joint)
+        if link.reduced is not None:
+            a["mass"][i], a["inertia"][i], a["root_mass"][i] = body.mass, body.inertia, link.mass
+            _fill_reduced(a, i, link, _matrices(link, shapes), loads[i])
+            continue
         a["mass"][i] = body.mass + link.total_mass - link.mass
         a["moment"][i], a["inertia"][i], a["root_mass"][i] = body.moment[0], body.inertia, link.mass
         nodes = nodes_of(link, counts[i], G)
@@ -408,6 +426,49 @@ def assemble(arm, shapes, loads):
             weights = data.cumulate[i, :, data.body_node[b]]
             data.body_bishop[b] = bishop_integrals(data, i, weights)
     return data
+
+
+#: Constants of reduced links by the names of their arrays; the second order stays out at the first.
+_REDUCED = {
+    "red_C": "translation", "red_l": "rotation", "red_H": "first", "red_G": "second",
+    "red_T": "tip_translation", "red_R": "tip_rotation",
+}  # fmt: skip
+_SECOND_ORDER = {
+    "red_C2": "second_translation", "red_H2": "second_first", "red_T2": "second_tip", "red_R2": "second_twist",
+}  # fmt: skip
+
+
+def _matrices(link, shapes):
+    """The reduced matrices of a link in the modes that the arm has."""
+    return shapes[link.name, REDUCED].reduced
+
+
+def _reduced_constants(links, K, level):
+    """The shape integrals of reduced links, in arrays for K modes."""
+    sizes = {"R": len(links), "K": K}
+    names = ("red_first", "red_tip", *_REDUCED, *_SECOND_ORDER)
+    out = {name: np.zeros(_shape(kernel.DATA[name], sizes)) for name in names}
+    for r, matrices in enumerate(links):
+        out["red_first"][r], out["red_tip"][r] = matrices["first_moment"], matrices["tip"]
+        known = _REDUCED if level == kernel.FIRST_ORDER else _REDUCED | _SECOND_ORDER
+        for name, source in known.items():
+            value = matrices.get(source) if source in _SECOND_ORDER.values() else matrices[source]
+            out[name][(r, *(slice(n) for n in value.shape))] = value
+    return out
+
+
+def _fill_reduced(a, i, link, r, load):
+    """Modal mass, stiffness and damping of a link given by reduced matrices r."""
+    m = slice(r.modes)
+    a["direction"][i, m] = kernel.REDUCED
+    a["gram"][i, m, m], a["stiffness"][i, m, m] = r["modal_mass"], r["modal_stiffness"]
+    if "modal_damping" in r.arrays:
+        a["damping"][i, m, m] = r["modal_damping"]
+        return
+    moment = np.zeros(3) if load.averaged else load.moment
+    carried = r.carrying(load.mass, moment, load.inertia)
+    ratios = link.flexible[REDUCED].damping
+    a["damping"][i, m, m] = damping_matrix(carried, r["modal_stiffness"], ratios)
 
 
 def _fill_bodies(a, i, link, modes, nodes, bodies):

@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arm.description import scaled
+from ..arm.description import REDUCED, scaled
 from ..errors import ModelError, check_shape
 from ..kernels import chain as plain
 from ..kernels import generated, integrators, load, straight_arm
@@ -484,6 +484,8 @@ class Chain(ArmModel):
         xi = position / link.length
         tip, slope, length = d.tip.copy(), d.slope.copy(), d.length.copy()
         length[index] = position
+        if link.reduced is not None:
+            return self._cut_reduced(index, position)
         for j, (shapes, number, direction) in enumerate(modes_of(link, self._shapes)):
             tip[index, j] = 0.0 if direction == "twist" else shapes(xi)[number]
             slope[index, j] = shapes(xi, 0 if direction == "twist" else 1)[number] / (
@@ -491,6 +493,21 @@ class Chain(ArmModel):
             )
         piece = d._replace(links=index + 1, tip=tip, slope=slope, length=length)
         return piece if d.level == plain.FIRST_ORDER else self._with_nodes_up_to(piece, index, xi)
+
+    def _cut_reduced(self, index, position):
+        """The same of a link given by reduced matrices, between whose stations sections are linear."""
+        d, link = self.data, self.arm.links[index]
+        r, part = d.reduced[index], position / link.length
+        translation, rotation = self._shapes[link.name, REDUCED].at(part * link.tip[0])
+        place, T, R = d.red_tip.copy(), d.red_T.copy(), d.red_R.copy()
+        T2, R2 = d.red_T2.copy(), d.red_R2.copy()
+        place[r], m = part * link.tip, slice(len(translation))
+        T[r, m], R[r, m] = translation, rotation
+        if (
+            part < 1.0
+        ):  # the archive has the second order of the tip alone: in proportion, for pictures
+            T2[r], R2[r] = part * T2[r], part * R2[r]
+        return d._replace(links=index + 1, red_tip=place, red_T=T, red_R=R, red_T2=T2, red_R2=R2)
 
     def _with_nodes_up_to(self, data, index, xi):
         """The data with the nodes of link `index` between its base and `xi`, for the kinematics of that section."""
@@ -525,6 +542,12 @@ class Chain(ArmModel):
         i = len(names) - 1 if link is None else names.index(link)
         d = self.data
         out = np.zeros(2)
+        if d.reduced[i] >= 0:
+            r, m = d.reduced[i], int(d.count[i])
+            own = delta[d.first[i] : d.first[i] + m]
+            return (d.red_T[r, :m, 1:].T @ own) + 0.5 * np.einsum(
+                "jka,j,k->a", d.red_T2[r, :m, :m, 1:], own, own
+            )
         for j in range(d.count[i]):
             if d.direction[i, j] != plain.TWIST:
                 out[d.direction[i, j] - 1] += d.tip[i, j] * delta[d.first[i] + j]

@@ -113,6 +113,8 @@ def simulated(arm, level=AUTO, drive=None):
     """
     if level != AUTO:
         return at_level(arm, level)
+    if arm.model == "chain" and any(link.reduced and link.reduced.stiffens for link in arm.links):
+        arm = arm if arm.finite_slope else replace(arm, foreshortening=True)
     if arm.model != "chain" or arm.finite_slope or not _bends(arm):
         return arm
     first, stiffening = neglected(arm, drive)

@@ -262,7 +262,8 @@ def _check_planar(arm):
     for field, value, fits, limit in (
         ("links", [link.name for link in arm.links], len(arm.links) == 1, "one link"),
         (f"flexible of {link.name}", list(link.flexible), set(link.flexible) == {"y"}, "y alone"),
-        (f"sections of {link.name}", len(link.pieces), not link.pieces, "a uniform link"),
+        (f"sections of {link.name}", len(link.pieces), link.uniform, "a uniform link"),
+        (f"bodies of {link.name}", len(link.bodies), not link.bodies, "none"),
         (
             f"axis of {joint.name}",
             list(joint.axis),

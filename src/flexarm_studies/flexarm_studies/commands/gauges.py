@@ -23,7 +23,7 @@ import numpy as np
 
 from flexarm_control.observers.gauge_health import resolution
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import Gauge
+from flexarm_dynamics.arm.description import REDUCED, Gauge
 from flexarm_dynamics.arm.strain_map import StrainMap, confused, gauge_rows, reading_noise
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
@@ -98,6 +98,8 @@ def study(arm_model, observed, count=None, criterion="A"):
         raise FlexarmError(f"of {arm.name} are none: it is rigid", field="modes to observe")
     places = []
     for key in dict.fromkeys((m.link, m.direction) for m in arm.modes if m.name in observed):
+        if key[1] == REDUCED:  # its archive names the points; there are no others to choose
+            continue
         names = [m.name for m in arm.modes if (m.link, m.direction) == key and m.name in observed]
         present = [g for g in arm.gauges if (g.link, g.direction) == key]
         wanted = max(len(present), len(names)) if count is None else count
@@ -109,6 +111,9 @@ def study(arm_model, observed, count=None, criterion="A"):
             problem = "gauges are more than there are positions"
             raise FlexarmError(problem, field="--count", value=wanted, limit=GRID)
         places.append(_place(arm_model, key, names, present, wanted, criterion))
+    if not places:
+        problem, hint = "are at the points that archives name", "flexarm show has their condition"
+        raise FlexarmError(problem, field=f"gauges of {arm.name}", hint=hint)
     return {"arm": arm.name, "criterion": criterion, "places": places}
 
 

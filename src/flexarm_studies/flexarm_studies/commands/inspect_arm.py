@@ -176,6 +176,7 @@ def describe(arm_model, q):
         },
         "gauges": [
             {"name": g.name, "link": g.link, "position": g.position, "direction": g.direction}
+            | ({"point": g.point} if g.point else {})
             for g in arm.gauges
         ],
     }
@@ -267,6 +268,8 @@ def text(d):
     for link in d["links"]:
         flexible = ", ".join(
             f"{k}: {v['modes']} {v['shape']}, {'GJ' if k == 'twist' else 'EI'} {link['stiffness'][k]:.4g} N m^2"
+            if k in link["stiffness"]
+            else f"{v['modes']} modes of reduced matrices"
             for k, v in link["flexible"].items()
         )
         yield f"{link['name']:18}{link['length']:10.4g}{link['mass']:10.4g}  {flexible or 'rigid'}"
@@ -294,7 +297,8 @@ def text(d):
     if d["gauges"]:
         yield "gauges"
         for g in d["gauges"]:
-            yield f"  {g['name']:18}{g['link']} at {g['position']:.4g} m, {g['direction']}"
+            where = f"{g['position']:.4g} m, {g['direction']}"
+            yield f"  {g['name']:18}{g['link']} at {g.get('point', where)}"
     if d["strain_map_condition"] is not None:
         yield f"  condition number of the strain map {d['strain_map_condition']:.3g}"
     for w in d["warnings"]:

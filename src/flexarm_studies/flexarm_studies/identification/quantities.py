@@ -72,7 +72,7 @@ def quantities(arm, recording):
     for i, link in enumerate(arm.links):
         for direction, flexibility in link.flexible.items():
             at = f"links[{i}]"
-            if not link.pieces:  # the file gives sections in the place of a stiffness
+            if link.uniform:  # the file gives sections in the place of a stiffness
                 name = f"{at}.{KEY[direction]}"
                 found.append(quantity(arm, name, "EI", (i, direction), "N m^2", "stiffness", 1e-6))
             for k in range(flexibility.modes):

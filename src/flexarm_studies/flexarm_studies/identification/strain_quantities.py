@@ -97,11 +97,11 @@ def strain_quantities(arm, recording):
             Quantity(f"{joint.name} offset", "offset", (i,), "rad", "none", OFFSET, -np.inf)
         )
     for i, link in enumerate(arm.links):
-        if not link.pieces:  # the file gives sections in their place
+        if link.uniform:  # the file gives sections in their place
             name = f"links[{i}].mass_per_length"
             add(name, "mass_per_length", (i,), "kg/m", "mass_per_length", 1e-3)
         for direction, flexibility in link.flexible.items():
-            if not link.pieces:
+            if link.uniform:
                 name = f"links[{i}].{KEY[direction]}"
                 add(name, "EI", (i, direction), "N m^2", "stiffness", 1e-6)
             for k in range(len(damping_of(flexibility))):
