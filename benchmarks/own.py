@@ -45,7 +45,7 @@ class Flexarm(Peer):
     method : str
         Of `flexarm_sim.integrators.METHODS`.
     foreshortening : bool
-        As in an arm file; there is no generated code with it.
+        As in an arm file.
     """
 
     name = "flexarm"
