@@ -23,6 +23,7 @@ from flexarm_control.nodes.controller import ControllerNode
 from flexarm_control.nodes.observer import ObserverNode
 from flexarm_control.nodes.shaper import ShaperNode
 from flexarm_ros.session import WaitError
+from flexarm_sim.nodes.hardware import HardwareNode
 from flexarm_sim.nodes.simulator import SimulatorNode
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 from flexarm_tools.recording.recorder import Recorder, raw_stamp_ns
@@ -31,6 +32,7 @@ from flexarm_tools.running.processes import arguments, own_domain
 
 CLASSES = {
     "simulator": SimulatorNode,
+    "hardware": HardwareNode,
     "observer": ObserverNode,
     "controller": ControllerNode,
     "replay": ReplayNode,

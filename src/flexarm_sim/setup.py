@@ -19,6 +19,7 @@ setup(
     entry_points={
         "console_scripts": [
             "simulator = flexarm_sim.nodes:start_simulator",
+            "hardware = flexarm_sim.nodes:start_hardware",
         ],
     },
 )

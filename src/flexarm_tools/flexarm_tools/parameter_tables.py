@@ -12,13 +12,15 @@ def groups():
     """Node name to its declared parameters by prefix."""
     from flexarm_control.nodes import controller, excite, goals, observer, shaper
     from flexarm_ros.node import ARM, COMMON
-    from flexarm_sim import simulator
+    from flexarm_sim import position_loop, simulator
+    from flexarm_sim.nodes import hardware
     from flexarm_sim.nodes import simulator as simulator_node
 
     from .replay import node as replay
 
     given = {
         "simulator": {"": (*simulator.PARAMETERS, *simulator_node.PARAMETERS)},
+        "hardware": {"": (*position_loop.PARAMETERS, *hardware.OWN)},
         "observer": observer.parameter_groups(),
         "controller": controller.parameter_groups(),
         "goals": {"": (ARM, *goals.PARAMETERS)},

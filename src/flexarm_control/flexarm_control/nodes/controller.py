@@ -27,6 +27,7 @@ from . import controller_parameters
 from .controller_designs import Designs
 from .controller_report import Report
 from .trajectory_inbox import TrajectoryInbox
+from .trajectory_state import TrajectoryState
 
 #: Timeout for delivering the final DISABLED message.
 LAST_MESSAGE_TIMEOUT = Duration(seconds=0.2)
@@ -110,6 +111,7 @@ class ControllerNode(ArmNode):
         self.make_service(Trigger, "~/recover", self._on_recover)
         self.make_service(SetBool, "~/enable_fast", self._on_enable_fast)
         self.make_timer(self.parameters["state_timeout"] / 5.0, self._watch)
+        TrajectoryState(self, self.core, self._sample)
 
     # Control path ----------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from ..composite.design import PARAMETERS as DESIGN
 from ..loop.arm_controller import PARAMETERS as CONTROLLER
 from ..loop.arm_controller import START_TOLERANCE
 from ..robust import default
+from .trajectory_state import STATE_PUBLISH_RATE
 
 STATE_TIMEOUT = parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
     "Without a state for so long the torque is disabled: a fault."
@@ -27,7 +28,7 @@ def groups():
     """Declared parameters of the controller node, by prefix."""
     return {
         "": (
-            *(ARM, *CONTROLLER, START_TOLERANCE, STATE_TIMEOUT, DESIGN_PROCESS),
+            *(ARM, *CONTROLLER, START_TOLERANCE, STATE_TIMEOUT, STATE_PUBLISH_RATE, DESIGN_PROCESS),
             *(*DESIGN, *default.PARAMETERS),
         ),
         **{f"{name}.": assembly.declarations(name) for name in assembly.CONTROL},

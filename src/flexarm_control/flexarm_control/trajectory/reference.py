@@ -289,6 +289,14 @@ class ReferenceGenerator:
         return self._last_ns
 
     @property
+    def rate(self):
+        """How fast the time of trajectories goes at the last stamp [-]: on its way to `speed_scaling`."""
+        path = self._path
+        if path is not None and path.scaled and path.trajectory_id and self.active:
+            return path.law.at(self._last_ns)[1]
+        return self.speed_scaling
+
+    @property
     def resting(self):
         """State (3, n) of a reference that will not move until a new trajectory comes; None while it will."""
         if self.pending or self.active or self.stopping or self._last_ns is None:

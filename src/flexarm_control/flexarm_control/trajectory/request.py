@@ -129,7 +129,7 @@ def validate(
     trajectory = JointTrajectoryData(stamp_ns, arm_joint_names, times_ns, *fields, effort=effort)
     _check_limits(trajectory, position_low, position_high, velocity_max)
     if fields[1] is None:
-        return _smoothed(trajectory, streaming.smoothing)
+        return _smoothed(trajectory, streaming)
     if not streaming.moving_end:
         _refuse_end_velocity(trajectory)
     elif (np.abs(fields[1][-1]) > END_VELOCITY_TOLERANCE).any():
@@ -152,11 +152,11 @@ def _effort(column, arm_joint_names, order, treatment):
     return None
 
 
-def _smoothed(trajectory, window):
-    """A trajectory of positions alone, smoothed over a window [s] where they are near."""
-    if not window or not are_near(trajectory.times_ns, window):
+def _smoothed(trajectory, streaming):
+    """A trajectory of positions alone, smoothed as `streaming` asks for where they are near."""
+    if not streaming.smoothing or not are_near(trajectory.times_ns, streaming.smoothing):
         return trajectory
-    times_ns, fields = smoothed(trajectory.times_ns, trajectory.positions, window)
+    times_ns, fields = smoothed(trajectory.times_ns, trajectory.positions, streaming.window)
     effort = trajectory.effort
     if effort is not None:
         before = np.clip(times_ns, *trajectory.times_ns[[0, -1]])

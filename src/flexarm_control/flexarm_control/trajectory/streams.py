@@ -18,6 +18,7 @@ W to each other, the straight lines L are smoothed by a triangle of that width,
 
 with its velocity and acceleration, the same differences of F' and of L. The end is reached, at rest, W/2 later. A
 single point is reached at rest after W, if its time is shorter: sent again and again it makes a filter of third order.
+W is at least half a period of the lowest bending mode.
 """
 
 from dataclasses import dataclass
@@ -39,8 +40,8 @@ PARAMETERS = (
         "How long a motion goes on after a last point with a velocity. 0.0: it comes to rest from that point on."
     ),
     parameter("smoothing_time", 0.1, "s", 0.0, 10.0).described(
-        "Positions alone that are nearer to each other than this are smoothed over this time. 0.0: straight lines,"
-        " whose velocity steps at each point."
+        "Positions alone that are nearer to each other than this are smoothed over this time, and at least half a"
+        " period of the lowest bending mode. 0.0: straight lines, whose velocity steps at each point."
     ),
     parameter("effort_in_points", REFUSE, choices=(REFUSE, IGNORE, ADD)).described(
         "What becomes of effort in points: refuse; ignore; add: it is added to the torque, which has all that the arm's"
@@ -51,6 +52,8 @@ PARAMETERS = (
 BRAKE_SLOPE = 15.0 / 8.0
 #: The brake takes at least so many periods of the lowest bending mode.
 BRAKE_PERIODS = 1.2
+#: The window of smoothing has at least so many of them.
+SMOOTH_PERIODS = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Streaming:
     period : float
         Of the lowest bending mode [s].
     smoothing : float
-        W [s]; 0: none.
+        Points that are nearer to each other are smoothed [s]; 0: none.
     effort : str
         One of `REFUSE`, `IGNORE` and `ADD`.
     """
@@ -79,6 +82,11 @@ class Streaming:
     period: float = 0.0
     smoothing: float = 0.0
     effort: str = REFUSE
+
+    @property
+    def window(self):
+        """W [s]: a slow manifold along a faster motion would not hold."""
+        return max(self.smoothing, SMOOTH_PERIODS * self.period)
 
     def coast(self, velocity):
         """The `Coast` after a last point with a velocity (n,) [rad/s]."""
