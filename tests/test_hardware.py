@@ -12,7 +12,7 @@ from std_msgs.msg import Float64MultiArray
 
 from flexarm_control.motions import profiles
 
-#: What the interface is told in its URDF, and the node here.
+#: As the interface has them in its URDF, and the node here.
 COMMANDS, STATES = "robot_joint_commands", "robot_joint_states"
 
 

@@ -145,7 +145,7 @@ def test_a_trajectory_of_thousands_of_points_is_followed(arm):
     t = np.arange(1, 2001) * 1e-4
     s = np.sin(np.pi * t)
     number = arm.offer(trajectory(J, *((at, [0.1 * x]) for at, x in zip(t, s, strict=True))))
-    samples = arm.run(0.3)
+    samples = arm.run(0.5)  # near positions are smoothed, and end later
     assert arm.state.accepted_trajectory_id == number
     assert arm.state.reference_position[0] == 0.1 * s[-1]
     assert len(samples) > 250
