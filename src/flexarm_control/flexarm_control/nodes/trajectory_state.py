@@ -59,13 +59,27 @@ class TrajectoryState:
     def __init__(self, node, core, sample):
         self._node, self._core, self._sample = node, core, sample
         self._publishers = [
-            (kind, node.make_publisher(kind, f"controller/{name}", qos.COMMAND))
+            (
+                kind,
+                node.make_publisher(
+                    kind,
+                    f"controller/{name}",
+                    qos.COMMAND,
+                    qos_overriding_options=qos.overridable(),
+                ),
+            )
             for kind, name in states()
         ]
         for kind, name in queries():
             node.make_service(kind, f"~/{name}", self._answer)
         if (kind := _theirs("msg", "SpeedScalingFactor")) is not None:
-            node.make_subscription(kind, "controller/speed_scaling_input", self._scale, qos.COMMAND)
+            node.make_subscription(
+                kind,
+                "controller/speed_scaling_input",
+                self._scale,
+                qos.COMMAND,
+                qos_overriding_options=qos.overridable(),
+            )
         node.make_timer(1.0 / node.parameters["state_publish_rate"], self._publish)
 
     def _publish(self):

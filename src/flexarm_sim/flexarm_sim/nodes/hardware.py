@@ -62,11 +62,20 @@ class HardwareNode(ArmNode):
         self._samples = max(round(1.0 / (parameters["command_rate"] * period)), 1)
         self._writer, self._refused, self._commands, self._counted = StateWriter(self.arm), 0, 0, 0
         self._states = self.make_publisher(
-            JointState, parameters["joint_states_topic"], qos.COMMAND
+            JointState,
+            parameters["joint_states_topic"],
+            qos.COMMAND,
+            qos_overriding_options=qos.overridable(),
         )
-        self._strains = self.make_publisher(Float64MultiArray, "strain", qos.COMMAND)
+        self._strains = self.make_publisher(
+            Float64MultiArray, "strain", qos.COMMAND, qos_overriding_options=qos.overridable()
+        )
         self.make_subscription(
-            JointState, parameters["joint_commands_topic"], self._on_command, qos.COMMAND
+            JointState,
+            parameters["joint_commands_topic"],
+            self._on_command,
+            qos.COMMAND,
+            qos_overriding_options=qos.overridable(),
         )
         if not parameters["lockstep"]:
             self.make_timer(self._samples * period, self._on_period)
