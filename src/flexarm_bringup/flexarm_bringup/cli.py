@@ -6,6 +6,7 @@ quick and commands that need no ROS work without it.
 """
 
 import argparse
+import difflib
 import importlib
 import os
 import re
@@ -241,6 +242,15 @@ def parser(only=None):
     return top
 
 
+def refuse_unknown(name):
+    """End with wrong usage where a command is none, and name the one that may be meant."""
+    if not name or name.startswith("-") or name in COMMANDS:
+        return
+    near = difflib.get_close_matches(name, COMMANDS, 1)
+    hint = f"did you mean {near[0]}?" if near else "flexarm --help lists the commands"
+    parser(only=name).error(f"{name!r} is no command; {hint}")
+
+
 #: Options whose value may begin with a minus.
 ANGLES = ("--at", "--initial", "--to", "--from", "--tip", "--via")
 
@@ -271,7 +281,8 @@ def main(argv=None):
     # As Ctrl-C: what was started is stopped on the way out.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
-        # An unknown command or --help needs no command's arguments.
+        refuse_unknown(name)
+        # --help needs no command's arguments.
         options = parser(only=name).parse_args(words)
         code = options.function(options)
     except BrokenPipeError:  # the reader has enough, as `head` does

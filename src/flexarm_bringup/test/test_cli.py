@@ -105,3 +105,10 @@ def test_a_reader_that_has_enough_is_no_error():
     assert process.stderr.read() == b""
     assert process.wait() == 141
     process.stderr.close()
+
+
+def test_a_command_that_there_is_not_is_named_with_the_one_that_may_be_meant(flexarm):
+    code, _, err = flexarm("simulat", "R")
+    assert code == 2
+    assert "'simulat' is no command; did you mean simulate?" in err
+    assert "flexarm --help lists the commands" in flexarm("xyzzy")[2]
