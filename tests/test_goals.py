@@ -260,3 +260,23 @@ def test_where_control_msgs_is_installed_its_action_is_served_too(tmp_path, monk
         status, result = client.follow(trajectory((0.5, 0.01)))
         assert (status, result.error_code) == (GoalStatus.STATUS_SUCCEEDED, R.SUCCESSFUL)
         client.client.destroy()
+
+
+@pytest.mark.parametrize(
+    ("killed", "text"),
+    [("controller", "no controller/state for 2 s"), ("simulator", "no arm_state_estimate for 1 s")],
+)
+def test_a_goal_whose_loop_is_killed_has_a_result(tmp_path, killed, text):
+    with Bench(tmp_path) as bench:
+        bench.start_loop(controller={"state_timeout": 1.0}, **LINE)
+        bench.start("goals", {"arm": "R", "state_timeout": 2.0})
+        arm = Arm(bench)
+        arm.wait_ready()
+        client = Client(bench)
+        handle, _ = client.send(trajectory((60.0, 0.8)))
+        bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+        bench.kill(killed)
+        status, result = client.result(handle)
+        assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED)
+        assert text in result.error_string
+        client.client.destroy()
