@@ -18,8 +18,9 @@ from flexarm_ros.messages import set_stamp
 
 R = Follow.Result
 LINE = {"arm": "R", "lockstep": True, "pause_at": -1.0, "rate": 500.0, "design_process": False}
-#: Random goals; FLEXARM_GOALS=100 for more.
+#: Random goals; FLEXARM_GOALS=100 for more, FLEXARM_SEED for others.
 SENT = int(os.environ.get("FLEXARM_GOALS", "10"))
+SEED = int(os.environ.get("FLEXARM_SEED", "0"))
 
 
 def trajectory(*points, joints=("joint1",), stamp_ns=0):
@@ -208,30 +209,114 @@ def test_a_stop_and_a_fault_abort_with_the_controllers_own_reason(line):
     assert "restarted during a motion" in result.error_string
 
 
-def test_random_goals_cancelled_and_replaced_always_have_a_result(line):
-    """Each with the status that its fate has; none is left, and the arm can go on."""
-    home(line)
-    bench, arm, client = line
-    rng = np.random.default_rng(0)
-    sent = []
-    for k in range(SENT):
-        fate = rng.choice(["wait", "cancel", "replace"])
-        handle, _ = client.send(trajectory((rng.uniform(0.5, 2.0), rng.uniform(-0.5, 0.5))))
-        wanted = arm.now + round(rng.uniform(0.0, 0.5) * 1e9)
-        bench.wait_for("a while", lambda wanted=wanted: arm.now > wanted)
-        if fate == "cancel":
-            handle.cancel_goal_async()
-        status = client.result(handle)[0] if fate != "replace" or k == SENT - 1 else None
-        sent.append((handle, fate, status))
-    for handle, fate, status in sent:
-        status = status or client.result(handle)[0]
-        allowed = {
-            "wait": {GoalStatus.STATUS_SUCCEEDED},
-            "cancel": {GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_SUCCEEDED},
-            "replace": {GoalStatus.STATUS_ABORTED, GoalStatus.STATUS_SUCCEEDED},
-        }[fate]
-        assert status in allowed, fate
-    home(line)
+#: What becomes of a random goal: how often, and the status and code that it may end with besides its success.
+FATES = {
+    "wait": (4, ()),
+    "cancel": (4, ((GoalStatus.STATUS_CANCELED, R.SUCCESSFUL),)),
+    "replace": (4, ((GoalStatus.STATUS_ABORTED, R.INVALID_GOAL),)),
+    "path tolerance": (2, ((GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED),)),
+    "tip tolerance": (2, ((GoalStatus.STATUS_ABORTED, R.GOAL_TOLERANCE_VIOLATED),)),
+    "stop": (2, ((GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED),)),
+    "kill": (1, ((GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED),)),
+}
+#: These can't succeed: no arm is within such a tolerance.
+NEVER = ("path tolerance", "tip tolerance")
+
+
+def random_goal(rng, position, fate):
+    """A motion within the arm's torque from where it is about to be, and its tolerances."""
+    to = position + rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.4)
+    to = to if abs(to) < 0.8 else to - 2.0 * np.sign(to) * 0.4
+    fields = {}
+    if fate == "path tolerance":
+        fields["path_tolerance"] = [JointTolerance(name="joint1", position=1e-6)]
+    if fate == "tip tolerance":
+        second = Follow.Goal().goal_time_tolerance
+        second.nanosec = 300_000_000
+        fields = {"tip_tolerance": 1e-12, "goal_time_tolerance": second}
+    return trajectory((rng.uniform(1.0, 2.0), to)), fields
+
+
+def meet(bench, arm, handle, fate, name):
+    """What happens to a goal in the middle of its motion."""
+    if fate == "cancel":
+        handle.cancel_goal_async()
+    elif fate == "stop":
+        assert bench.call(Trigger, "controller/stop").success
+    elif fate == "kill":
+        bench.kill(name)
+
+
+def restart(bench, arm, name):
+    """Start a killed node again, and get the torque back."""
+    bench.start(name, LIVES[name])
+    seen = len(arm.states.messages)
+
+    def back():
+        if len(arm.states.messages) <= seen:
+            return False
+        return arm.ready() or arm.recover() and False
+
+    bench.wait_for("the loop", back)
+    arm.wait_ready()
+
+
+#: Short patience: killed nodes are noticed soon, in the wall clock's time.
+LIVES = {
+    "simulator": LINE,
+    "observer": LINE,
+    "controller": {**LINE, "state_timeout": 1.0},
+}
+
+
+def test_random_goals_with_cancel_preemption_tolerances_and_kills_always_have_the_right_result(
+    tmp_path,
+):
+    """Each ends with the status and the code of its fate; none is left, and the arm can go on."""
+    rng = np.random.default_rng(SEED)
+    names, weights = list(FATES), np.array([often for often, _ in FATES.values()], float)
+    # One of each, whatever their number; then at random.
+    fates = [*names, *rng.choice(names, max(SENT - len(names), 0), p=weights / weights.sum())]
+    with Bench(tmp_path) as bench:
+        for name, values in LIVES.items():
+            bench.start(name, values)
+        bench.start("goals", {"arm": "R", "state_timeout": 2.0})
+        arm = Arm(bench)
+        arm.wait_ready()
+        client, waiting, counts = Client(bench), [], {}
+
+        def judge(handle, fate):
+            status, result = client.result(handle)
+            allowed = (
+                FATES[fate][1]
+                if fate in NEVER
+                else ((GoalStatus.STATUS_SUCCEEDED, R.SUCCESSFUL), *FATES[fate][1])
+            )
+            told = f"{fate}: {status}, {result.error_code}: {result.error_string}"
+            assert (status, result.error_code) in allowed, told
+            counts[fate, status] = counts.get((fate, status), 0) + 1
+
+        for fate in fates:
+            message, fields = random_goal(rng, arm.state.reference_position[0], fate)
+            handle, _ = client.send(message, **fields)
+            assert handle.accepted
+            wanted = arm.now + round(rng.uniform(0.0, 0.6) * 1e9)
+            bench.wait_for("a while", lambda wanted=wanted: arm.now > wanted)
+            for before in waiting:  # replaced by now
+                judge(*before)
+            waiting = [(handle, fate)]
+            killed = str(rng.choice(list(LIVES)))
+            meet(bench, arm, handle, fate, killed)
+            if fate != "replace":
+                judge(*waiting.pop())
+            if fate == "kill":
+                restart(bench, arm, killed)
+        for last in waiting:
+            judge(*last)
+        print(counts)
+        assert sum(counts.values()) == len(fates)
+        assert client.follow(trajectory((2.0, 0.0)))[1].error_code == R.SUCCESSFUL
+        client.client.destroy()
 
 
 def test_without_a_controller_a_goal_is_aborted(tmp_path):
