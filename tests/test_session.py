@@ -126,9 +126,11 @@ def set_and_designed(s):
     before = s.get("controller", "fast.alpha")
     assert all(r.successful for r in s.set("controller", slow__kp=9.0))  # one value for all
     s.until("the gain", lambda: re.search(r"slow\.kp .*: active", s.last_set()))
+    s.until("it in the state", lambda: s.arm.state.parameters_set == s.last_set())
     assert s.get("controller", "slow.kp") == 9.0
     assert all(r.successful for r in s.set("controller", fast__alpha=400.0))
     s.until("the design", lambda: re.search(r"fast\.alpha 400.0 .*: refused: ", s.last_set()))
+    s.until("it in the state", lambda: ": refused: " in s.arm.state.parameters_set)
     assert s.get("controller", "fast.alpha") == before
     assert "design refused, the old law goes on" in s.log("controller")
     assert re.search(r"slow\.kp .*: active", s.log("controller"))

@@ -259,8 +259,8 @@ class CompositeStateWriter:
             )
         }
 
-    def fill(self, sample, controller, compute_time):
-        """Copy what the controller holds; `compute_time` in seconds."""
+    def fill(self, sample, controller, compute_time, parameters_set=""):
+        """Copy what the controller holds; `compute_time` in seconds, `parameters_set` as `Designs.last_change`."""
         msg, a = self.message, self._arrays
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
@@ -272,6 +272,7 @@ class CompositeStateWriter:
         msg.accepted_trajectory_id = controller.trajectory_id
         msg.judged_trajectory, msg.judged_reason = controller.judged
         msg.compute_time = float(compute_time)
+        msg.parameters_set = parameters_set
         return msg
 
 

@@ -698,6 +698,18 @@ def test_a_recording_from_before_states_had_a_trust_is_read(rates, padding):
         layout_of(old[: end - 9], kind)
 
 
+@pytest.mark.parametrize("padding", range(4))
+def test_a_recording_from_before_states_named_parameters_is_read(padding):
+    raw = bytes(serialize_message(CompositeState(sequence=7, compute_time=0.25)))
+    kind = "flexarm_msgs/msg/CompositeState"
+    end = layout_of(raw, kind).texts["parameters_set"][0] - 4
+    old = raw[:end] + bytes(padding)
+    layout = layout_of(old, kind)
+    assert "parameters_set" not in layout.texts
+    block = np.frombuffer(old, np.uint8)[None]
+    assert layout.column(block, "compute_time")[0] == 0.25
+
+
 def test_columns_are_what_the_middleware_reads():
     random = np.random.default_rng(1)
     messages = []

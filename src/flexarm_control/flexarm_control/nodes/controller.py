@@ -134,7 +134,7 @@ class ControllerNode(ArmNode):
         self._send(enabled)
         took = perf_counter() - started
         if self._state_pub.get_subscription_count():
-            self._state_pub.publish(self._state.fill(sample, core, took))
+            self._state_pub.publish(self._filled(took))
         self._report.answered(took)
         if enabled:
             core.answered_by.look_ahead()
@@ -160,11 +160,14 @@ class ControllerNode(ArmNode):
         self._torque.answer(self._sample, enabled, self.core.torque)
         self._torque_pub.publish(self._torque_bytes())
 
+    def _filled(self, took):
+        """controller/state as it is now; `took` [s]."""
+        return self._state.fill(self._sample, self.core, took, self._designs.last_change)
+
     def _answer_again(self):
         """Publish torque and controller/state as answers to the last state: they have changed since."""
-        sample, core = self._sample, self.core
-        self._send(core.enabled)
-        self._state_pub.publish(self._state.fill(sample, core, 0.0))
+        self._send(self.core.enabled)
+        self._state_pub.publish(self._filled(0.0))
         self._report.log_state()
 
     # Services --------------------------------------------------------------------------------

@@ -24,7 +24,10 @@ _CODES = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1",
 _CODES |= {"int16": "i2", "uint32": "u4", "int32": "i4", "float32": "f4", "uint64": "u8"}
 _CODES |= {"int64": "i8", "float64": "f8"}
 #: First of the fields that were added at a message's end, which older recordings lack, and the least of their bytes.
-_ADDED = {"flexarm_msgs/msg/ArmState": ("controller_id", 12)}
+_ADDED = {
+    "flexarm_msgs/msg/ArmState": ("controller_id", 12),
+    "flexarm_msgs/msg/CompositeState": ("parameters_set", 5),
+}
 #: A message with more numbers in an array than this is broken.
 MAX_COUNT = 100_000
 #: Layouts that are remembered for messages of one length: names may be in several orders.
