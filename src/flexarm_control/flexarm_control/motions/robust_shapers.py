@@ -24,6 +24,8 @@ from .shapers import Shaper, half_period
 IMPULSES, FREQUENCIES, DIRECTIONS = 65, 13, 16
 #: V at a mode's own frequency, over the largest V within its spread [-].
 AT_DESIGN = 0.3
+#: A linear programme is given up after this time [s]; it takes milliseconds.
+PATIENCE = 10.0
 #: Impulses below this fraction are left out [-].
 NEGLIGIBLE = 1e-6
 
@@ -66,7 +68,10 @@ def robust(frequencies, dampings, spread, periods) -> Shaper:
     cost = np.zeros(IMPULSES + 1)
     cost[-1] = 1.0
     total = np.append(np.ones(IMPULSES), 0.0)[None]
-    found = linprog(cost, bound, np.zeros(len(bound)), total, [1.0], method="highs")
+    found = linprog(
+        cost, bound, np.zeros(len(bound)), total, [1.0],
+        method="highs", options={"time_limit": PATIENCE},
+    )  # fmt: skip
     if not found.success:
         raise DesignError(f"not found: {found.message}", field="robust shaper")
     amplitudes = found.x[:-1]
