@@ -7,7 +7,7 @@ from pathlib import Path
 from .. import workers
 from ..progress import Progress
 from ..store import Store, gather
-from . import cases, figure, report, study
+from . import cases, figure, pushes, report, study
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ def add_arguments(parser):
     )
     add("--fresh", action="store_true", help="remove that file first: after a change of the code")
     add("--write", metavar="FILE.md", help="write the tables between the markers of this file")
+    add("--pushes", action="store_true", help="push one link, with damping by strain and without")
     add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
 
 
@@ -43,6 +44,12 @@ def vibration(options):
     """Run the sub-command."""
     if options.figure:
         print(figure.draw(options.figure, options.seed))
+        return
+    if options.pushes:
+        decays = [pushes.decay(payload, options.seed) for payload in pushes.PAYLOADS]
+        if options.write:
+            pushes.write(decays, options.write)
+        print(pushes.text(decays))
         return
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One link behind a position loop, pushed aside and released: how fast it comes to rest, damped by its strain and not.
+
+What the damping knows is measured on the same simulated arm, behind the same drives, with the payload that it has:
+frequency and damping from the ringing after a small motion, the answer to corrections from a burst of the command.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_control.shaping import strain_damping
+from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.models import model
+from flexarm_dynamics.parameters import check_all
+
+from ..markdown import table, write_between
+from . import cases
+from .position_arm import COMMAND_RATE, DRIVE_RATE, PositionArm
+from .study import measured
+
+BEGIN, END = "<!-- pushes: begin -->", "<!-- pushes: end -->"
+PERIOD = 1.0 / COMMAND_RATE
+#: Payloads, as multiples of the one that the drives know.
+PAYLOADS = (0.0, 1.0, 3.0)
+#: The push bends the link so far [m]; noise of the strain [-].
+PUSH, NOISE = 0.01, 1e-6
+#: Which way the small motion goes whose ringing is measured [rad].
+WAY = np.array([1.2])
+#: Amplitude of the burst [rad], and periods of ringing recorded with it.
+BURST, LISTEN = 0.01, 6.0
+#: Periods for which the release is watched, and fraction of the first swing at which it has decayed [-].
+WATCHED, DECAYED = 36.0, 0.1
+#: The damping is also made for frequencies that are off by this fraction, either way.
+OFF = strain_damping.MARGIN
+COLUMNS = (
+    "payload",
+    "frequency, Hz",
+    "damping, %",
+    "phase, degrees",
+    "without, s",
+    "with, s",
+    "faster",
+    "-15 %",
+    "+15 %",
+    "made for payload 1",
+    "largest correction, mrad",
+    "after a motion",
+)
+
+
+@dataclass(frozen=True)
+class Decay:
+    """How a push decayed.
+
+    Attributes
+    ----------
+    payload : float
+        Multiple of the payload that the drives know [-].
+    frequency, ratio : float
+        Measured, of the lowest mode [Hz], [-].
+    phase : float
+        Of its answer to corrections [rad].
+    without, damped : float
+        Time until the tip swings less than `DECAYED` of its first swing [s].
+    low, high : float
+        The same, damped for a frequency that is too low, or too high, by `OFF` [s].
+    other : float
+        The same, damped for the payload that the drives know [s].
+    largest : float
+        Correction [rad].
+    motion : float
+        Residual swing after the case's first motion, damped over not damped [-].
+    """
+
+    payload: float
+    frequency: float
+    ratio: float
+    phase: float
+    without: float
+    damped: float
+    low: float
+    high: float
+    other: float
+    largest: float
+    motion: float
+
+    def row(self):
+        """The values of `COLUMNS`."""
+        factors = (self.without / time for time in (self.damped, self.low, self.high, self.other))
+        angles = 100.0 * self.ratio, float(np.degrees(self.phase))
+        times = self.without, self.damped
+        rest = 1e3 * self.largest, self.motion
+        return (self.payload, self.frequency, *angles, *times, *factors, *rest)
+
+
+class Bench:
+    """An arm, and the first of its gauges.
+
+    Parameters
+    ----------
+    arm : PositionArm
+        With one joint.
+    """
+
+    def __init__(self, arm):
+        self._arm = arm
+        self._row = gauge_rows(arm.plant.model, arm.plant.model.arm.gauges)[0]
+
+    def drive(self, references, correct, pushed=0.0):
+        """Command the arm from rest.
+
+        Parameters
+        ----------
+        references : (k,) ndarray
+            Of its joint [rad].
+        correct : callable
+            ``correct(now, strain)`` gives what is added [rad].
+        pushed : float
+            First modal amplitude at the start [m].
+
+        Returns
+        -------
+        tip : (k, 3) ndarray
+            When each command is sent [m].
+        strains, corrections : (k,) ndarrays
+            [-], [rad]
+        """
+        plant, loop = self._arm.plant, self._arm.loop
+        noise = np.random.default_rng(0).normal(0.0, NOISE, references.size)
+        every = round(DRIVE_RATE / COMMAND_RATE)
+        bent = np.array(plant.model.static_deflection(references[:1]), float)
+        bent[0] += pushed
+        plant.reset(references[:1], bent)
+        loop.begin(references[:1])
+        tip, strains, corrections = [], [], []
+        for k, reference in enumerate(references):
+            now = k * PERIOD
+            tip.append(np.array(plant.model.tip_position(plant.q, plant.delta)))
+            strains.append(float(self._row @ plant.delta) + noise[k])
+            corrections.append(correct(now, strains[-1]))
+            loop.command(now, [reference + corrections[-1]])
+            for i in range(every):
+                loop.drive(plant, now + i / DRIVE_RATE)
+        return np.array(tip), np.array(strains), np.array(corrections)
+
+    def settings(self, found):
+        """Settings of the damping: of the mode `found`, and its answer to a burst."""
+        frequency, ratio = float(found.frequencies[0]), float(found.dampings[0])
+        sent = strain_damping.burst(frequency, BURST, PERIOD)
+        sent = np.append(sent, np.zeros(int(LISTEN / (frequency * PERIOD))))
+        _, strains, _ = self.drive(sent, _no_correction)
+        beta, _ = strain_damping.identified(frequency, ratio, PERIOD, sent, strains)
+        given = {"frequency": frequency, "damping": ratio, "period": PERIOD}
+        answer = {"sensitivity": abs(beta), "phase": float(np.angle(beta))}
+        return check_all(strain_damping.PARAMETERS, {**given, **answer})
+
+
+def prepared(payload, seed=0):
+    """The case of a payload, its bench, and the settings of the damping that are measured on it."""
+    case = cases.payload(payload, seed)
+    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
+    bench = Bench(arm)
+    return case, bench, bench.settings(measured(arm, np.zeros(1), WAY, case.period))
+
+
+def decay(payload, seed=0) -> Decay:
+    """Push one link with `payload` times its payload, with and without damping; `seed` of the case."""
+    case, bench, settings = prepared(payload, seed)
+    known = settings if payload == 1.0 else prepared(1.0, seed)[2]
+    still = np.zeros(int(WATCHED * case.period / PERIOD))
+
+    def pushed(correct):
+        tip, _, corrections = bench.drive(still, correct, PUSH)
+        return _time(tip), float(np.abs(corrections).max())
+
+    laws = (_law(settings), _law(settings, 1.0 - OFF), _law(settings, 1.0 + OFF), _law(known))
+    times, largest = zip(*map(pushed, (_no_correction, *laws)), strict=True)
+    swings = [_swing(case, bench, correct) for correct in (_no_correction, _law(settings))]
+    mode = settings["frequency"], settings["damping"], settings["phase"]
+    return Decay(payload, *mode, *times, max(largest[:4]), swings[1] / swings[0])
+
+
+def _swing(case, bench, correct):
+    """What the tip moves from one to four locked periods after the end of the case's first motion [m]."""
+    motion = case.motions[0]
+    first, last = (motion.duration + n * case.period for n in (1.0, 4.0))
+    references = motion.position(np.arange(int(last / PERIOD)) * PERIOD)[:, 0]
+    tip, _, _ = bench.drive(references, correct)
+    return float(np.linalg.norm(np.ptp(tip[int(first / PERIOD) :], axis=0)))
+
+
+def _no_correction(*_):
+    return 0.0
+
+
+def _law(settings, factor=1.0):
+    """The damping, at rest before the push; its frequency times a factor."""
+    changed = {**settings, "frequency": settings["frequency"] * factor}
+    damping = strain_damping.StrainDamping(changed)
+    damping.update(-PERIOD, 0.0)
+    return damping.update
+
+
+def _time(tip):
+    """When the tip (k, 3) has come within `DECAYED` of its first swing for good [s]."""
+    away = np.linalg.norm(tip - tip[-1], axis=1)
+    over = np.flatnonzero(away > DECAYED * away[0])
+    return float(over[-1] + 1) * PERIOD
+
+
+def text(decays):
+    """The table of some `Decay`, Markdown."""
+    return "\n".join(table(COLUMNS, [found.row() for found in decays]))
+
+
+def write(decays, path):
+    """Put the table between the markers of a Markdown file."""
+    write_between(path, BEGIN, END, text(decays))
