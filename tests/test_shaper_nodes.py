@@ -16,8 +16,9 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from flexarm_control.motions import shapers
+from flexarm_control.shaping import strain_damping
 from flexarm_control.shaping.piecewise import PiecewiseMotion
-from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.errors import DesignError, ParameterError
 from flexarm_msgs.action import FollowJointTrajectory as Follow
 from flexarm_msgs.msg import ShaperState
 from flexarm_ros.messages import set_stamp, stamp_ns
@@ -222,6 +223,73 @@ def test_a_stream_of_velocities_ends_when_its_source_is_silent(bench):
     bench.wait_for("commands", lambda: commands.messages and commands.newest.data[0] > 0.1)
     time.sleep(0.06)  # the steady clock is that of the machine
     bench.wait_for("rest", lambda: not any(commands.newest.data), patience=3.0)
+
+
+#: Of the mode that the damping of the tests is made for: its frequency, and what the strain is of a joint's velocity.
+FREQUENCY, SENSITIVITY = 3.0, 0.04
+DAMPING = {
+    "stream_output": "commands",
+    "damping.joint": "b",
+    "damping.gauge": 1,
+    "damping.frequency": FREQUENCY,
+    "damping.sensitivity": SENSITIVITY,
+    "damping.phase": 1.57,
+    "damping.target": 0.1,
+}
+
+
+def test_a_push_is_damped_in_the_stream_by_strain_until_the_sensor_is_silent(bench):
+    Shaper(bench, **DAMPING)
+    node = bench.nodes["shaper"]
+    node.now_ns = lambda: round(1e9 * bench.queue.time)
+    commands = bench.tap(Float64MultiArray, "commands")
+    strain = bench.publisher(Float64MultiArray, "strain")
+    bench.publisher(Float64MultiArray, "stream").publish(Float64MultiArray(data=[0.2, 0.1]))
+    swing, p = 1e-3 + 0j, strain_damping.pole(FREQUENCY, 0.005)
+
+    def periods(count, sensor=True):
+        nonlocal swing
+        found = []
+        for _ in range(count):
+            if sensor:
+                strain.publish(Float64MultiArray(data=[7.0, swing.real]))
+            seen = len(commands.messages)
+            bench.wait_for("a command", lambda seen=seen: len(commands.messages) > seen)
+            found.append(commands.newest.data)
+            u = found[-1][1] - 0.1
+            swing = strain_damping.moved(swing, p, 1j * SENSITIVITY, u, 0.008)
+        return np.array(found)
+
+    found = periods(250)
+    free = 1e-3 * np.exp(p.real * 2.0)
+    assert abs(swing) < 0.3 * free
+    assert set(found[:, 0]) == {0.2}
+    corrections = found[:, 1] - 0.1
+    assert 1e-3 < np.abs(corrections).max() <= 0.02
+    swing = 1e-3 + 0j
+    periods(20)
+    strain.publish(Float64MultiArray(data=[1.0]))
+    gone = periods(60, sensor=False)
+    assert gone[-1, 1] == 0.1
+    assert "no reading 1" in bench.log("shaper")
+    _, text, values = node.diagnose()
+    assert text == "no damping: the sensor is silent"
+    assert values["damping"] == "off: the sensor is silent"
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"damping.joint": "x"}, "no joint of the stream"),
+        ({"stream_output": ""}, "no positions to correct"),
+        ({"stream_kind": "velocities"}, "no positions to correct"),
+        ({"damping.target": 0.01, "damping.damping": 0.02}, "no more than the mode has"),
+    ],
+)
+def test_a_damping_that_can_not_be_is_refused(bench, changes, problem):
+    with pytest.raises((ParameterError, DesignError, AssertionError)) as refused:
+        Shaper(bench, **{**DAMPING, **changes})
+    assert problem in str(refused.value)
 
 
 class Controller:

@@ -53,7 +53,7 @@ def answer(p):
 
 def settings(**changes):
     beta = answer(pole(F, RATIO)) * cmath.exp(-1j * W * LATE * T)
-    known = {"frequency": F, "damping": RATIO, "period": T, "sensitivity": abs(beta)}
+    known = {"frequency": F, "damping": RATIO, "sensitivity": abs(beta)}
     return check_all(PARAMETERS, {**known, "phase": cmath.phase(beta), **changes})
 
 
@@ -100,7 +100,7 @@ def test_strain_in_proportion_to_joint_acceleration_answers_so():
 
 @pytest.mark.parametrize("factor", [0.85, 1.0, 1.15])
 def test_a_push_decays_as_wanted_also_with_the_frequency_off(factor):
-    law = StrainDamping(settings(observer=1.0, target=0.1))
+    law = StrainDamping(settings(observer=1.0, target=0.1), T)
     law.update(-T, 0.0)
     amplitudes, _ = run(law, Link(factor, bent=1e-4), 3.0)
     first, last = 40, 120
@@ -111,7 +111,7 @@ def test_a_push_decays_as_wanted_also_with_the_frequency_off(factor):
 
 
 def test_the_eigenvalues_are_those_of_the_loop_that_runs():
-    law = StrainDamping(settings(observer=0.3, target=0.05))
+    law = StrainDamping(settings(observer=0.3, target=0.05), T)
     law.update(-T, 0.0)
     amplitudes, _ = run(law, Link(bent=1e-4), 6.0)
     per_period = (amplitudes[700] / amplitudes[300]) ** (1.0 / 400.0)
@@ -120,13 +120,13 @@ def test_the_eigenvalues_are_those_of_the_loop_that_runs():
 
 def test_a_phase_that_is_wrong_with_a_frequency_off_is_refused():
     with pytest.raises(DesignError, match="frequency"):
-        StrainDamping(settings(target=0.5, observer=2.0, period=0.05))
+        StrainDamping(settings(target=0.5, observer=2.0), 0.05)
     with pytest.raises(DesignError, match="no more than the mode has"):
-        StrainDamping(settings(target=0.02, damping=0.02))
+        StrainDamping(settings(target=0.02, damping=0.02), T)
 
 
 def test_the_bias_makes_no_correction():
-    law = StrainDamping(settings())
+    law = StrainDamping(settings(), T)
     _, corrections = run(law, Link(bias=5e-3), 1.0)
     assert np.abs(corrections).max() == 0.0
     # A bias that jumps later: for a moment only.
@@ -150,7 +150,7 @@ def test_the_bias_makes_no_correction():
 )
 def test_a_sensor_in_doubt_fades_the_correction_out_and_it_comes_back(reading, reason):
     given = settings(target=0.03)
-    law, link = StrainDamping(given), Link(bent=1e-3)
+    law, link = StrainDamping(given, T), Link(bent=1e-3)
     law.update(-T, 0.0)
     run(law, link, 0.5)
     assert law.state == ACTIVE
@@ -174,8 +174,31 @@ def test_a_sensor_in_doubt_fades_the_correction_out_and_it_comes_back(reading, r
     assert abs(link.z) < 0.7 * before
 
 
+def test_a_sensor_at_half_the_rate_damps_and_comes_back():
+    law, link = StrainDamping(settings(target=0.1), T), Link(bent=1e-3)
+    law.update(-T, 0.0)
+
+    def every_second(now, strain):
+        return (strain,) if round(now / T) % 2 else ()
+
+    run(law, link, 0.5, lambda now, strain: ())
+    assert law.state == OFF
+    amplitudes, _ = run(law, link, 4.0, every_second, start=0.504)
+    assert law.state == ACTIVE
+    assert amplitudes[-1] < 0.02 * amplitudes[0]
+
+
+def test_a_clock_that_goes_back_is_followed():
+    law, link = StrainDamping(settings(target=0.1), T), Link(bent=1e-3)
+    law.update(100.0 - T, 0.0)
+    run(law, link, 0.2, start=100.0)
+    amplitudes, _ = run(law, link, 2.0)
+    assert law.state == ACTIVE
+    assert amplitudes[-1] < 0.15 * amplitudes[0]
+
+
 def test_a_sensor_that_sticks_makes_no_lasting_correction():
-    law, link = StrainDamping(settings()), Link(bent=1e-3)
+    law, link = StrainDamping(settings(), T), Link(bent=1e-3)
     law.update(-T, 0.0)
     run(law, link, 0.1)
     stuck = link.strain
@@ -185,7 +208,7 @@ def test_a_sensor_that_sticks_makes_no_lasting_correction():
 
 def test_at_its_bounds_the_correction_still_damps():
     given = settings(max_correction=4e-3, max_rate=0.05)
-    law, link = StrainDamping(given), Link(bent=1e-3)
+    law, link = StrainDamping(given, T), Link(bent=1e-3)
     law.update(-T, 0.0)
     amplitudes, corrections = run(law, link, 8.0)
     assert not law.latched
@@ -197,7 +220,7 @@ def test_at_its_bounds_the_correction_still_damps():
 
 
 def test_with_the_sign_wrong_it_switches_off_for_good_until_the_next_start():
-    law, link = StrainDamping(settings(max_correction=1e-3)), Link(bent=1e-4)
+    law, link = StrainDamping(settings(max_correction=1e-3), T), Link(bent=1e-4)
     law.update(-T, 0.0)
     _, corrections = run(law, link, 12.0, lambda now, strain: (-strain,))
     assert law.latched
@@ -221,7 +244,7 @@ def test_with_the_sign_wrong_it_switches_off_for_good_until_the_next_start():
 )
 def test_whatever_comes_the_correction_is_finite_and_bounded(inputs):
     given_ = settings()
-    law, now, before = StrainDamping(given_), 0.0, 0.0
+    law, now, before = StrainDamping(given_, T), 0.0, 0.0
     for step, strain, stamp in inputs:
         now += step
         out = law.update(now, strain, stamp)

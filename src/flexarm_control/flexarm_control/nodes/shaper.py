@@ -27,7 +27,9 @@ from ..shaping import modes, trajectory_shaper
 from ..shaping.modes import Modes
 from ..shaping.stream import StreamShaper
 from ..shaping.trajectory_shaper import TrajectoryShaper
+from . import stream_damping
 from .shaper_goals import ShaperGoals
+from .stream_damping import StreamDamping
 from .trajectory_inbox import rows
 
 POSITIONS, VELOCITIES = "positions", "velocities"
@@ -64,6 +66,7 @@ def parameter_groups():
         "": PARAMETERS,
         "shaper.": modes.PARAMETERS,
         "limits.": trajectory_shaper.PARAMETERS,
+        "damping.": stream_damping.PARAMETERS,
     }
 
 
@@ -271,11 +274,22 @@ class ShaperNode(ArmNode):
     def _build_stream(self):
         topic, rate = self.parameters["stream_output"], self.parameters["stream_rate"]
         self._wish, self._wished_at, self._step = None, -math.inf, 1.0 / rate
+        self._damping = None
+        damping = self.parameters.group("damping.")
+        if damping["joint"]:
+            self._refuse_damping_without_positions(topic)
+            self._damping = StreamDamping(self, self._names, damping, self._step)
         if not topic:
             return
         self._commands = self.make_publisher(Float64MultiArray, topic)
         self.make_subscription(Float64MultiArray, "stream", self._on_stream)
         self.make_timer(self._step, self._on_tick)
+
+    def _refuse_damping_without_positions(self, topic):
+        """Refuse a damping that has no stream of positions to correct; `topic` of the stream."""
+        if not topic or self.parameters["stream_kind"] != POSITIONS:
+            hint = f"give stream_output, with stream_kind {POSITIONS}"
+            raise ParameterError("has no positions to correct", field="damping.joint", hint=hint)
 
     def _on_stream(self, msg):
         if not self.active:
@@ -316,10 +330,13 @@ class ShaperNode(ArmNode):
             self._wish = np.zeros(len(self._names))
         if not stream.started:
             stream.begin(np.zeros(len(self._names)) if velocities else self._wish)
-        if silent and stream.settled() and not stream.steps_to(self._wish):
+        stands = silent and stream.settled() and not stream.steps_to(self._wish)
+        if stands and self._damping is None:
             return
         where = self._measurement() if velocities else None
         value = stream.step(self._wish, self._step, where)
+        if self._damping is not None:
+            value = self._damping.corrected(value, 1e-9 * self.now_ns())
         self._commands.publish(Float64MultiArray(data=value.tolist()))
 
     # -----------------------------------------------------------------------------------------
@@ -334,6 +351,11 @@ class ShaperNode(ArmNode):
             "added time [s]": f"{state.added_time:.4g}",
             "last refused": state.rejected_reason,
         }
+        if self._damping is not None:
+            law = self._damping.law
+            values["damping"] = f"{law.state}: {law.reason}" if law.reason else law.state
+            if law.reason:
+                return WARN, f"no damping: {law.reason}", values
         if not self._trajectories.get_subscription_count() and not self._goals.served():
             topic = self._trajectories.topic_name
             return WARN, f"nothing listens on {topic}: is parameter output right?", values

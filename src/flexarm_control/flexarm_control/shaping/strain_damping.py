@@ -54,7 +54,6 @@ PARAMETERS = (
     parameter("observer", 0.5, "-", 0.02, 2.0, read_only=True).described(
         "Rate at which the observer follows the reading, over the mode's angular frequency."
     ),
-    parameter("period", 0.008, "s", 1e-4, 1.0, read_only=True).described("Of the commands."),
     parameter("max_correction", 0.02, "rad", 1e-9, 3.0, read_only=True).described(
         "Largest correction of the position."
     ),
@@ -81,6 +80,8 @@ PARAMETERS = (
 MARGIN = 0.15
 #: Rate of the bias over that of the observer [-].
 DRIFT = 0.1
+#: A reading counts for at most so many periods: longer steps would overshoot.
+LATE = 2.0
 #: After `max_saturated` at the bounds the mode must swing less than this fraction of the largest swing since [-].
 LESS = 0.9
 #: A burst has so many periods; after its end the drive gets this fraction of a period to settle.
@@ -186,6 +187,8 @@ class StrainDamping:
     ----------
     settings : mapping
         Checked values of `PARAMETERS`.
+    period : float
+        Of the commands [s].
 
     Attributes
     ----------
@@ -205,8 +208,8 @@ class StrainDamping:
         `MARGIN`.
     """
 
-    def __init__(self, settings):
-        self.settings = settings
+    def __init__(self, settings, period):
+        self.settings, self.period = settings, period
         self._p = pole(settings["frequency"], settings["damping"])
         self._w = abs(self._p)
         self._beta = cmath.rect(settings["sensitivity"], settings["phase"])
@@ -227,7 +230,7 @@ class StrainDamping:
     def begin(self):
         """Start at rest: the next good reading is the bias."""
         self._z, self._bias, self._weight = 0j, None, 1.0
-        self._time = self._stamp = self._good_since = self._good_at = None
+        self._time = self._stamp = self._read_at = self._good_since = self._good_at = None
         self._saturated_since, self._swing = None, 0.0
         self.correction, self.state, self.reason, self.latched = 0.0, ACTIVE, "", False
 
@@ -253,18 +256,27 @@ class StrainDamping:
         stamp : float, optional
             When it was taken [s]; `now` if not given.
         """
-        step = 0.0 if self._time is None else max(now - self._time, 0.0)
-        self._time = now
+        step = self._step_to(now)
         self._z = moved(self._z, self._p, self._beta, self.correction, step)
         problem = self._problem(now, strain, now if stamp is None else stamp)
         if not problem:
-            self._correct(float(strain), step)
+            self._correct(float(strain), now)
         self._judge(now, problem)
         amplitude = self._gain * abs(self._z)
         self._note_saturation(now, amplitude)
         self._fade(step)
         self.correction = self._bounded(amplitude, step)
         return self.correction
+
+    def _step_to(self, now):
+        """Time since the call before [s]; where the clock goes back, times before are forgotten."""
+        last, self._time = self._time, now
+        if last is None:
+            return 0.0
+        if now < last:
+            self._stamp = self._read_at = self._good_since = self._good_at = None
+            self._saturated_since = None
+        return max(now - last, 0.0)
 
     def _problem(self, now, strain, stamp):
         """What is wrong with a reading; empty: nothing."""
@@ -282,12 +294,13 @@ class StrainDamping:
             return "the sensor's reading is beyond its full scale"
         return ""
 
-    def _correct(self, strain, step):
-        """Correct the observer by a reading."""
+    def _correct(self, strain, now):
+        """Correct the observer by a reading, as much as is due since the reading before."""
         if self._bias is None:
             self._z, self._bias = 0j, strain
-        # Late readings count as one of a double period: longer steps would overshoot.
-        part = self._rate * min(step, 2.0 * self.settings["period"])
+        since = 0.0 if self._read_at is None else now - self._read_at
+        self._read_at = now
+        part = self._rate * min(since, LATE * self.period)
         error = strain - self._z.real - self._bias
         self._z += part * error
         self._bias += DRIFT * part * error
@@ -295,10 +308,10 @@ class StrainDamping:
     def _judge(self, now, problem):
         """Decide by how long the sensor has been good or bad whether the correction is wanted."""
         if problem:
-            self._good_since = None
             self._good_at = now if self._good_at is None else self._good_at
-            if now - self._good_at > self.settings["timeout"] and not self.latched:
-                self.reason = problem
+            if now - self._good_at > self.settings["timeout"]:
+                self._good_since = None
+                self.reason = self.reason if self.latched else problem
             return
         self._good_at = now
         self._good_since = now if self._good_since is None else self._good_since
@@ -347,17 +360,16 @@ class StrainDamping:
         factor : float
             [-]
         """
-        s = self.settings
         p = self._p * factor
         turn = cmath.exp(-1j * (factor - 1.0) * self._lag())
         beta = self._beta * factor * turn
-        part = self._rate * s["period"]
+        part = self._rate * self.period
         loop = np.zeros((5, 5))
         for i, unit in enumerate(np.eye(5)):
             x, z, bias = complex(*unit[:2]), complex(*unit[2:4]), unit[4]
             u = -self._gain * (self._beta.conjugate() * z).real / abs(self._beta)
-            x = moved(x, p, beta, u, s["period"])
-            z = moved(z, self._p, self._beta, u, s["period"])
+            x = moved(x, p, beta, u, self.period)
+            z = moved(z, self._p, self._beta, u, self.period)
             error = x.real - z.real - bias
             z, bias = z + part * error, bias + DRIFT * part * error
             loop[:, i] = x.real, x.imag, z.real, z.imag, bias

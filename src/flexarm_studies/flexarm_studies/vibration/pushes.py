@@ -151,7 +151,7 @@ class Bench:
         sent = np.append(sent, np.zeros(int(LISTEN / (frequency * PERIOD))))
         _, strains, _ = self.drive(sent, _no_correction)
         beta, _ = strain_damping.identified(frequency, ratio, PERIOD, sent, strains)
-        given = {"frequency": frequency, "damping": ratio, "period": PERIOD}
+        given = {"frequency": frequency, "damping": ratio}
         answer = {"sensitivity": abs(beta), "phase": float(np.angle(beta))}
         return check_all(strain_damping.PARAMETERS, {**given, **answer})
 
@@ -197,7 +197,7 @@ def _no_correction(*_):
 def _law(settings, factor=1.0):
     """The damping, at rest before the push; its frequency times a factor."""
     changed = {**settings, "frequency": settings["frequency"] * factor}
-    damping = strain_damping.StrainDamping(changed)
+    damping = strain_damping.StrainDamping(changed, PERIOD)
     damping.update(-PERIOD, 0.0)
     return damping.update
 
