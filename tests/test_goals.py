@@ -253,9 +253,11 @@ def restart(bench, arm, name):
     seen = len(arm.states.messages)
 
     def back():
-        if len(arm.states.messages) <= seen:
+        if len(arm.states.messages) <= seen:  # the newest one is from before
             return False
-        return arm.ready() or arm.recover() and False
+        if not arm.ready():
+            arm.recover()
+        return arm.ready()
 
     bench.wait_for("the loop", back)
     arm.wait_ready()

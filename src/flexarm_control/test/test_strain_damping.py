@@ -29,11 +29,11 @@ W = 2.0 * math.pi * F
 
 
 class Link:
-    """The mode of eta'' + 2 zeta w eta' + w^2 eta = -c q'', with q the command of `LATE` periods before."""
+    """The mode of eta'' + 2 zeta w eta' + w^2 eta = -c q'', with q the command of `late` periods before."""
 
-    def __init__(self, factor=1.0, bent=0.0, bias=0.0):
+    def __init__(self, factor=1.0, bent=0.0, bias=0.0, late=LATE):
         self.p, self.bias, self.z = pole(F * factor, RATIO), bias, complex(bent)
-        self.queue = [0.0] * LATE
+        self.queue = [0.0] * late
 
     @property
     def strain(self):
@@ -51,8 +51,8 @@ def answer(p):
     return -1j * C * abs(p)
 
 
-def settings(**changes):
-    beta = answer(pole(F, RATIO)) * cmath.exp(-1j * W * LATE * T)
+def settings(late=LATE, **changes):
+    beta = answer(pole(F, RATIO)) * cmath.exp(-1j * W * late * T)
     known = {"frequency": F, "damping": RATIO, "sensitivity": abs(beta)}
     return check_all(PARAMETERS, {**known, "phase": cmath.phase(beta), **changes})
 
@@ -110,12 +110,15 @@ def test_a_push_decays_as_wanted_also_with_the_frequency_off(factor):
     assert law.radius(factor) < 1.0
 
 
-def test_the_eigenvalues_are_those_of_the_loop_that_runs():
-    law = StrainDamping(settings(observer=0.3, target=0.05), T)
+@pytest.mark.parametrize("late", [0, 8])
+@pytest.mark.parametrize("factor", [0.85, 1.0, 1.15])
+def test_the_eigenvalues_are_those_of_the_loop_that_runs(late, factor):
+    given = settings(late, observer=0.3, target=0.05)
+    law = StrainDamping(given, T)
     law.update(-T, 0.0)
-    amplitudes, _ = run(law, Link(bent=1e-4), 6.0)
+    amplitudes, _ = run(law, Link(factor, bent=1e-4, late=late), 6.0)
     per_period = (amplitudes[700] / amplitudes[300]) ** (1.0 / 400.0)
-    assert law.radius() == pytest.approx(per_period, abs=2e-3)
+    assert law.radius(factor) == pytest.approx(per_period, abs=4e-4)
 
 
 def test_a_phase_that_is_wrong_with_a_frequency_off_is_refused():
@@ -186,6 +189,14 @@ def test_a_sensor_at_half_the_rate_damps_and_comes_back():
     amplitudes, _ = run(law, link, 4.0, every_second, start=0.504)
     assert law.state == ACTIVE
     assert amplitudes[-1] < 0.02 * amplitudes[0]
+    # A reading counts for the time since the one before.
+    half, slow = StrainDamping(settings(), T), StrainDamping(settings(), 2.0 * T)
+    for law in (half, slow):
+        law.update(0.0, 0.0)
+    half.update(T)
+    wanted = slow.update(2.0 * T, 1e-5)
+    assert wanted != 0.0
+    assert half.update(2.0 * T, 1e-5) == pytest.approx(wanted, rel=1e-9)
 
 
 def test_a_clock_that_goes_back_is_followed():

@@ -56,15 +56,16 @@ def test_the_table_counts_what_is_within_what_is_wanted():
 def test_a_push_decays_five_times_faster_with_damping_by_strain():
     found = pushes.decay(1.0)
     assert found.frequency == pytest.approx(3.78, rel=0.02)
-    assert found.without > 5.0 * max(found.damped, found.low, found.high)
+    assert found.without > 5.0 * max(found.damped, found.low, found.high, found.noisy)
     assert found.largest < 0.01
     assert found.motion < 0.5
 
 
 def test_the_table_of_pushes_has_times_and_factors():
-    found = pushes.Decay(1.0, 3.0, 0.01, np.pi / 2.0, 6.0, 1.0, 1.2, 1.5, 2.0, 0.004, 0.25)
+    found = pushes.Decay(1.0, 3.0, 0.01, np.pi / 2.0, 6.0, 1.0, 1.2, 1.5, 2.0, 3.0, 0.004, 0.25)
     row = dict(zip(pushes.COLUMNS, found.row(), strict=True))
     assert row["faster"] == 6.0
     assert (row["-15 %"], row["+15 %"], row["made for payload 1"]) == (5.0, 4.0, 3.0)
+    assert row["noise 1e-5"] == 2.0
     assert row["phase, degrees"] == pytest.approx(90.0)
     assert row["largest correction, mrad"] == pytest.approx(4.0)

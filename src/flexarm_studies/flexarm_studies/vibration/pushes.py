@@ -22,9 +22,11 @@ from .study import measured
 BEGIN, END = "<!-- pushes: begin -->", "<!-- pushes: end -->"
 PERIOD = 1.0 / COMMAND_RATE
 #: Payloads, as multiples of the one that the drives know.
-PAYLOADS = (0.0, 1.0, 3.0)
+PAYLOADS = (0.0, 1.0, 2.0, 3.0)
 #: The push bends the link so far [m]; noise of the strain [-].
 PUSH, NOISE = 0.01, 1e-6
+#: More noise that is tried [-].
+NOISY = 1e-5
 #: Which way the small motion goes whose ringing is measured [rad].
 WAY = np.array([1.2])
 #: Amplitude of the burst [rad], and periods of ringing recorded with it.
@@ -44,6 +46,7 @@ COLUMNS = (
     "-15 %",
     "+15 %",
     "made for payload 1",
+    "noise 1e-5",
     "largest correction, mrad",
     "after a motion",
 )
@@ -67,6 +70,8 @@ class Decay:
         The same, damped for a frequency that is too low, or too high, by `OFF` [s].
     other : float
         The same, damped for the payload that the drives know [s].
+    noisy : float
+        The same, damped, with noise of `NOISY` [s].
     largest : float
         Correction [rad].
     motion : float
@@ -82,12 +87,16 @@ class Decay:
     low: float
     high: float
     other: float
+    noisy: float
     largest: float
     motion: float
 
     def row(self):
         """The values of `COLUMNS`."""
-        factors = (self.without / time for time in (self.damped, self.low, self.high, self.other))
+        factors = (
+            self.without / time
+            for time in (self.damped, self.low, self.high, self.other, self.noisy)
+        )
         angles = 100.0 * self.ratio, float(np.degrees(self.phase))
         times = self.without, self.damped
         rest = 1e3 * self.largest, self.motion
@@ -107,7 +116,7 @@ class Bench:
         self._arm = arm
         self._row = gauge_rows(arm.plant.model, arm.plant.model.arm.gauges)[0]
 
-    def drive(self, references, correct, pushed=0.0):
+    def drive(self, references, correct, pushed=0.0, noise=NOISE):
         """Command the arm from rest.
 
         Parameters
@@ -118,6 +127,8 @@ class Bench:
             ``correct(now, strain)`` gives what is added [rad].
         pushed : float
             First modal amplitude at the start [m].
+        noise : float
+            Of the strain [-].
 
         Returns
         -------
@@ -127,7 +138,7 @@ class Bench:
             [-], [rad]
         """
         plant, loop = self._arm.plant, self._arm.loop
-        noise = np.random.default_rng(0).normal(0.0, NOISE, references.size)
+        added = np.random.default_rng(0).normal(0.0, noise, references.size)
         every = round(DRIVE_RATE / COMMAND_RATE)
         bent = np.array(plant.model.static_deflection(references[:1]), float)
         bent[0] += pushed
@@ -137,7 +148,7 @@ class Bench:
         for k, reference in enumerate(references):
             now = k * PERIOD
             tip.append(np.array(plant.model.tip_position(plant.q, plant.delta)))
-            strains.append(float(self._row @ plant.delta) + noise[k])
+            strains.append(float(self._row @ plant.delta) + added[k])
             corrections.append(correct(now, strains[-1]))
             loop.command(now, [reference + corrections[-1]])
             for i in range(every):
@@ -170,15 +181,16 @@ def decay(payload, seed=0) -> Decay:
     known = settings if payload == 1.0 else prepared(1.0, seed)[2]
     still = np.zeros(int(WATCHED * case.period / PERIOD))
 
-    def pushed(correct):
-        tip, _, corrections = bench.drive(still, correct, PUSH)
+    def pushed(correct, noise=NOISE):
+        tip, _, corrections = bench.drive(still, correct, PUSH, noise)
         return _time(tip), float(np.abs(corrections).max())
 
     laws = (_law(settings), _law(settings, 1.0 - OFF), _law(settings, 1.0 + OFF), _law(known))
     times, largest = zip(*map(pushed, (_no_correction, *laws)), strict=True)
+    noisy, _ = pushed(_law(settings), NOISY)
     swings = [_swing(case, bench, correct) for correct in (_no_correction, _law(settings))]
     mode = settings["frequency"], settings["damping"], settings["phase"]
-    return Decay(payload, *mode, *times, max(largest[:4]), swings[1] / swings[0])
+    return Decay(payload, *mode, *times, noisy, max(largest[:4]), swings[1] / swings[0])
 
 
 def _swing(case, bench, correct):
