@@ -14,7 +14,7 @@ from flexarm_tools.recording.record import Taken
 
 COMMANDS = sorted(next(a for a in cli.parser()._actions if getattr(a, "choices", None)).choices)
 #: They go on until they are stopped: what they have to say is in the log, or on a page.
-WITHOUT_JSON = {"arms", "run", "view"}  # arms writes its runs as JSON lines: --out
+WITHOUT_JSON = {"arms", "run", "vibration", "view"}  # arms and vibration write JSON lines: --out
 
 
 @pytest.fixture

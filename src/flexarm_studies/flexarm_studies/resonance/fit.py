@@ -265,8 +265,11 @@ def _odd(problem, solution, low, high):
     widths = _widths(problem, solution)
     for k, most in enumerate((MAX_WIDTH, MAX_DAMPING)):
         bad |= ~(np.abs(widths[:, k, k]) < (most * poles.imag / NORMAL) ** 2)
+    if bad.any():
+        # The most damped first. Two of them that cancel each other are large, so that modes look small beside them.
+        return int(np.argmax(np.where(bad, ratio, -1.0)))
     power = _power(problem, solution)
-    bad |= (power < MIN_PART**2 * power.max(axis=0)).all(axis=1)
+    bad = (power < MIN_PART**2 * power.max(axis=0)).all(axis=1)
     density = np.abs(np.einsum("faa->fa", _density(problem, solution)))
     at = np.minimum(np.rint(2.0 * len(problem.values) * problem.period * hertz), len(density) - 1)
     # White noise puts this much into the two columns of a mode.
