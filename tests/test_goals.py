@@ -294,8 +294,8 @@ def test_random_goals_with_cancel_preemption_tolerances_and_kills_always_have_th
                 if fate in NEVER
                 else ((GoalStatus.STATUS_SUCCEEDED, R.SUCCESSFUL), *FATES[fate][1])
             )
-            told = f"{fate}: {status}, {result.error_code}: {result.error_string}"
-            assert (status, result.error_code) in allowed, told
+            reported = f"{fate}: {status}, {result.error_code}: {result.error_string}"
+            assert (status, result.error_code) in allowed, reported
             counts[fate, status] = counts.get((fate, status), 0) + 1
 
         for fate in fates:

@@ -22,9 +22,9 @@ def test_what_is_drawn_is_noisy_as_it_says():
 
 @pytest.mark.slow
 def test_play_is_found_within_a_tenth():
-    table = strain_coverage.run(2, seed=5, count=1)
+    table = strain_coverage.run(1, seed=5, count=1)
     play = table["joints[0].transmission.play"]
-    assert play["arms"] == 2 and max(play["errors"]) < 0.1
+    assert play["arms"] == 1 and max(play["errors"]) < 0.1
     # Intervals of 95 % are too narrow on some arms (docs/identification.md): no more is promised of them here.
-    assert all(row["covered"] <= row["arms"] == 2 for row in table.values())
+    assert all(row["covered"] <= row["arms"] == 1 for row in table.values())
     assert "joints[0].transmission.play" in "\n".join(strain_coverage.text(table))

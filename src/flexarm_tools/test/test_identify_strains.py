@@ -73,6 +73,13 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
+def few_steps(monkeypatch):
+    """What is made of a fit is tested, and not the fit."""
+    for name, count in (("START_STEPS", 3), ("PASS_STEPS", 2), ("PASSES", 1)):
+        monkeypatch.setattr(strain_fit, name, count)
+
+
+@pytest.fixture
 def identify(flexarm, folder):
     def run(*words):
         return flexarm(
@@ -109,10 +116,8 @@ def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(iden
 
 
 def test_the_page_has_all_parts_every_number_and_nothing_from_the_network(
-    identify, folder, monkeypatch
+    identify, folder, few_steps
 ):
-    for name in ("START_STEPS", "PASS_STEPS", "PASSES"):  # the page, not the fit, is tested
-        monkeypatch.setattr(strain_fit, name, 1)
     page = folder / "pages" / "fit.html"
     code, printed, err = identify(
         *HOLD, "--fit", "0:8", "--score", "8:12", "--json", "--report", page
@@ -136,7 +141,7 @@ def test_the_page_has_all_parts_every_number_and_nothing_from_the_network(
     assert "http://" not in text and "https://" not in text
 
 
-def test_without_parts_all_is_fitted_and_printed_for_people(identify):
+def test_without_parts_all_is_fitted_and_printed_for_people(identify, few_steps):
     code, printed, err = identify(*HOLD)
     assert code == 0, err
     assert "links[0].EI_y" in printed and "quasi-static" in printed and "ring-down" in printed
