@@ -40,6 +40,29 @@ def test_a_shaped_motion_leaves_a_tenth_of_the_swing_with_what_ringing_shows():
     assert off < 0.2 * unshaped
 
 
+def test_modes_of_both_ends_are_given_once():
+    end = study.Measured(np.array([8.7, 13.0]), np.array([0.08, 0.01]))
+    start = study.Measured(np.array([6.8, 13.1]), np.array([0.06, 0.02]))
+    both = study.together(end, start)
+    assert_allclose(both.frequencies, [8.7, 13.0, 6.8])
+    assert_allclose(both.dampings, [0.08, 0.01, 0.06])
+
+
+def test_a_motion_along_which_the_frequency_rises_by_a_quarter_needs_the_modes_of_both_ends():
+    case = cases.random_arm(2)
+    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
+    motion, window = case.motions[1], study.WINDOW * case.period
+    end = study.measured(arm, motion.end, motion.angle, case.period)
+    start = study.measured(arm, motion.start, -motion.angle, case.period)
+    assert end.frequencies[0] > 1.2 * start.frequencies[0]
+    both = study.together(end, start)
+    unshaped, one, two = (
+        arm.follow(m, window).residual(window)
+        for m in (motion, *(study.shaped(motion, "robust", f) for f in (end, both)))
+    )
+    assert two < 0.1 * unshaped < one
+
+
 def test_the_table_counts_what_is_within_what_is_wanted():
     common = {"arm": "x", "frequencies": [2.0], "added": 1.0}
     rows = [

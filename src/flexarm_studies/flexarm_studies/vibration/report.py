@@ -8,7 +8,15 @@ from .study import METHODS
 
 BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 #: What is wanted of a method: residual over that of the trapezoid [-].
-WANTED = {"robust": 0.1, "zvd": 0.1, "robust -15 %": 0.2, "robust +15 %": 0.2}
+WANTED = {
+    "robust": 0.1,
+    "zvd": 0.1,
+    "robust -15 %": 0.2,
+    "robust +15 %": 0.2,
+    "robust, both ends": 0.1,
+    "robust, both ends -15 %": 0.2,
+    "robust, both ends +15 %": 0.2,
+}
 UNSHAPED = METHODS[0]
 COLUMNS = (
     "method",

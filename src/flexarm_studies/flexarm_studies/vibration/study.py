@@ -28,6 +28,8 @@ WINDOW = 1.5
 AUDIBLE, MAX_DAMPING, MAX_MODES = 0.03, 0.3, 3
 #: Modes closer than this fraction are one.
 SAME = 0.12
+#: Modes of the two ends of a motion that are closer than this fraction are given once.
+ALIKE = 0.02
 #: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
 METHODS = (
@@ -39,6 +41,9 @@ METHODS = (
     "robust",
     "robust -15 %",
     "robust +15 %",
+    "robust, both ends",
+    "robust, both ends -15 %",
+    "robust, both ends +15 %",
 )
 
 
@@ -107,9 +112,34 @@ def shaped(motion, kind, found, off=1.0):
     return Shaped(ShapedMotion(motion, modes))
 
 
-def candidates(motion, found):
-    """The motion by each of `METHODS`, a dict."""
-    lowest = 1.0 / found.frequencies.min()
+def together(found, other) -> Measured:
+    """All modes of both ends of a motion; those of `other` that `found` has, too, are left out.
+
+    Parameters
+    ----------
+    found, other : Measured
+    """
+    new = [
+        k
+        for k, f in enumerate(other.frequencies)
+        if (np.abs(found.frequencies / f - 1.0) > ALIKE).all()
+    ]
+    return Measured(
+        np.append(found.frequencies, other.frequencies[new]),
+        np.append(found.dampings, other.dampings[new]),
+    )
+
+
+def candidates(motion, found, other):
+    """The motion by each of `METHODS`, a dict.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+    found, other : Measured
+        At its end; at its start.
+    """
+    lowest, both = 1.0 / found.frequencies.min(), together(found, other)
     return {
         "trapezoid": motion,
         "TOTG 0.1 s": resampled(motion, RESAMPLE),
@@ -119,6 +149,9 @@ def candidates(motion, found):
         "robust": shaped(motion, "robust", found),
         "robust -15 %": shaped(motion, "robust", found, 1.0 - OFF),
         "robust +15 %": shaped(motion, "robust", found, 1.0 + OFF),
+        "robust, both ends": shaped(motion, "robust", both),
+        "robust, both ends -15 %": shaped(motion, "robust", both, 1.0 - OFF),
+        "robust, both ends +15 %": shaped(motion, "robust", both, 1.0 + OFF),
     }
 
 
@@ -149,7 +182,8 @@ def run(case):
             rows.append({**common, "method": ""})
             continue
         lowest = 1.0 / found.frequencies.min()
-        for method, given in candidates(motion, found).items():
+        other = measured(arm, motion.start, -motion.angle, case.period)
+        for method, given in candidates(motion, found, other).items():
             swing = arm.follow(given, WINDOW * case.period)
             rows.append(
                 {
