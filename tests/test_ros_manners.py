@@ -107,12 +107,13 @@ def test_one_arm_whose_observer_is_killed_stands_and_the_other_goes_on(arms):
     bench = a.bench
     a.pause(False)
     bench.wait_for("arm a to go on", lambda: a.measured.newest.sequence > 300)
-    bench.kill("a_observer")
+    if "a_observer" in bench.processes.running:  # else this is a second try
+        bench.kill("a_observer")
     standing = a.measured
     bench.wait_for(
         "arm a to stand",
         lambda: (
-            len(standing.messages) > 3 and len({m.sequence for m in standing.messages[-3:]}) == 1
+            len(standing.messages) > 8 and len({m.sequence for m in standing.messages[-8:]}) == 1
         ),
     )
     stands = standing.newest.sequence
