@@ -637,8 +637,15 @@ LAWS = [
         (
             "motion",
             "the rest of a step: missing",
-            "            out += rest * (rate + (0.5 * rest) * (step.A @ rate))\n",
-            "            pass\n",
+            "        out += rest * (rate + (0.5 * rest) * (step.A @ rate))\n",
+            "        pass\n",
+            TESTS + "test_kalman.py",
+        ),
+        (
+            "motion",
+            "foreseen acceleration: the torque's change missing",
+            "rate[self._size :] += foreseen.push @ change",
+            "rate[self._size :] += 0.0",
             TESTS + "test_kalman.py",
         ),
         (

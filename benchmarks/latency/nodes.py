@@ -61,9 +61,9 @@ def timed(kind, key):
     """Time `kind.step`, for new samples; what was found is printed at the end of the process."""
     step, times, last = kind.step, [], [None]
 
-    def stepping(self, sample, *more):
+    def stepping(self, sample, *more, **named):
         begin = perf_counter()
-        result = step(self, sample, *more)
+        result = step(self, sample, *more, **named)
         took = perf_counter() - begin
         if sample.key != last[0]:  # one that was sent again is answered from the cache
             last[0] = sample.key

@@ -89,6 +89,23 @@ def test_a_repeated_sample_changes_nothing_to_the_last_bit(arm_r, name):
     assert_array_equal(state(core), state(fresh))
 
 
+@pytest.mark.parametrize("name", ["filtered_derivative", "kalman"])
+def test_what_is_left_until_the_estimate_is_sent_changes_nothing_to_the_last_bit(arm_r, name):
+    """A joint velocity of wrong sign is found by what is left; both then say so in the same sample."""
+    late, whole = observed(arm_r, name), observed(arm_r, name)
+    doubts = []
+    for k in range(100):
+        mine, other = (sample(k, position=[7e-4 * k], velocity=[-0.7]) for _ in range(2))
+        late.step(mine, later=True)
+        whole.step(other)
+        assert_array_equal(state(late), state(whole))
+        assert (mine.trust, mine.doubt) == (other.trust, other.doubt)
+        doubts.append(mine.doubt)
+        late.look_ahead()
+    assert not doubts[0]
+    assert "wrong sign" in doubts[-1]
+
+
 def test_a_new_session_starts_the_observer_again(arm_r):
     core, fresh = observed(arm_r), observed(arm_r)
     for k in range(20):

@@ -221,6 +221,22 @@ def test_a_filter_that_computes_ahead_gives_the_same_to_the_last_bit(linear, eve
     assert len(computed) <= 123
 
 
+@pytest.mark.parametrize("period", [H, H + 3e-6])
+@pytest.mark.parametrize("name", ["R", "two_link", "long_reach"])
+def test_a_step_whose_torque_was_foreseen_otherwise_is_the_step_under_its_torque(
+    arms, name, period
+):
+    arm, rng = arms[name], np.random.default_rng(3)
+    n, size = arm.n_joints, arm.n_joints + arm.n_modes
+    motion, x = Motion(arm), 1e-2 * rng.standard_normal(2 * size)
+    expected, torque = rng.uniform(-50.0, 50.0, (2, n))
+    foreseen = motion.foresee(x, expected, H)
+    after = motion.go_on(foreseen, torque, period)
+    wanted = motion.advance(x, torque, period, motion.step_for(H, x[:n]))
+    assert_allclose(after, wanted, rtol=0.0, atol=1e-12 * np.abs(wanted - x).max())
+    assert not np.allclose(after, motion.go_on(foreseen, expected, period), rtol=1e-3)
+
+
 # --------------------------------------------------------------------------- noise levels
 
 

@@ -96,7 +96,7 @@ class ObserverNode(ArmNode):
         self._statistics.received(msg)
         try:
             self._reader.read(msg, sample)
-            known = core.step(sample)
+            known = core.step(sample, later=True)
         except MessageError as error:
             self._statistics.refused(error)
             self.report(f"arm_state {msg.sequence}: {error}")

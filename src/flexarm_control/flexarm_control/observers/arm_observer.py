@@ -115,15 +115,19 @@ class ArmObserver:
         self._mapped, self._nothing = np.zeros(m), np.zeros(0)
         self._motion = Motion(model)
         self._order = SampleOrder()
+        self._taken = None  # a sample that the monitor is to remember
 
-    def step(self, sample):
+    def step(self, sample, later=False):
         """Take one sample, on the control path.
 
         Parameters
         ----------
         sample : ArmSample
             Its `amplitude` is filled in from the strains if it is None. Readings that can't be true are replaced, and
-            `trust` and `doubt` are set: see `plausibility.monitor`.
+            `trust` and `doubt` are set: see `plausibility.monitor`. What only shows over several samples is in the next
+            one's.
+        later : bool
+            Leave that to `look_ahead`, which must then be called before the next sample, with this one unchanged.
 
         Returns
         -------
@@ -167,7 +171,10 @@ class ArmObserver:
         self._pass_on(sample)
         # Only now, so that a refused sample leaves nothing behind, not even its time step.
         if judges:
-            self.monitor.take(sample)
+            self.monitor.mark(sample)
+            self._taken = sample
+        if not later:
+            self._take()
         self._order.take(sample)
         self._derivative[:], self._measured[:] = sample.velocity, sample.position
         if sample.strain is not None and self.calibration is not None:
@@ -175,8 +182,15 @@ class ArmObserver:
         return self.observer.converged
 
     def look_ahead(self):
-        """Do beforehand what the next sample will need; call once the estimate is sent. Results are the same."""
+        """Do what `step` left, and beforehand what the next sample will need; call once the estimate is sent."""
+        self._take()
         self.observer.look_ahead()
+
+    def _take(self):
+        """Have the last sample remembered, if it was judged."""
+        sample, self._taken = self._taken, None
+        if sample is not None:
+            self.monitor.take(sample)
 
     @property
     def _judges(self):

@@ -158,6 +158,9 @@ class ExtendedKalman(Kalman):
             self._design, self._age = design, 0.0
         return self.state + design.Gamma @ self.derivative(self.state, torque), design
 
+    def _foresee(self):
+        """Nothing: the parameters move with the state."""
+
     def _linearised(self, torque, dt):
         """The step at the estimate under this torque."""
         N, x = 2 * self._p, self.state

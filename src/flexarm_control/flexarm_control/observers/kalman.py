@@ -93,6 +93,8 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
+        # Of the last sample: what the next one is taken to have.
+        self._torque, self._period = np.zeros(n), 0.0
         self._assume()
         self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
         self._forget_gain()
@@ -145,6 +147,7 @@ class Kalman(Observer):
         """As `Observer.rest_at`: the old bias, which looked like motion, is in no later innovation."""
         n, p = self._n, self._p
         self.state[n:p], self.state[p : 2 * p] = amplitude, 0.0
+        self._foreseen = None
         self._publish()
 
     def update(self, sample, dt):
@@ -172,6 +175,7 @@ class Kalman(Observer):
         self.innovation_squared = float(innovation @ weighted)
         self._judge()
         self._publish()
+        self._torque[:], self._period = torque, dt
         self._elapsed += dt
         if not self.converged:
             after = self.covariance.diagonal()[self._p : 2 * self._p]
@@ -190,8 +194,14 @@ class Kalman(Observer):
 
     def _predict(self, torque, dt):
         """The predicted state, and the step that the covariance makes."""
-        step = self.motion.step_for(dt, self.state[: self._n])
-        return self.motion.advance(self.state, torque, dt, step), step
+        foreseen, self._foreseen = self._foreseen, None
+        if foreseen is None or foreseen.period != round(dt, 5):
+            foreseen = self.motion.foresee(self.state, self._torque, dt)
+        return self.motion.go_on(foreseen, torque, dt), foreseen.step
+
+    def _foresee(self):
+        """Begin the prediction of the next sample, whose torque and time step are taken to be this one's."""
+        self._foreseen = self.motion.foresee(self.state, self._torque, self._period)
 
     def _innovations(self, innovation):
         """Publish the innovation of a sample (measurements,)."""
@@ -203,7 +213,10 @@ class Kalman(Observer):
 
     def look_ahead(self):
         step = self._step
-        if not self.converged or step is None or self._steady:
+        if step is None:
+            return
+        self._foresee()
+        if not self.converged or self._steady:
             return
         with suppress(MessageError):  # to be raised by the sample, if it comes so
             self._ahead = step, self.measurement_covariance, self._corrected(step)
@@ -242,7 +255,7 @@ class Kalman(Observer):
 
     def _forget_gain(self):
         self._step, self._steady, self._root, self._gain_transposed = None, False, None, None
-        self._ahead = None  # the result of `look_ahead`
+        self._ahead = self._foreseen = None  # the results of `look_ahead`
 
     def _judge(self):
         self._beyond += self.RECENT * (float(self.innovation_squared > self._bound) - self._beyond)

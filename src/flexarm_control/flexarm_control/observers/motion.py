@@ -7,7 +7,8 @@ A of f at rest in the present configuration, a step of length h under constant t
 
 .. math:: x_{k+1} = x_k + \Gamma f(x_k, u), \qquad \Gamma = \int_0^h e^{As}ds,
 
-exact for any h where f is linear. The nonlinear parts of f (centrifugal and Coriolis forces, Coulomb friction,
+exact for any h where f is linear. f is affine in the torque, so that most of a step is known before its torque is:
+`Motion.foresee`. The nonlinear parts of f (centrifugal and Coriolis forces, Coulomb friction,
 gravity's curvature) are held over the step. Forces of spectral density S on joints and modes (white noise) add
 
 .. math:: Q = \int_0^h e^{As}\,B S B^T e^{A^Ts}ds, \qquad B = \begin{bmatrix}0\\ M^{-1}\end{bmatrix}
@@ -21,12 +22,14 @@ are kept per configuration; a new time step there costs a short series (`flexarm
 matrix exponentials, as at every sample of a source whose stamps jitter or whose samples get lost.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from flexarm_dynamics.linear import state_matrix
-from flexarm_dynamics.sampling import Sampling
+from flexarm_dynamics.sampling import Sampling, Step
 
 #: Steps of the central differences: sizes of a joint angle, a deflection and their rates [rad, m, rad/s, m/s].
 DIFFERENCE = 1e-5
@@ -34,6 +37,8 @@ DIFFERENCE = 1e-5
 KEPT = 256
 #: Configurations that linearisations are kept for; a new one costs a millisecond or so.
 CONFIGURATIONS = 64
+#: A time step that is so close to a design's is the design's [s].
+EXACT = 1e-12
 
 
 def mass_matrix(model, q, delta):
@@ -52,6 +57,19 @@ def force_density(model, x, density):
     return out
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """A step before its torque is known; arrays of N = 2 (n + m) rows."""
+
+    period: float  # that the step was designed for [s]
+    step: Step
+    torque: np.ndarray  # that is expected, (n,) [N m]
+    state: np.ndarray  # after the step under that torque, (N,)
+    rate: np.ndarray  # f under that torque, (N,)
+    push: np.ndarray  # change of the accelerations with the torque, (n + m, n)
+    moved: np.ndarray  # and of the state after the step, (N, n)
+
+
 class Motion:
     """Predicts an arm's state; designs are kept.
 
@@ -65,6 +83,7 @@ class Motion:
     def __init__(self, model, density=None):
         self.model, self.density = model, density
         self._n, self._size = model.n_joints, model.n_joints + model.n_modes
+        self._onto_joints = np.eye(self._size, self._n)
         self._kept = lru_cache(KEPT)(self._design)
         self._linear = lru_cache(CONFIGURATIONS)(lambda *q: Sampling(*self.linearise(np.array(q))))
 
@@ -90,9 +109,31 @@ class Motion:
     def advance(self, x, torque, dt, step):
         """The state after dt under constant torque (n,), shape (N,); `step` from `step_for`."""
         rate = self.model.derivative(x, torque)
-        out = x + step.Gamma @ rate
-        rest = dt - step.length
-        if abs(rest) > 1e-12:
-            rate = step.Phi @ rate  # after the step
-            out += rest * (rate + (0.5 * rest) * (step.A @ rate))
-        return out
+        return _with_rest(x + step.Gamma @ rate, rate, dt, step)
+
+    def foresee(self, x, torque, dt):
+        """The `Foreseen` step over dt [s] from a state (N,), in which a torque (n,) [N m] is expected."""
+        n, size = self._n, self._size
+        rate = self.model.derivative(x, torque)
+        push = dposv(mass_matrix(self.model, x[:n], x[n:size]), self._onto_joints)[1]
+        step = self.step_for(dt, x[:n])
+        state, moved = x + step.Gamma @ rate, step.Gamma[:, size:] @ push
+        return Foreseen(round(dt, 5), step, torque.copy(), state, rate, push, moved)
+
+    def go_on(self, foreseen, torque, dt):
+        """As `advance`, by a `foreseen` step of that period."""
+        change, step = torque - foreseen.torque, foreseen.step
+        rate = foreseen.rate
+        if abs(dt - step.length) > EXACT:
+            rate = rate.copy()
+            rate[self._size :] += foreseen.push @ change
+        return _with_rest(foreseen.state + foreseen.moved @ change, rate, dt, step)
+
+
+def _with_rest(out, rate, dt, step):
+    """What `step` gives, `out`, corrected for the rest of the time dt [s]; `rate` is f before the step."""
+    rest = dt - step.length
+    if abs(rest) > EXACT:
+        rate = step.Phi @ rate  # after the step
+        out += rest * (rate + (0.5 * rest) * (step.A @ rate))
+    return out

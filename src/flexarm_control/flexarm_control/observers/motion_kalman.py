@@ -37,7 +37,7 @@ from flexarm_dynamics.parameters import parameter
 
 from .innovation_memory import InnovationMemory
 from .kalman import NOISE, UNSTATED_STRAIN, Kalman, position_uncertainty
-from .motion import DIFFERENCE, Motion, mass_matrix
+from .motion import DIFFERENCE, EXACT, Motion, mass_matrix
 
 _OF_STRAINS = {p.name: p for p in NOISE if p.name in ("strain_noise", "position_noise")}
 #: Variance of a reading that is none, over that of the gauge's noise.
@@ -217,6 +217,13 @@ class MotionKalman(Kalman):
         self._elapsed = 0.0
         self._publish()
 
+    def _predict(self, torque, dt):
+        step = self.motion.step_for(dt, self.state[: self._n])
+        return self.motion.advance(self.state, torque, dt, step), step
+
+    def _foresee(self):
+        """Nothing: no torque is waited for."""
+
     def _output(self, x):
         return self._C @ x
 
@@ -325,7 +332,7 @@ class PrescribedMotion(Motion):
         rate = self.derivative(x[:moving])
         out[:moving] = x[:moving] + step.Gamma[:moving, :moving] @ rate
         rest = dt - step.length
-        if abs(rest) > 1e-12:
+        if abs(rest) > EXACT:
             out[:moving] += rest * (step.Phi[:moving, :moving] @ rate)
         return out
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Runs the checks of an arm's readings, and says what follows from them.
 
-`judge` looks at a sample before the observer sees it. A single outlier is replaced. `take` looks at it afterwards, as
-the past of the next one. What is found:
+`judge` looks at a sample before the observer sees it. A single outlier is replaced. `take` looks at it once the
+estimate is sent, as the past of the next one, which bears what is found:
 
 ============================================  =======================================================
 a joint position that jumps or stands still   DISTRUSTED: the loop can't do without it
@@ -253,7 +253,6 @@ class Monitor:
         Parameters
         ----------
         sample : ArmSample
-            Its `trust` and `doubt` are set; what its source doubts comes first.
         """
         stamp = sample.stamp_ns
         if self._dt > 0.0:
@@ -267,7 +266,6 @@ class Monitor:
             and not self.doubts.about_any("strain of")
         ):
             self._gauges.doubted[:] = False
-        self.mark(sample)
         self.stamp_ns = stamp
 
     def mark(self, sample):
