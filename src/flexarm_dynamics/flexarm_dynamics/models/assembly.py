@@ -42,8 +42,8 @@ def roomy(data):
         _capacity(data.links, (8, 32)),
         _capacity(data.s.shape[1], (16, 60)),
         _capacity(data.nodes, (92,)),
-        _capacity(data.body_x.size, (4,)),
-        _capacity(len(data.red_tip), (1,)),
+        _capacity(data.body_x.size, (8, 32)),
+        _capacity(len(data.red_tip), (4,)),
     )
 
 
