@@ -74,6 +74,7 @@ def test_the_guides_lines_are_those_of_the_modules():
 
 
 def test_where_nothing_runs_there_is_nothing_to_join(tmp_path, monkeypatch):
+    monkeypatch.setattr("flexarm_tools.arm.MUST_JOIN", 2.0)
     with Bench(tmp_path) as bench:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(bench.domain))
         with pytest.raises(WaitError, match="there is no controller/state to join"):
