@@ -14,7 +14,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 from flexarm_sim.fault_injector import FaultInjector
-from flexarm_studies.attack import actions, command, healthy, lies, report, run
+from flexarm_studies.attack import actions, command, healthy, lies, recoil, report, run
 from flexarm_studies.attack.cases import ARMS, Case, arm_of, chosen, observers
 from flexarm_studies.attack.driver import ALONE, TORQUE_TIMEOUT, Gate
 from flexarm_studies.attack.healthy import healthy_run, motion, plant
@@ -391,6 +391,24 @@ def test_the_table_has_the_worst_of_all_runs_and_the_worst_lie_on_top(tmp_path):
     page.write_text("\n".join(("before", *report.MARKERS, "after")))
     report.write(page, report.summary(rows))
     assert "| a |" in page.read_text() and page.read_text().endswith("after")
+
+
+def test_bent_links_hardly_turn_a_heavy_joint_and_no_torque_that_may_return_holds_a_light_one(
+    honest,
+):
+    assert recoil.recoil(honest, 0.0) < 0.01
+    elbow = run.Honest(Case("two_link", "filtered_derivative", True, noise=False))
+    free, held = recoil.recoil(elbow, 0.0)[1], recoil.recoil(elbow)[1]
+    assert run.CRITERIA["speed"] < held < free
+
+
+def test_a_table_of_recoil_has_each_joint_once(tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("\n".join(("before", *recoil.MARKERS, "after")))
+    words = ("--recoil", "--arms", "R", "--observers", "kalman", "--write", str(page))
+    assert command.attack(options(*words)) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "joint1" in line]
+    assert len(rows) == 1 and rows[0] in page.read_text()
 
 
 @pytest.mark.slow

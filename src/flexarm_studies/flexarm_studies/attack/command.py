@@ -39,6 +39,11 @@ def add_arguments(parser):
     )
     add("--random", type=int, default=0, metavar="N", help="so many random lies beside them (0)")
     add("--healthy", type=int, metavar="SAMPLES", help="no lies: count alarms in healthy samples")
+    add(
+        "--recoil",
+        action="store_true",
+        help="no lies: how fast bent links turn joints that were held, which no control prevents",
+    )
     add("--seed", type=int, default=0, help="of random lies and healthy runs (0)")
     add("--workers", type=int, metavar="N", help="processes (one per core)")
     add(
@@ -69,6 +74,10 @@ def attack(options):
     if options.stored:
         return _report(options, [row for file in options.stored for row in _stored(file)])
     cases = chosen(_split(options.arms), _split(options.observers))
+    if options.recoil:
+        from . import recoil
+
+        return recoil.report(cases, options.write)
     if options.healthy:
         from .healthy import healthy
 
