@@ -5,9 +5,6 @@ import numpy as np
 
 from . import chain, integrators, load, symbols
 
-#: Longer code takes too long to compile; such arms use the recursion in loops.
-MAX_OPERATIONS = 6000
-
 DERIVATIVE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
 
 import numpy as np
@@ -37,11 +34,23 @@ def low_storage(
 """
 
 
-#: What generated code is given where links are foreshortened, in the place of its constants alone.
-UNPACK = ("c, data, scratch, m = c",)
+#: How what is summed at the nodes of foreshortened links gets into the code: there are no sums; as polynomials of the
+#: state, whose coefficients are in a vector; from `chain.sums_at_nodes`, at every evaluation.
+NONE, POLYNOMIALS, AT_NODES = "none", "polynomials", "at nodes"
+#: Longer code takes too long to compile; arms for which there is none use the recursion in loops.
+MAX_OPERATIONS = {NONE: 6000, POLYNOMIALS: 4000, AT_NODES: 6000}
+#: What generated code is then given in the place of its constants alone.
+UNPACK = {NONE: (), POLYNOMIALS: ("c, m = c",), AT_NODES: ("c, data, scratch, m = c",)}
 
 
-def right_hand_side(data, work):
+def ways(data):
+    """How the sums of an arm of this level may get into its code, the fastest first."""
+    if data.level == chain.FIRST_ORDER:
+        return (NONE,)
+    return (POLYNOMIALS, AT_NODES) if data.level == chain.FORESHORTENING else (AT_NODES,)
+
+
+def right_hand_side(data, work, way):
     """Sources of ``derivative(state, net torque, constants, out)`` and its integrators for arms of this structure.
 
     Parameters
@@ -49,13 +58,16 @@ def right_hand_side(data, work):
     data : chain.Data
     work : chain.Work
         Of dtype object.
+    way : str
+        One of `ways`.
 
     Returns
     -------
     sources : tuple of str
-        What `load.joined` makes a module of, with `chain.sums_at_nodes` where links are foreshortened. They depend on
+        What `load.joined` makes a module of, with `chain.sums_at_nodes` where sums come from there. They depend on
         which constants are zero, one, negative, or equal to one another, not on their values.
-    constants : ndarray
+    constants : ndarray, or tuple of two
+        With the coefficients of polynomials.
     operations : int
     """
     n, K = data.links, data.s.shape[1]
@@ -72,19 +84,155 @@ def right_hand_side(data, work):
     )
     zeros = np.zeros((n, K, K), dtype=object)
     none = np.zeros((n, 2), dtype=object)
-    packed = ((exact,), (work,), none, zeros, np.zeros(n, int), np.zeros(m, dtype=object))
-    if data.level != chain.FIRST_ORDER:
-        exact = packed[0][0]._replace(nodes=0)
+    if way != NONE:
+        exact = exact._replace(nodes=0)
+    coefficients = ()
+    if way == POLYNOMIALS:
+        coefficients = Polynomials(data, work, state, graph).coefficients
+    elif way == AT_NODES:
         given_sums(data, work, graph)
-        packed = ((exact,), *packed[1:])
+    packed = ((exact,), (work,), none, zeros, np.zeros(n, int), np.zeros(m, dtype=object))
     chain.derivative(state, torque, packed, out)
     lines, words, constants, operations = symbols.emit(graph, out)
     lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]
-    summed = data.level != chain.FIRST_ORDER
-    begin = _indented([*UNPACK, "sums_at_nodes(data, scratch, x, m)"], 1) + "\n" if summed else ""
-    source = DERIVATIVE.format(begin=begin, body=_indented(lines, 1))
-    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m, summed))
-    return parts, np.array(constants or [0.0]), operations
+    begin = [*UNPACK[way]] + ["sums_at_nodes(data, scratch, x, m)"] * (way == AT_NODES)
+    source = DERIVATIVE.format(begin=_block(begin, 1), body=_indented(lines, 1))
+    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m, way))
+    constants = np.array(constants or [0.0])
+    if way == POLYNOMIALS:
+        constants = constants, np.array(coefficients or [0.0])
+    return parts, constants, operations
+
+
+class Polynomials:
+    r"""What `chain.at_nodes` sums, of second order in the slopes, as polynomials put into the work space.
+
+    The foreshortening is a form in the amplitudes, :math:`s = \sum_{jk}a_{jk}\delta_j\delta_k` with
+    :math:`a_{jk} = \frac12\int_0^x\varphi_j'\varphi_k'`, and so are the integrals over the mass that hold it,
+    with the coefficients
+
+    .. math:: \int a_{jk}dm, \quad \int x\,a_{jk}dm, \quad \int a_{jk}\varphi_l dm, \quad \int a_{jk}a_{lm}dm,
+
+    summed at the nodes once and for all. They are symbols ``m[0]``, ``m[1]`` ...
+
+    Parameters
+    ----------
+    data : chain.Data
+        Of level FORESHORTENING.
+    work : chain.Work
+        Of dtype object.
+    state : ndarray of Symbol, shape (2 (n + m),)
+    graph : symbols.Graph
+
+    Attributes
+    ----------
+    coefficients : list of float
+    """
+
+    def __init__(self, data, work, state, graph):
+        self.coefficients, self._graph = [], graph
+        half = state.size // 2
+        for i in range(data.links):
+            if data.count[i] == 0 or data.reduced[i] >= 0:
+                continue
+            first = data.links + data.first[i]
+            own = slice(first, first + data.count[i])
+            self._link(data, work, i, state[own], state[half:][own])
+
+    def _symbols(self, values):
+        """Symbols of coefficients, an array like that of their values."""
+        out = np.empty(values.shape, dtype=object)
+        for index, value in np.ndenumerate(values):
+            out[index] = self._graph.symbol(f"m[{len(self.coefficients)}]")
+            self.coefficients.append(float(value))
+        return out
+
+    def _link(self, data, work, i, delta, rate):
+        """Put the sums of link i into the work space; its amplitudes and their rates (K,)."""
+        K, G, kinds = delta.size, data.nodes, data.direction[i, : delta.size]
+        link, mode, modes = work.of_link[i], work.of_mode[i, :K], work.of_modes[i]
+        link[:], mode[:], modes[:], work.draws[i], work.bent[i] = 0.0, 0.0, 0.0, 0.0, 0.0
+        bends = kinds != chain.TWIST
+        forms = self._forms = _Forms(kinds, delta, rate)
+        if not forms.pairs:
+            return
+        slope, phi = data.node_slope[i], data.node_phi[i, :, :K]
+        products = np.array([slope[:G, j] * slope[:G, k] for j, k in forms.pairs])
+        a = 0.5 * products @ data.cumulate[i]  # (pairs, G + 1)
+        mass, at = data.node_mass[i, :G], a[:, :G]
+        work.draws[i, :K], link[chain.SHORT_TIP], link[chain.SHORT_TIP_DD] = self._drawn(a[:, G])
+        for b in np.flatnonzero(data.host[: data.bodies] == i):
+            found = self._drawn(a[:, data.body_node[b]])
+            work.body_draws[b, :K], work.of_body[b, 0], work.of_body[b, 1] = found
+        mode[:, chain.P], link[chain.SHORT], link[chain.SHORT_DD] = self._drawn(at @ mass)
+        xp = self._drawn(at @ (mass * data.node_x[i, :G]))[0]
+        modes[:K, :K], mode[:, chain.SDDP] = self._squares((at * mass) @ at.T)
+        sp = 0.5 * (modes[:K, :K] @ delta)
+        mode[:, chain.XP] = xp - sp
+        link[chain.XX] = 0.5 * ((sp - 2.0 * xp) @ delta)
+        self._with_shapes((at * mass) @ phi[:G], kinds, mode)
+        mode[~bends] = 0.0
+
+    def _drawn(self, values):
+        """Sums P_j (K,), s, and its second derivative along the rates, of a form (pairs,)."""
+        forms, values = self._forms, self._symbols(2.0 * values)
+        draws = forms.matrix(values) @ forms.delta
+        return draws, 0.5 * (draws @ forms.delta), values @ forms.squares
+
+    def _squares(self, values):
+        """Sums of P_j P_k, (K, K), and of the second derivative times P_j, (K,); of (pairs, pairs)."""
+        forms, K = self._forms, self._forms.delta.size
+        third, out = np.zeros((K, len(forms.pairs)), dtype=object), np.zeros((K, K), dtype=object)
+        for p, (row, (j, k)) in enumerate(
+            zip(self._symbols(4.0 * values), forms.pairs, strict=True)
+        ):
+            third[:, p] = forms.matrix(row) @ forms.delta
+            out[:, j] += third[:, p] * forms.delta[k]
+            if j != k:
+                out[:, k] += third[:, p] * forms.delta[j]
+        return out, third @ forms.squares
+
+    def _with_shapes(self, values, kinds, mode):
+        """Sums with y, z and the shapes, into `mode`; of (pairs, K)."""
+        forms, values = self._forms, self._symbols(2.0 * values.T)
+        delta, rate = forms.delta, forms.rate
+        across = np.stack([forms.matrix(row) @ delta for row in values], axis=1)  # of P_j phi_l
+        for kind, still, moving in (
+            (chain.Y, chain.YP, chain.YDP),
+            (chain.Z, chain.ZP, chain.ZDP),
+        ):
+            mode[:, still] = across[:, kinds == kind] @ delta[kinds == kind]
+            mode[:, moving] = across[:, kinds == kind] @ rate[kinds == kind]
+        mode[:, chain.SPHI] = 0.5 * (delta @ across)
+        mode[:, chain.SDPHI] = rate @ across
+        mode[:, chain.SDDPHI] = values @ forms.squares
+
+
+class _Forms:
+    """Forms in the amplitudes of a link's modes, of pairs of one direction.
+
+    Attributes
+    ----------
+    pairs : list of (int, int)
+    delta, rate : ndarray, shape (K,)
+    squares : ndarray, shape (pairs,)
+        Of the rates; twice the products of two.
+    """
+
+    def __init__(self, kinds, delta, rate):
+        same = [(j, k) for j, kind in enumerate(kinds) for k in range(j + 1) if kind == kinds[k]]
+        self.pairs = [(j, k) for j, k in same if kinds[j] != chain.TWIST]
+        self.delta, self.rate = delta, rate
+        self.squares = np.array(
+            [rate[j] * rate[k] * (1.0 if j == k else 2.0) for j, k in self.pairs], dtype=object
+        )
+
+    def matrix(self, values):
+        """The symmetric matrix (K, K) of what is stated by pairs."""
+        out = np.zeros((self.delta.size, self.delta.size), dtype=object)
+        for (j, k), value in zip(self.pairs, values, strict=True):
+            out[j, k] = out[k, j] = value
+        return out
 
 
 def given_sums(data, work, graph):
@@ -139,7 +287,7 @@ def room_for_sums(data):
     return links + sum(2 + k for k in hosts if k)
 
 
-def _low_storage(graph, out, n, half, summed):
+def _low_storage(graph, out, n, half, way):
     lines, words, _, _ = symbols.emit(graph, out, scalars=True)
     # Of each pair of states (z, rate): rate is the derivative of z, and a that of the rate.
     pairs = [(i, half + i) for i in range(half)]
@@ -156,10 +304,13 @@ def _low_storage(graph, out, n, half, summed):
         ]
     every = range(2 * half)
     scratch = [f"point[{i}] = x{i}" for i in (*range(n, half), *range(half + n, 2 * half))]
-    sums = [*scratch, "sums_at_nodes(data, scratch, point, m)"]
+    sums, begin = [], [*UNPACK[way]]
+    if way == AT_NODES:
+        sums = [*scratch, "sums_at_nodes(data, scratch, point, m)"]
+        begin.append("point = work[0]")
     return LOW_STORAGE.format(
-        begin_all=_indented([*UNPACK, "point = work[0]"], 1) + "\n" if summed else "",
-        sums=_indented(sums, 3) + "\n" if summed else "",
+        begin_all=_block(begin, 1),
+        sums=_block(sums, 3),
         read=_indented([f"s{i} = state[{i}]" for i in every], 1),
         begin=_indented([f"x{i} = w{i} = s{i}" for i in every], 2),
         torque=_indented(torque, 3),
@@ -168,6 +319,11 @@ def _low_storage(graph, out, n, half, summed):
         end=_indented([f"s{i} = w{i}" for i in every], 2),
         write=_indented([f"state[{i}] = s{i}" for i in every], 1),
     )
+
+
+def _block(lines, depth):
+    """As `_indented`, ended if there are lines."""
+    return _indented(lines, depth) + "\n" if lines else ""
 
 
 def _indented(lines, depth):

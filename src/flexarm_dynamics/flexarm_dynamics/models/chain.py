@@ -599,21 +599,27 @@ class Chain(ArmModel):
     @cached_property
     def straight_line(self):
         """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
+        return self._generated and self._generated[:2]
+
+    @cached_property
+    def _generated(self):
+        """As `straight_line`, with how sums get into the code."""
         if not self._compiled:
             return None
-        sources, constants, operations = generated.right_hand_side(
-            self.data, work_space(self.data, object)
-        )
-        if operations > generated.MAX_OPERATIONS:
-            return None
-        given = None if self.data.level == plain.FIRST_ORDER else self.kernel
-        return load.joined("generated", sources, inline=INLINE, given=given), constants
+        for way in generated.ways(self.data):
+            sources, constants, operations = generated.right_hand_side(
+                self.data, work_space(self.data, object), way
+            )
+            if operations <= generated.MAX_OPERATIONS[way]:
+                given = self.kernel if way == generated.AT_NODES else None
+                return load.joined("generated", sources, inline=INLINE, given=given), constants, way
+        return None
 
     def stepper(self, method, straight_line=True):
         """As `ArmModel.stepper`; ``straight_line=False`` asks for the recursion in loops."""
-        if method is not None and straight_line and self.straight_line is not None:
-            module, data = self.straight_line
-            if self.data.level != plain.FIRST_ORDER:
+        if method is not None and straight_line and self._generated is not None:
+            module, data, way = self._generated
+            if way == generated.AT_NODES:
                 room = np.zeros(max(1, generated.room_for_sums(self.data)))
                 data = (data, self._data, self._new_work(), room)
             return explicit_stepper(module, method, data, self)
