@@ -8,19 +8,23 @@ nominal arm's file.
 """
 
 import argparse
+import itertools
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
 from .. import workers
 from ..recordings.motion import CORNER
 from . import recording as recordings
 from .currents import motor_fits, torques
+from .fit import NORMAL
 from .strain_fit import Options, StrainProblem, identify_strains
 
 NOMINAL = """
@@ -47,7 +51,9 @@ SPREAD = 0.2
 BIAS, DRIFT, DELAY, OFFSET = 50e-6, 15e-6, 0.008, 0.03
 #: Noise that gauges share, its memory, and noise of each [-]; of the current [A]; torque per ampere [N m/A].
 COMMON, MEMORY, OWN, OF_CURRENT, CONSTANT = 1.0e-6, 0.5, 0.3e-6, 0.03, 12.0
-RATE, SECONDS = 100.0, 20.0
+RATE, SECONDS = 100.0, 10.0
+#: Starts of each fit.
+STARTS = 1
 
 
 def motion():
@@ -56,11 +62,9 @@ def motion():
     angle = np.full(time.size, 0.4)
     moves = (
         (0.6, 0.6, 1.2),
-        (3.0, 0.5, 1.0),
-        (6.0, 0.7, -1.4),
-        (9.0, 0.5, 1.6),
-        (12.0, 0.6, -0.8),
-        (15.0, 0.5, -1.2),
+        (2.6, 0.5, 1.0),
+        (4.6, 0.7, -1.4),
+        (7.0, 0.5, 1.6),
     )
     for at, long, size in moves:
         s = np.clip((time - at) / long, 0.0, 1.0)
@@ -102,7 +106,7 @@ def drawn(seed):
 def one(seed):
     """Rows of one arm: name, true value, value found, half-width."""
     run, truth = drawn(seed)
-    found = identify_strains(arm_file.parse(NOMINAL), run, Options(hold=HOLD, starts=2))
+    found = identify_strains(arm_file.parse(NOMINAL), run, Options(hold=HOLD, starts=STARTS))
     rows = [
         (q.name, truth[q.name], float(v), float(w))
         for q, v, w in zip(found.quantities, found.values, found.half_widths, strict=True)
@@ -116,8 +120,8 @@ def one(seed):
     return rows
 
 
-def run(arms, seed=0, count=None, progress=None):
-    """Identify so many `arms`; a row per parameter: how many intervals covered, errors, half-widths.
+def run(arms, seed=0, count=None, progress=None, path=None):
+    """Rows of so many `arms`, each identified from its own recording, as `one` gives them.
 
     Parameters
     ----------
@@ -127,33 +131,80 @@ def run(arms, seed=0, count=None, progress=None):
         Processes.
     progress : callable, optional
         ``progress(done)``
+    path : str or Path, optional
+        File with a line of JSON for each arm that is done; those that it has are not computed again.
+
+    Raises
+    ------
+    FlexarmError
+        For a file that can't be read.
     """
-    table = {}
-    calls = [([seed, k],) for k in range(arms)]
-    for done, (_, rows) in enumerate(workers.results(one, calls, count)):
-        for name, true, value, width in rows:
-            row = table.setdefault(name, {"arms": 0, "covered": 0, "errors": [], "widths": []})
-            row["arms"] += 1
-            row["covered"] += bool(abs(value - true) <= width)
-            row["errors"].append(abs(value - true) / max(abs(true), 1e-300))
-            row["widths"].append(width / max(abs(true), 1e-300))
+    done = _kept(path)
+    missing = [k for k in range(arms) if (seed, k) not in done]
+    for i, rows in workers.results(one, [([seed, k],) for k in missing], count):
+        done[seed, missing[i]] = rows
+        if path is not None:
+            with Path(path).open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"seed": seed, "arm": missing[i], "rows": rows}) + "\n")
         if progress:
-            progress(done + 1)
-    return table
+            progress(len(done))
+    return [done[seed, k] for k in range(arms)]
 
 
-def text(table):
-    """Lines of the table of `run`, as Markdown."""
-    yield "| parameter | covered | median error [%] | largest error [%] | median half-width [%] |"
-    yield "| --- | --- | --- | --- | --- |"
-    for name, row in table.items():
+def _kept(path):
+    """What a file of `run` has: (seed, arm) to rows."""
+    if path is None or not Path(path).exists():
+        return {}
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        kept = [json.loads(line) for line in lines]
+        return {(k["seed"], k["arm"]): k["rows"] for k in kept}
+    except (ValueError, KeyError, TypeError, OSError):
+        hint = "give another name, or remove it"
+        raise FlexarmError(
+            "is no file of this study", field=str(path), limit="lines of JSON", hint=hint
+        ) from None
+
+
+def table(rows_of_arms):
+    """How many intervals covered, with errors, half-widths and the mean square of error over deviation.
+
+    Parameters
+    ----------
+    rows_of_arms : list
+        Of `run`.
+
+    Returns
+    -------
+    dict
+        By the parameter's name.
+    """
+    made = {}
+    for name, true, value, width in itertools.chain.from_iterable(rows_of_arms):
+        row = made.setdefault(
+            name, {"arms": 0, "covered": 0, "errors": [], "widths": [], "squares": []}
+        )
+        row["arms"] += 1
+        row["covered"] += bool(abs(value - true) <= width)
+        row["errors"].append(abs(value - true) / max(abs(true), 1e-300))
+        row["widths"].append(width / max(abs(true), 1e-300))
+        row["squares"].append((NORMAL * (value - true) / width) ** 2)
+    return made
+
+
+def text(made):
+    """Lines of a `table`, as Markdown."""
+    yield "| parameter | covered | median error [%] | largest [%] | median half-width [%] | (error / deviation)² |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for name, row in made.items():
         errors, widths = 100.0 * np.array(row["errors"]), 100.0 * np.array(row["widths"])
         yield (
             f"| `{name}` | {row['covered']} of {row['arms']} | {np.median(errors):.2g} | {errors.max():.2g} |"
-            f" {np.median(widths):.2g} |"
+            f" {np.median(widths):.2g} | {np.mean(row['squares']):.2f} |"
         )
-    covered, arms = (sum(row[k] for row in table.values()) for k in ("covered", "arms"))
-    yield f"| all | {100.0 * covered / arms:.1f} % | | | |"
+    covered, arms = (sum(row[k] for row in made.values()) for k in ("covered", "arms"))
+    mean = np.mean(np.concatenate([row["squares"] for row in made.values()]))
+    yield f"| all | {100.0 * covered / arms:.1f} % | | | | {mean:.2f} |"
 
 
 def main(words=None):
@@ -162,12 +213,19 @@ def main(words=None):
     parser.add_argument("--arms", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int)
+    parser.add_argument(
+        "--out", metavar="FILE", help="keep each arm in this file; the same command goes on from it"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(words)
     model.build(arm_file.parse(NOMINAL))  # a clear error before the workers start
     shown = lambda done: print(f"{done} of {options.arms}", file=sys.stderr, flush=True)  # noqa: E731
-    table = run(options.arms, options.seed, options.workers, shown)
-    print(json.dumps(table) if options.json else "\n".join(text(table)))
+    try:
+        rows = run(options.arms, options.seed, options.workers, shown, options.out)
+    except FlexarmError as error:
+        sys.exit(f"strain_coverage: {error}")
+    made = table(rows)
+    print(json.dumps(made) if options.json else "\n".join(text(made)))
 
 
 if __name__ == "__main__":

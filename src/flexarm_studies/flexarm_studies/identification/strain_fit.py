@@ -56,8 +56,12 @@ VARIED = ("EI", "transmission_stiffness", "transmission_play")
 LATER = ("offset", "delay", "drift", "hub_inertia")
 #: Each start is fitted to the first samples, this fraction of all, at least so many seconds of them.
 START_PART, START_SECONDS = 0.35, 10.0
-#: Evaluations of a start, and of each pass with new weights.
-START_STEPS, PASS_STEPS, PASSES = 12, 12, 4
+#: Evaluations of a start, and of each pass with new weights; largest number of passes.
+START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
+#: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
+FIRST_TOLERANCE = 1e-4
+#: The weights belong to the values once a pass leaves at least this fraction of the sum of squares [-].
+SETTLED = 0.98
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-4
 #: Deviation of the prior about the file's value, in scales: what strains hardly tell stays near it [-].
@@ -374,7 +378,7 @@ class StrainProblem:
 
         self.best = (np.inf, None)
         least_squares(
-            residuals, start, jacobian, (low, np.full(start.size, np.inf)),
+            residuals, start, jacobian, (low, np.full(start.size, np.inf)), x_scale="jac",
             max_nfev=steps, ftol=tolerance, xtol=1e-8, gtol=1e-12,
         )  # fmt: skip
         self.cost, self.values = self.best
@@ -399,12 +403,19 @@ class StrainProblem:
         stage = 0 if state is None or state.best is None else state.best["stage"]
         for number in range(stage, PASSES):
             self.weigh()
-            self.solve(PASS_STEPS, 1e-6, keep=self._keeper(state, number))
+            self.solve(PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number))
             report(f"pass {number + 1} of {PASSES}: {self.cost:.6g}")
             if number == 0:
                 self.leave_out_alike()
             if state is not None:
                 state.keep_best(self.snapshot(number + 1))
+            if number > 0 and self.cost > SETTLED * self.used:
+                break
+        else:
+            self.warnings.append(
+                f"the fit has not settled after {PASSES} passes: its intervals may be too narrow; fit from other"
+                " values (--starts), or hold what you know"
+            )
         self.weigh()
 
     def _keeper(self, state, number):
