@@ -403,7 +403,9 @@ class StrainProblem:
         stage = 0 if state is None or state.best is None else state.best["stage"]
         for number in range(stage, PASSES):
             self.weigh()
-            self.solve(PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number))
+            self.solve(
+                PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number)
+            )
             report(f"pass {number + 1} of {PASSES}: {self.cost:.6g}")
             if number == 0:
                 self.leave_out_alike()

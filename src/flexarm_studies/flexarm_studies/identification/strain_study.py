@@ -9,7 +9,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 from ..recordings import rest
 from ..recordings.summary import quiet_and_rings
-from . import scores
+from . import pickup, scores
 from .currents import motor_fits
 from .prescribed import MotionPredictor
 from .strain_fit import Options, identify_strains, predict
@@ -28,11 +28,14 @@ class Study:
         Beginning and end, as the recording counts the time [s]; None: all of it, and nothing but the fitted part.
     above : float
         Frequency above which scores are given beside those of everything [Hz].
+    pickup : float, or None
+        Frequency above which gauges are taken to pick up the motor currents, see `pickup` [Hz]; None: they don't.
     """
 
     fit: tuple | None = None
     score: tuple | None = None
     above: float = 1.0
+    pickup: float | None = None
 
 
 def whole_of(recording):
@@ -60,7 +63,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     -------
     found : StrainFit
     result : dict
-        Plain data: ``parts`` with scores by gauge, ``ring_downs``, ``currents``.
+        Plain data: ``parts`` with scores by gauge, ``ring_downs``, ``currents``, ``pickup``.
     run : tuple
         Recording, measured and predicted strains (s, g), from the beginning to the end of all that was predicted.
     """
@@ -75,12 +78,14 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     found = identify_strains(arm, run.part(fitted.stop), options, **fitting)
     middle = 0.5 * (fitted.stop - 1) * run.period
     predicted = predict(found, run, options, middle)
-    parts = {"fit": _scored(found, recording, run, predicted, fitted, fitted, wanted, options)}
+    picked = _picked(run, predicted, fitted, wanted)
+    given = found, recording, run, predicted, picked
+    parts = {"fit": _scored(*given, fitted, fitted, wanted, options)}
     if other is None and score is not None:
         scored = slice(max(row(score[0]), 0), min(row(score[1]), len(run.position)))
-        parts["score"] = _scored(found, recording, run, predicted, scored, fitted, wanted, options)
+        parts["score"] = _scored(*given, scored, fitted, wanted, options)
     elif other is not None:
-        parts["score"] = _other(found, other, score, wanted, options)
+        parts["score"] = _other(found, other, score, picked, wanted, options)
     noise = _noise(recording, found)
     rings = scores.ring_downs(run, predicted, noise)
     last = scored if other is None and score is not None else fitted
@@ -91,6 +96,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
         "parts": parts,
         "currents": [_motor(m) for m in motors],
         "ring_downs": [_ring(run, *r) for r in rings],
+        "pickup": _pickup(picked),
     }
     return found, result, (run, predicted)
 
@@ -104,12 +110,32 @@ def _begin(recording, start):
     return recording.start + recording.period * (before + (standing[-1] if standing.size else 0))
 
 
+def _picked(run, predicted, fitted, wanted):
+    """The `Pickup` that was asked for, or None."""
+    if wanted.pickup is None:
+        return None
+    return pickup.fit(run, run.strain - predicted, fitted, wanted.pickup)
+
+
+def _with_pickup(made, sizes, picked, run):
+    """Add to the predictions `made` that of the model with what the gauges pick up, if that is of use."""
+    if picked is not None and picked.useful:
+        made["with pickup"] = made["model"] + picked.strain(run)[:, None]
+        sizes["with pickup"] = picked.taps.size
+
+
+def _pickup(picked):
+    if picked is None:
+        return None
+    return {"above_hz": picked.above, "left": picked.left, "useful": picked.useful}
+
+
 def _noise(recording, found):
     quiet, _ = quiet_and_rings(recording, rest.stretches(recording))
     return found.noise if quiet is None else quiet.rms
 
 
-def _scored(found, recording, run, predicted, part, fitted, wanted, options):
+def _scored(found, recording, run, predicted, picked, part, fitted, wanted, options):
     """Scores of the model and of what needs none on a `part` of a run, as plain data."""
     if part.stop - part.start < 20:
         raise FlexarmError(
@@ -117,14 +143,14 @@ def _scored(found, recording, run, predicted, part, fitted, wanted, options):
         )
     predictor = MotionPredictor(found.setup.arm, run, options.corner)
     motion = predictor.position, predictor.velocity, predictor.acceleration
-    made = {"model": predicted}
-    sizes = {}
+    made, sizes = {"model": predicted}, {}
+    _with_pickup(made, sizes, picked, run)
     for name, (values, size) in scores.baselines(motion, run.strain, fitted).items():
         made[name], sizes[name] = values, size
     return _table(found, recording, run, made, sizes, part, wanted.above)
 
 
-def _other(found, other, score, wanted, options):
+def _other(found, other, score, picked, wanted, options):
     """Scores on another recording, with the biases of its longest rest."""
     predicted = predict(found, other, options)
     rests = sorted(rest.stretches(other), key=lambda p: p.stop - p.start)
@@ -132,7 +158,9 @@ def _other(found, other, score, wanted, options):
         predicted = predicted + np.nanmean((other.strain - predicted)[rests[-1]], axis=0)
     rows = np.round((np.array(score) - other.start) / other.period).astype(int)
     part = slice(max(int(rows[0]), 0), min(int(rows[1]), len(other.position)))
-    return _table(found, other, other, {"model": predicted}, {}, part, wanted.above)
+    made, sizes = {"model": predicted}, {}
+    _with_pickup(made, sizes, picked, other)
+    return _table(found, other, other, made, sizes, part, wanted.above)
 
 
 def _table(found, recording, run, made, sizes, part, above):

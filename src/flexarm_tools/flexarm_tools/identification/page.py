@@ -17,6 +17,8 @@ from ..report.page import digits
 DEGREES, MICRO = 180.0 / np.pi, 1e6
 #: Lags of the residuals' correlation [samples], and samples of a segment of the spectra.
 LAGS, SEGMENT = 60, 512
+#: A modelled frequency is near the measured one within this fraction, a damping ratio within this factor [-].
+NEAR, DAMPED = 0.02, 1.5
 #: Names along the matrix of correlations at most.
 MAX_NAMES = 45
 
@@ -90,7 +92,8 @@ def _page(found, run, shown, result):
         short=short(result),
         traces=json.dumps(traces, allow_nan=False).replace("<", "\\u003c"),
         parts=_parts(result),
-        rings=result.get("ring_downs", []),
+        rings=[_judged(ring) for ring in result.get("ring_downs", [])],
+        picked=result.get("pickup"),
         currents=result.get("currents", []),
         spectra=_drawn(lambda axes: _spectra(axes, shown, run.period), "spectra", len(shown)),
         parameters=[_parameter(row) for row in result["parameters"]],
@@ -131,19 +134,29 @@ def short(result):
             f"{name} {digits(row['model']['vaf'], 4)} %" for name, row in gauges.items()
         )
         yield f"Variance accounted for where {what}: {cells}."
-    rings = [r for r in result.get("ring_downs", []) if r["modelled_frequency"]]
+    if (picked := result.get("pickup")) and picked["useful"]:
+        score = result["parts"].get("score") or result["parts"]["fit"]
+        cells = ", ".join(
+            f"{name} {digits(row['with pickup']['vaf'], 4)} %"
+            for name, row in score.items()
+            if "with pickup" in row
+        )
+        yield f"With what all gauges pick up from the motor currents above {picked['above_hz']:g} Hz: {cells}."
+    rings = [_judged(r) for r in result.get("ring_downs", []) if r["modelled_frequency"]]
     if rings:
-        near = sum(
-            abs(r["modelled_frequency"] / r["measured_frequency"] - 1.0) < 0.02 for r in rings
-        )
-        damped = sum(
-            1 / 1.5 < (r["modelled_damping"] or 0.0) / max(r["measured_damping"], 1e-9) < 1.5
-            for r in rings
-        )
+        near, damped = (sum(ring[key] for ring in rings) for key in ("near", "damped"))
         yield (
-            f"Of {len(rings)} ring-downs the model has {near} frequencies within 2 % and {damped} damping ratios"
-            " within a factor of 1.5."
+            f"Of {len(rings)} ring-downs the model has {near} frequencies within {100.0 * NEAR:g} % and {damped}"
+            f" damping ratios within a factor of {DAMPED:g}."
         )
+
+
+def _judged(ring):
+    """A ring-down, and whether the model's frequency and damping are near the measured ones."""
+    frequency, damping = (ring[f"modelled_{what}"] for what in ("frequency", "damping"))
+    near = frequency is not None and abs(frequency / ring["measured_frequency"] - 1.0) < NEAR
+    ratio = (damping or 0.0) / max(ring["measured_damping"], 1e-9)
+    return ring | {"near": near, "damped": 1.0 / DAMPED < ratio < DAMPED}
 
 
 def _parts(result):
@@ -228,9 +241,10 @@ def _correlation(found):
         size = 2.6 + 0.2 * len(names)
         figure, ax = plt.subplots(figsize=(size + 0.8, size), layout="constrained")
         drawn = ax.imshow(rho, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+        ax.grid(visible=False)
         ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
         ax.set_yticks(range(len(names)), names, fontsize=7)
-        figure.colorbar(drawn, ax=ax, shrink=0.6)
+        figure.colorbar(drawn, ax=ax, shrink=0.6, label="correlation [-]")
         return _closed(figure, "correlation")
 
 
@@ -352,7 +366,7 @@ h3 { font-size: 15px; margin: 12px 0 0; font-weight: 600; }</style>
 <section id="short"><h2>In short</h2><ul class="short">{% for line in short %}<li>{{ line }}</li>{% endfor %}</ul>
 {% if notes %}<h2 style="margin-top:14px">Notes</h2><ul class="short notes">{% for note in notes %}<li>{{ note }}</li>{% endfor %}</ul>{% endif %}</section>
 <section id="overlays"><h2>Measured and predicted</h2>
-<p class="caption">Grey: measured; blue: predicted; red: measured less predicted. Drag over a time to zoom, turn the wheel to zoom about the pointer, double click for all. All figures show the same time.</p>
+<p class="caption">Grey: measured; blue: predicted; red: measured less predicted. Drag over a time to zoom, turn the wheel to zoom about the pointer, double click for all. All figures show the same time, in seconds.</p>
 <div class="controls"><button id="whole" type="button">All</button><output id="range"></output></div>
 <div id="plots"></div>
 <script type="application/json" id="traces">{{ traces|safe }}</script>
@@ -367,15 +381,15 @@ JSON.parse(document.getElementById("traces").textContent).channels.forEach(funct
 });
 </script></section>
 {% if parts %}<section id="scores"><h2>Scores</h2>
-<p class="caption">Variance accounted for [%], the same above the frequency [%], rms of the residual [microstrain]; beside regressions that need no model, and beside what the noise at rest would leave to a perfect one.</p>
+<p class="caption">Variance accounted for [%], the same above the frequency [%], rms of the residual [microstrain]; beside regressions that need no model, and beside what the noise at rest would leave to a perfect one (ceiling).{% if picked %} With pickup: the model, and what all gauges pick up from the motor currents above {{ digits(picked.above_hz) }} Hz.{% endif %}</p>
 {% for part in parts %}<h3>{{ part.title }}</h3><div class="scroll"><table><thead><tr><th></th>{% for g in part.gauges %}<th scope="col">{{ g }}</th>{% endfor %}</tr></thead><tbody>
 {% for key, cells in part.rows %}<tr><th scope="row">{{ key }}</th>{% for c in cells %}<td>{% if c %}{{ digits(c.vaf, 4) }} <span class="small">{{ digits(c.vaf_above) }}; {{ digits(c.rms) }}</span>{% else %}–{% endif %}</td>{% endfor %}</tr>
 {% endfor %}<tr><th scope="row">residual, correlation from sample to sample</th>{% for value, bound in part.white %}<td>{{ digits(value, 2) }} <span class="small">(white: within {{ digits(bound, 2) }})</span></td>{% endfor %}</tr></tbody></table></div>
 {% endfor %}
-{% if rings %}<h3>Ring-downs</h3><div class="scroll"><table><thead><tr><th>time [s]</th><th>gauge</th><th>measured [Hz]</th><th>modelled [Hz]</th><th>damping measured</th><th>modelled</th></tr></thead><tbody>
-{% for r in rings %}<tr><td>{{ "%.2f"|format(r.from_s) }} to {{ "%.2f"|format(r.to_s) }}</td><td>{{ r.gauge }}</td><td>{{ digits(r.measured_frequency, 4) }}</td><td>{{ digits(r.modelled_frequency, 4) }}</td><td>{{ digits(r.measured_damping) }}</td><td>{{ digits(r.modelled_damping) }}</td></tr>
+{% if rings %}<h3>Ring-downs</h3><p class="caption">Red: the model's frequency is off by more than 2 %, or its damping ratio by more than a factor of 1.5. Intervals of 95 %.</p><div class="scroll"><table><thead><tr><th>time [s]</th><th>gauge</th><th>measured [Hz]</th><th>modelled [Hz]</th><th>damping measured</th><th>modelled</th></tr></thead><tbody>
+{% for r in rings %}<tr><td>{{ "%.2f"|format(r.from_s) }} to {{ "%.2f"|format(r.to_s) }}</td><td>{{ r.gauge }}</td><td>{{ digits(r.measured_frequency, 4) }} ± {{ digits(r.frequency_width, 2) }}</td><td{% if not r.near %} class="bad"{% endif %}>{{ digits(r.modelled_frequency, 4) }}</td><td>{{ digits(r.measured_damping) }} ± {{ digits(r.damping_width, 2) }}</td><td{% if not r.damped %} class="bad"{% endif %}>{{ digits(r.modelled_damping) }}</td></tr>
 {% endfor %}</tbody></table></div>{% endif %}
-{% if currents %}<h3>Motor currents</h3><div class="scroll"><table><thead><tr><th>joint</th><th>torque per ampere [N m/A]</th><th>viscous [N m s/rad]</th><th>Coulomb [N m]</th><th>left where fitted</th><th>left where scored</th></tr></thead><tbody>
+{% if currents %}<h3>Motor currents</h3><p class="caption">The model's torque and friction, by regression. Left: fraction of the current's sum of squares that they do not explain.</p><div class="scroll"><table><thead><tr><th>joint</th><th>torque per ampere [N m/A]</th><th>viscous [N m s/rad]</th><th>Coulomb [N m]</th><th>left where fitted</th><th>left where scored</th></tr></thead><tbody>
 {% for m in currents %}<tr><td>{{ m.joint }}</td>{% for k in ("torque_constant", "viscous", "coulomb") %}<td>{% if m.explained %}{{ digits(m[k].value) }} ± {{ digits(m[k].half_width, 2) }}{% else %}not explained{% endif %}</td>{% endfor %}<td>{{ digits(m.left_of_fitted) }}</td><td>{{ digits(m.left_of_scored) }}</td></tr>
 {% endfor %}</tbody></table></div>{% endif %}
 </section>{% endif %}

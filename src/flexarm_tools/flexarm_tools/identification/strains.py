@@ -64,6 +64,12 @@ def add_arguments(parser):
         action="store_true",
         help="in the end, fit the damping to the decay of ring-downs: strains alone overestimate it",
     )
+    add(
+        "--pickup",
+        type=float,
+        metavar="HZ",
+        help="score also with what all gauges pick up from the motor currents above this frequency",
+    )
     add("--free", nargs="+", action="extend", default=[], metavar="NAME",
         help="find these, too, which are held by default: 'gauges[*].position'")  # fmt: skip
     add(
@@ -92,6 +98,7 @@ def asked(options):
             options.free,
             options.state,
             options.ring_downs,
+            options.pickup,
         )
     )
 
@@ -111,7 +118,9 @@ def identify(options, arm, measured, progress):
     FlexarmError
         For options out of range, and as `strain_study.study`.
     """
-    wanted = Study(span(options.fit, "--fit"), span(options.score, "--score"), options.above)
+    wanted = Study(
+        span(options.fit, "--fit"), span(options.score, "--score"), options.above, options.pickup
+    )
     if options.starts < 1:
         raise FlexarmError(
             "is too small", field="--starts", value=options.starts, limit="1 or more"
@@ -225,6 +234,12 @@ def text_of(result, line):
             f"current of {motor['joint']}: {_pair(constant)} N m/A, friction {_pair(viscous)} N m s/rad and"
             f" {_pair(coulomb)} N m; {motor['left_of_fitted']:.3f} of it is left where fitted,"
             f" {motor['left_of_scored']:.3f} where scored"
+        )
+    if (picked := result["pickup"]) is not None:
+        use = "" if picked["useful"] else ": no use, so not counted"
+        yield (
+            f"common to all gauges, from the motor currents above {picked['above_hz']:g} Hz: leaves"
+            f" {picked['left']:.3f} of what the model leaves there, in blocks it was not fitted to{use}"
         )
     if result["ring_downs"]:
         yield ""
