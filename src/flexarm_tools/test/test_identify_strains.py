@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """`flexarm identify` without torque: what is fitted, what is scored, what is written, and going on where it stopped."""
 
+import contextlib
+import io
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_studies.identification import strain_fit
 
@@ -23,6 +27,7 @@ joints:
     stiffness: 700.0           # a guess
     damping: 2.0
     play: 0.010
+    rounding: 0.002
 links:
 - name: beam
   length: 0.6
@@ -89,13 +94,22 @@ def identify(flexarm, folder):
     return run
 
 
-def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(identify, folder):
-    out, plot = folder / "out.yaml", folder / "fit.png"
-    code, printed, err = identify(
-        *HOLD, "--fit", "0:8", "--score", "8:12", "--json", "--out", out, "--plot", plot,
+@pytest.fixture(scope="module")
+def whole(folder):
+    """A fit to its end by the command: what it printed as JSON, and the files that it wrote."""
+    out, plot, printed = folder / "out.yaml", folder / "fit.png", io.StringIO()
+    words = (
+        "identify", folder / "run.csv", folder / "arm.yaml", "--mapping", folder / "mapping.yaml", *HOLD,
+        "--fit", "0:8", "--score", "8:12", "--json", "--out", out, "--plot", plot,
     )  # fmt: skip
-    assert code == 0, err
-    result = json.loads(printed)
+    with contextlib.redirect_stdout(printed), pytest.raises(SystemExit) as stop:
+        cli.main([str(word) for word in words])
+    assert stop.value.code == 0
+    return SimpleNamespace(result=json.loads(printed.getvalue()), out=out, plot=plot)
+
+
+def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(whole):
+    result = whole.result
     for row in result["parts"]["score"].values():
         assert row["model"]["vaf"] > 99.5 and row["model"]["vaf"] > row["rigid"]["vaf"] + 1.0
         assert row["ceiling"]["vaf"] > row["model"]["vaf"] - 0.5
@@ -107,12 +121,12 @@ def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(iden
     assert result["ring_downs"]
     for ring in result["ring_downs"]:
         assert ring["modelled_frequency"] == pytest.approx(ring["measured_frequency"], rel=0.02)
-    text, made = out.read_text(), arm_file.load(out)
+    text, made = whole.out.read_text(), arm_file.load(whole.out)
     assert made.links[0].stiffness["y"] == pytest.approx(stiffness["value"], rel=1e-5)
     line = next(line for line in text.splitlines() if "EI_y:" in line and "#" in line)
     assert "identified: +- " in line and "a guess" not in line
     assert "hub_inertia: 0.03            # assumed" in text
-    assert "root delay" in text and plot.stat().st_size > 10_000
+    assert "root delay" in text and whole.plot.stat().st_size > 10_000
 
 
 def test_the_page_has_all_parts_every_number_and_nothing_from_the_network(
@@ -149,7 +163,9 @@ def test_without_parts_all_is_fitted_and_printed_for_people(identify, few_steps)
     assert "start 1 of 1" in err and "pass 1 of" in err
 
 
-def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(identify, folder):
+def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(
+    identify, folder, few_steps
+):
     state = folder / "state.json"
     code, first, err = identify(*HOLD, "--fit", "0:5", "--state", state, "--json")
     assert code == 0 and "start 1 of 1" in err, err
@@ -172,20 +188,51 @@ def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(identify
         (("--fit", "90:95"), "samples"),
         (("--above", "60"), "half of the rate"),
         (("--starts", "0"), "--starts"),
+        (("--pickup", "8", *HOLD), "has no motor current"),
         (("--free", "links[7].EI_y"), "matches no parameter"),
     ],
 )
-def test_options_out_of_range_are_refused(identify, words, message):
+def test_options_out_of_range_are_refused(identify, words, message, few_steps):
     code, _, err = identify(*words)
     assert code != 0 and message in err
 
 
-def test_another_file_is_scored_with_its_own_bias(identify, folder):
+def test_another_file_is_scored_with_its_own_bias(flexarm, folder, whole, few_steps):
     rows = np.genfromtxt(folder / "run.csv", delimiter=",", skip_header=1)
     rows[:, 2:] += 40.0
     other = folder / "other.csv"
     np.savetxt(other, rows, delimiter=",", header="t,shoulder,root,middle", comments="")
-    code, printed, err = identify(*HOLD, "--fit", "0:8", "--score-file", other, "--json")
+    code, printed, err = flexarm(
+        "identify", folder / "run.csv", whole.out, "--mapping", folder / "mapping.yaml", *HOLD,
+        "--fit", "0:8", "--score-file", other, "--json",
+    )  # fmt: skip
     assert code == 0, err
     for row in json.loads(printed)["parts"]["score"].values():
         assert row["model"]["vaf"] > 99.5 and row["model"]["rms"] < 2e-6
+
+
+def test_what_gauges_pick_up_from_the_currents_is_scored_beside_the_model(
+    flexarm, folder, whole, few_steps
+):
+    rows = np.genfromtxt(folder / "run.csv", delimiter=",", skip_header=1)
+    current = np.random.default_rng(2).standard_normal((len(rows), 1))
+    rows[:, 2:] += 3.0 * current
+    path, mapping = folder / "driven.csv", folder / "currents.yaml"
+    np.savetxt(
+        path, np.hstack([rows, current]), delimiter=",", header="t,shoulder,root,middle,amps", comments=""
+    )  # fmt: skip
+    mapping.write_text(
+        MAPPING + "- {column: amps, quantity: current, joint: shoulder, unit: A}\n",
+        encoding="utf-8",
+    )
+    page = folder / "pages" / "pickup.html"
+    code, printed, err = flexarm(
+        "identify", path, whole.out, "--mapping", mapping, *HOLD, "--fit", "0:8", "--score", "8:12",
+        "--pickup", 8, "--json", "--report", page,
+    )  # fmt: skip
+    assert code == 0, err
+    result = json.loads(printed)
+    assert result["pickup"]["useful"] and result["pickup"]["left"] < 0.2
+    for row in result["parts"]["score"].values():
+        assert row["with pickup"]["rms"] < 0.7 * row["model"]["rms"]
+    assert "from the motor currents above 8" in page.read_text(encoding="utf-8")
