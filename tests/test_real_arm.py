@@ -37,7 +37,7 @@ def test_a_step_ahead_the_filter_is_better_than_persistence_and_than_regressions
         assert line in PAGE
 
 
-#: Variance accounted for from 60 to 80 s, in all and above 1 Hz [%], of the model alone and with what the gauges pick up.
+#: Variance accounted for from 60 to 80 s, in all and above 1 Hz [%], of the model, and with what the gauges pick up.
 EXPLAINED, ABOVE = (99.4, 99.2, 90.9, 44.0), (90.0, 90.0, 50.0, 9.0)
 WITH_PICKUP = (99.4, 99.2, 92.0, 55.0)
 

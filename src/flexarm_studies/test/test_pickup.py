@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What bridges pick up from the motors: found where it is, not where it is not, and told from what the model lacks."""
+"""What bridges pick up from the motors: found where it is, not where it is not, and not what a model lacks."""
 
 from dataclasses import replace
 
