@@ -33,7 +33,8 @@ README = "".join(
 )
 PARAMETERS = ROOT / "docs" / "parameters.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README, re.DOTALL)
-COMMANDS = [line for kind, text in BLOCKS if kind == "sh" for line in text.splitlines() if line]
+LINES = [line.strip() for kind, text in BLOCKS if kind == "sh" for line in text.splitlines()]
+COMMANDS = [line for line in LINES if line]
 
 
 def words_of(command):
