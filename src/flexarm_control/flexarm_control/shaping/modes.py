@@ -19,12 +19,16 @@ from flexarm_dynamics.parameters import parameter
 from ..motions import robust_shapers, shapers
 from ..motions.shapers import NONE, SHAPERS
 
-ROBUST = "robust"
-KINDS = (*SHAPERS, ROBUST, NONE)
+ROBUST, RETIMED = "robust", "retimed"
+KINDS = (*SHAPERS, ROBUST, RETIMED, NONE)
+
+#: Modes of several configurations that are closer than this fraction are one to a shaper of all of them [-].
+ALIKE = 0.02
 
 PARAMETERS = (
     parameter("type", "zvd", choices=KINDS, read_only=True).described(
-        "Shaper: robust is optimal for the spread of all modes in shaper.periods; none passes motions as they are."
+        "Shaper: robust is optimal for the spread of all modes in shaper.periods; retimed gives straight motions from "
+        "rest to rest a new time law, else it is robust; none passes motions as they are."
     ),
     parameter("frequencies", [], "Hz", 0.01, 1000.0, kind="float_array", read_only=True).described(
         "Natural frequencies of the modes to shape; with configurations, one row of modes after the other."
@@ -36,10 +40,10 @@ PARAMETERS = (
         "Joint positions at which the frequencies were measured, one row after the other; empty: everywhere the same."
     ),
     parameter("spread", 0.15, "-", 0.0, 0.5, read_only=True).described(
-        "Of the type robust: frequencies may be off by this fraction."
+        "Of the types robust and retimed: frequencies may be off by this fraction."
     ),
     parameter("periods", 1.0, "-", 0.25, 3.0, read_only=True).described(
-        "Of the type robust: how much longer a motion gets, in periods of the lowest mode."
+        "Of the types robust and retimed: how much longer a motion gets, in periods of the lowest mode."
     ),
 )
 
@@ -78,6 +82,8 @@ class Modes:
         Empty where the frequencies are everywhere the same.
     frequencies, dampings : (c, modes) ndarrays
         With one row at least [Hz], [-].
+    spread, periods : float
+        Of the settings [-].
 
     Raises
     ------
@@ -120,7 +126,7 @@ class Modes:
         self.frequencies = frequencies.reshape(rows, -1)
         self.dampings = np.broadcast_to(dampings, frequencies.shape).reshape(rows, -1)
         self._refuse_same(self.configurations)
-        self._spread, self._periods = settings["spread"], settings["periods"]
+        self.spread, self.periods = settings["spread"], settings["periods"]
         self.stages = self._designed()
 
     @staticmethod
@@ -139,10 +145,15 @@ class Modes:
         frequencies, dampings = self.frequencies.mean(axis=0), self.dampings.mean(axis=0)
         if self.kind == NONE:
             return ()
-        if self.kind == ROBUST:
+        if self.kind in (ROBUST, RETIMED):
             lowest = int(np.argmin(frequencies))
-            train = robust_shapers.robust(frequencies, dampings, self._spread, self._periods)
-            return (Stage(train.times * frequencies[lowest], train.amplitudes, lowest),)
+            if (
+                self.kind == RETIMED
+            ):  # what can't be retimed gets one shaper for the modes of all rows
+                frequencies, dampings = _different(self.frequencies.ravel(), self.dampings.ravel())
+            train = robust_shapers.robust(frequencies, dampings, self.spread, self.periods)
+            unit = self.mean_frequencies[lowest]
+            return (Stage(train.times * unit, train.amplitudes, lowest),)
         trains = [
             shapers.impulses(self.kind, f, d) for f, d in zip(frequencies, dampings, strict=True)
         ]
@@ -154,19 +165,26 @@ class Modes:
 
     @property
     def varies(self):
-        """Whether the frequencies depend on the configuration."""
-        return bool(self.stages) and bool(np.ptp(self.frequencies, axis=0).any())
+        """Whether the shaper depends on the configuration."""
+        if self.kind == RETIMED or not self.stages:
+            return False
+        return bool(np.ptp(self.frequencies, axis=0).any())
+
+    @property
+    def mean_frequencies(self):
+        """Of each mode over the configurations (modes,): those of a shaper that does not vary [Hz]."""
+        return self.frequencies.mean(axis=0)
 
     @property
     def delay(self):
         """Mean delay of the shaped motion, at the mean frequencies [s]."""
-        mean = self.frequencies.mean(axis=0)
+        mean = self.mean_frequencies
         return float(sum(s.cycles @ s.amplitudes / mean[s.mode] for s in self.stages))
 
     @property
     def max_duration(self):
         """How much longer a motion gets at most [s]."""
-        low = self.frequencies.min(axis=0)
+        low = self.frequencies.min(axis=0) if self.varies else self.mean_frequencies
         return float(sum(s.cycles[-1] / low[s.mode] for s in self.stages))
 
     def at(self, q):
@@ -182,10 +200,45 @@ class Modes:
         weights /= weights.sum(axis=1, keepdims=True)
         return weights @ self.frequencies
 
+    def along(self, q):
+        """Frequencies [Hz] and damping ratios, (k, modes) each, at joint positions (k, n), for motions that pass them.
+
+        Unlike `at`, they change evenly between two configurations: they are combined linearly, with the distances from
+        all configurations and a constant as functions, and kept between the smallest and the largest measured.
+        """
+        q, rows = np.asarray(q, float), len(self.frequencies)
+        known = np.hstack([self.frequencies, self.dampings])
+        if rows == 1:
+            found = np.repeat(known, len(q), axis=0)
+        else:
+            system = np.ones((rows + 1, rows + 1))
+            system[:-1, :-1], system[-1, -1] = (
+                _distances(self.configurations, self.configurations),
+                0.0,
+            )
+            weights = np.linalg.solve(system, np.vstack([known, np.zeros(known.shape[1])]))
+            parts = np.column_stack([_distances(q, self.configurations), np.ones(len(q))])
+            found = np.clip(parts @ weights, known.min(axis=0), known.max(axis=0))
+        return np.hsplit(found, 2)
+
     def constant(self):
         """The `Shaper` of frequencies that are everywhere the same."""
         if not self.stages:
             return shapers.Shaper(np.zeros(1), np.ones(1))
-        frequencies = self.frequencies.mean(axis=0)
+        frequencies = self.mean_frequencies
         trains = [shapers.Shaper(s.cycles / frequencies[s.mode], s.amplitudes) for s in self.stages]
         return shapers.convolve(trains)
+
+
+def _distances(q, other):
+    """Distances (k, l) [rad] of positions (k, n) from others (l, n)."""
+    return np.linalg.norm(q[:, None] - other, axis=2)
+
+
+def _different(frequencies, dampings):
+    """Modes (k,), without those that are `ALIKE` to one before."""
+    kept = []
+    for i, frequency in enumerate(frequencies):
+        if all(abs(frequencies[j] / frequency - 1.0) > ALIKE for j in kept):
+            kept.append(i)
+    return frequencies[kept], dampings[kept]

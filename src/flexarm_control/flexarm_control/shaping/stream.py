@@ -121,7 +121,7 @@ class StreamShaper:
             where = self.output if configuration is None else configuration
             frequencies = self._modes.at(np.asarray(where, float)[None])[0]
         else:
-            frequencies = self._modes.frequencies[0]
+            frequencies = self._modes.mean_frequencies
         for each in self._filters:
             value = each.step(period * frequencies[each.mode], value)
         self.output = value

@@ -21,7 +21,7 @@ def draw(path, seed=0):
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion = case.motions[1]
     found = study.measured(arm, motion.end, motion.angle, case.period)
-    given = study.candidates(motion, found, found)
+    given = study.candidates(motion, found, found, found)
     with plt.rc_context(plotting.STYLE):
         figure, axes = plt.subplots()
         for method, colour in SHOWN.items():

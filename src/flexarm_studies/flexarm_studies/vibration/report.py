@@ -16,6 +16,9 @@ WANTED = {
     "robust, both ends": 0.1,
     "robust, both ends -15 %": 0.2,
     "robust, both ends +15 %": 0.2,
+    "retimed": 0.1,
+    "retimed -15 %": 0.2,
+    "retimed +15 %": 0.2,
 }
 UNSHAPED = METHODS[0]
 COLUMNS = (

@@ -6,10 +6,12 @@ the same simulated arm, behind the same drives. The arms' files are not looked a
 """
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from flexarm_control.motions.profiles import Motion
+from flexarm_control.shaping import limited, time_law
 from flexarm_control.shaping import modes as modes_module
 from flexarm_control.shaping.modes import Modes
 from flexarm_control.shaping.shaped_motion import ShapedMotion
@@ -30,6 +32,8 @@ AUDIBLE, MAX_DAMPING, MAX_MODES = 0.03, 0.3, 3
 SAME = 0.12
 #: Modes of the two ends of a motion that are closer than this fraction are given once.
 ALIKE = 0.02
+#: A mode changes at most by this factor from one configuration on the way to the next.
+CHANGE = 2.0
 #: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
 METHODS = (
@@ -37,6 +41,8 @@ METHODS = (
     "TOTG 0.1 s",
     "jerk limit",
     "jerk limit, one period",
+    "toppra",
+    "ruckig, one period",
     "zvd",
     "robust",
     "robust -15 %",
@@ -44,6 +50,9 @@ METHODS = (
     "robust, both ends",
     "robust, both ends -15 %",
     "robust, both ends +15 %",
+    "retimed",
+    "retimed -15 %",
+    "retimed +15 %",
 )
 
 
@@ -130,21 +139,108 @@ def together(found, other) -> Measured:
     )
 
 
-def candidates(motion, found, other):
+def rows(found, others):
+    """Modes at several places of a motion as rows, with as many modes as ring at its end, each mode in its own column.
+
+    Modes keep their order of frequency along the way. Where fewer are found, two of them are close to each other, and
+    one counts for both; one that would change by more than `CHANGE` from row to row stays as it is.
+
+    Parameters
+    ----------
+    found : Measured
+        At the end of the motion.
+    others : sequence of Measured
+        At places before, from the end to the start.
+
+    Returns
+    -------
+    frequencies, dampings : (c, m) ndarrays
+        From the start to the end [Hz], [-].
+    """
+    count = found.frequencies.size
+    rows = [_ascending(found, count)]
+    for other in others:
+        if not other.frequencies.size:
+            rows.insert(0, rows[0])
+            continue
+        mode, after = _ascending(other, count), rows[0]
+        chosen = min(
+            (list(c) for c in combinations_with_replacement(range(mode.shape[1]), count)),
+            key=lambda c: (-len(set(c)), np.abs(np.log(mode[0, c] / after[0])).sum()),
+        )
+        far = np.abs(np.log(mode[0, chosen] / after[0])) > np.log(CHANGE)
+        rows.insert(0, np.where(far, after, mode[:, chosen]))
+    return tuple(np.stack(rows).transpose(1, 0, 2))
+
+
+def _ascending(found, count):
+    """The `count` loudest modes by frequency, (2, k)."""
+    modes = np.stack([found.frequencies, found.dampings])[:, :count]
+    return modes[:, np.argsort(modes[0])]
+
+
+def retimed(motion, along, off=1.0):
+    """A motion with a new time law for the modes at its start, middle and end.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+    along : tuple of (3, m) ndarrays
+        As of `rows`.
+    off : float
+        Factor of the frequencies: how wrong they are taken to be [-].
+    """
+    frequencies, dampings = along
+    where = motion.start + np.linspace(0.0, 1.0, len(frequencies))[:, None] * motion.angle
+    settings = {
+        "type": modes_module.RETIMED,
+        "frequencies": (off * frequencies).ravel().tolist(),
+        "dampings": dampings.ravel().tolist(),
+        "configurations": where.ravel().tolist(),
+    }
+    modes = Modes(check_all(modes_module.PARAMETERS, settings), motion.start.size)
+    return time_law.retimed(motion, modes) or Shaped(ShapedMotion(motion, modes))
+
+
+def quickest(motion, rise):
+    """The motion's line by TOPP-RA and by Ruckig, within the speed and acceleration of the motion, a dict.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+        A trapezoid of speed.
+    rise : float
+        Acceleration over jerk, for Ruckig [s].
+    """
+    speed, bend = (
+        np.abs(motion.derivative(k, motion.knots[1:] - 1e-9)).max(axis=0) for k in (1, 2)
+    )
+    # A joint that stands may move a little.
+    speed, bend = (np.maximum(values, 1e-6 * values.max()) for values in (speed, bend))
+    begin = np.stack([motion.start, 0.0 * motion.start, 0.0 * motion.start])
+    return {
+        "toppra": limited.time_optimal([motion.start, motion.end], speed, bend),
+        "ruckig, one period": limited.jerk_limited(begin, motion.end, speed, bend, bend / rise),
+    }
+
+
+def candidates(motion, found, middle, other):
     """The motion by each of `METHODS`, a dict.
 
     Parameters
     ----------
     motion : PiecewiseMotion
-    found, other : Measured
-        At its end; at its start.
+    found, middle, other : Measured
+        At its end; half-way; at its start.
     """
     lowest, both = 1.0 / found.frequencies.min(), together(found, other)
+    along = rows(found, (middle, other))
     return {
         "trapezoid": motion,
         "TOTG 0.1 s": resampled(motion, RESAMPLE),
         "jerk limit": jerk_limited(motion, RISE),
         "jerk limit, one period": jerk_limited(motion, lowest),
+        **quickest(motion, lowest),
         "zvd": shaped(motion, "zvd", found),
         "robust": shaped(motion, "robust", found),
         "robust -15 %": shaped(motion, "robust", found, 1.0 - OFF),
@@ -152,6 +248,9 @@ def candidates(motion, found, other):
         "robust, both ends": shaped(motion, "robust", both),
         "robust, both ends -15 %": shaped(motion, "robust", both, 1.0 - OFF),
         "robust, both ends +15 %": shaped(motion, "robust", both, 1.0 + OFF),
+        "retimed": retimed(motion, along),
+        "retimed -15 %": retimed(motion, along, 1.0 - OFF),
+        "retimed +15 %": retimed(motion, along, 1.0 + OFF),
     }
 
 
@@ -169,7 +268,7 @@ def run(case):
     """
     known = model.build(case.known)
     arm = PositionArm(known, model.build(case.plant), 2.0 * np.pi / case.period)
-    rows = []
+    out = []
     for number, motion in enumerate(case.motions):
         found = measured(arm, motion.end, motion.angle, case.period)
         common = {
@@ -179,13 +278,14 @@ def run(case):
             "dampings": found.dampings.tolist(),
         }
         if not found.frequencies.size:
-            rows.append({**common, "method": ""})
+            out.append({**common, "method": ""})
             continue
         lowest = 1.0 / found.frequencies.min()
         other = measured(arm, motion.start, -motion.angle, case.period)
-        for method, given in candidates(motion, found, other).items():
+        middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
+        for method, given in candidates(motion, found, middle, other).items():
             swing = arm.follow(given, WINDOW * case.period)
-            rows.append(
+            out.append(
                 {
                     **common,
                     "method": method,
@@ -194,4 +294,4 @@ def run(case):
                     "saturated": swing.saturated,
                 }
             )
-    return rows
+    return out

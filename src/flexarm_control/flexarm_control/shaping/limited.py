@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The quickest time laws within limits: of jerk by Ruckig, of speed and acceleration along a path by TOPP-RA.
+
+Ruckig (Berscheid & Kroeger 2021) joins two states in the shortest time within limits of speed, acceleration and jerk;
+from rest all joints stay on the straight line between. TOPP-RA (Pham & Pham 2018) moves along the cubic spline
+through points, by length, in the shortest time within limits of speed and acceleration.
+
+Both are libraries of their own, imported where they are used: `ruckig` and `toppra` on PyPI.
+"""
+
+import importlib
+
+import numpy as np
+
+from flexarm_dynamics.errors import DesignError, TrajectoryError
+
+from .piecewise import PiecewiseMotion
+
+#: Points of the spline at which TOPP-RA keeps the limits, for each piece between two points; at least in all.
+GRID, FEWEST = 50, 100
+#: Points closer to each other than this are one [rad].
+SAME = 1e-9
+#: Knots closer than this are one [s].
+MOMENT = 1e-9
+
+
+def jerk_limited(begin, end, velocity, acceleration, jerk) -> PiecewiseMotion:
+    """Return the quickest motion to rest within limits of speed, acceleration and jerk.
+
+    Parameters
+    ----------
+    begin : (3, n) array_like
+        Position, velocity and acceleration [rad], [rad/s], [rad/s^2].
+    end : (n,) array_like
+        [rad]
+    velocity, acceleration, jerk : (n,) array_like
+        Finite and above 0 [rad/s], [rad/s^2], [rad/s^3].
+
+    Raises
+    ------
+    DesignError
+        Where `ruckig` is not installed, or a limit is not given.
+    TrajectoryError
+        Where there is no such motion.
+    """
+    ruckig = _library("ruckig")
+    begin, end = np.asarray(begin, float), np.asarray(end, float)
+    limits = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
+    _refuse_unlimited(limits)
+    asked = ruckig.InputParameter(end.size)
+    asked.current_position, asked.current_velocity, asked.current_acceleration = begin.tolist()
+    asked.target_position = end.tolist()
+    for name, values in limits.items():
+        setattr(asked, f"max_{name}", np.broadcast_to(values, end.shape).tolist())
+    if not begin[1:].any():
+        asked.synchronization = ruckig.Synchronization.Phase
+    found = ruckig.Trajectory(end.size)
+    try:
+        done = ruckig.Ruckig(end.size).calculate(asked, found)
+    except ruckig.RuckigError as error:
+        raise TrajectoryError(f"has no time law: {error}", field="trajectory") from error
+    if done not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise TrajectoryError(f"has no time law: {done}", field="trajectory")
+    if found.duration < MOMENT:
+        return PiecewiseMotion.resting(end, 0.0)
+    knots = [0.0, found.duration]
+    for profile in found.profiles[0]:
+        steps = np.concatenate([profile.brake.t, profile.t])
+        knots += np.cumsum(np.maximum(steps, 0.0)).tolist()
+    knots = np.unique(np.clip(knots, 0.0, found.duration))
+    knots = knots[np.concatenate([[True], np.diff(knots) > MOMENT])]
+    states = np.array([found.at_time(float(t)) for t in knots])
+    states[-1] = end, 0.0 * end, 0.0 * end
+    return PiecewiseMotion.through(knots, list(states.transpose(1, 0, 2)))
+
+
+def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
+    """Return the quickest motion from rest to rest through points, within limits of speed and acceleration.
+
+    Parameters
+    ----------
+    points : (k, n) array_like
+        [rad]
+    velocity, acceleration : (n,) array_like
+        Finite and above 0 [rad/s], [rad/s^2].
+
+    Raises
+    ------
+    DesignError
+        Where `toppra` is not installed, or a limit is not given.
+    TrajectoryError
+        Where there is no such motion.
+    """
+    toppra = _library("toppra")
+    points = np.asarray(points, float)
+    _refuse_unlimited({"velocity": velocity, "acceleration": acceleration})
+    away = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    points = points[np.concatenate([[True], away > SAME])]
+    if len(points) < 2:
+        return PiecewiseMotion.resting(points[0], 0.0)
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    toppra.setup_logging("ERROR")
+    bounds = [
+        np.broadcast_to(values, points[0].shape)[:, None] * np.array([-1.0, 1.0])
+        for values in (velocity, acceleration)
+    ]
+    constraints = [
+        toppra.constraint.JointVelocityConstraint(bounds[0]),
+        toppra.constraint.JointAccelerationConstraint(bounds[1]),
+    ]
+    grid = np.linspace(0.0, length[-1], max(GRID * (len(points) - 1), FEWEST) + 1)
+    problem = toppra.algorithm.TOPPRA(
+        constraints,
+        toppra.SplineInterpolator(length, points, bc_type="natural"),
+        gridpoints=np.union1d(grid, length),
+        parametrizer="ParametrizeConstAccel",
+    )
+    found = problem.compute_trajectory(0.0, 0.0)
+    if found is None:
+        raise TrajectoryError("has no time law within the limits", field="trajectory")
+    count = len(problem.gridpoints)
+    times = np.linspace(0.0, float(found.duration), 2 * count)
+    states = [np.array(found(times, order)) for order in range(2)]
+    states[0][[0, -1]], states[1][[0, -1]] = points[[0, -1]], 0.0
+    motion = PiecewiseMotion.through(times, states)
+    # Between the points of the grid the limits are exceeded a little.
+    places = (times[:-1, None] + np.diff(times)[:, None] * np.array([0.0, 0.5, 1.0 - 1e-6])).ravel()
+    speed, bend = (np.abs(motion.derivative(order, places)).max(axis=0) for order in (1, 2))
+    slower = max((speed / velocity).max(), np.sqrt((bend / acceleration).max()), 1.0)
+    return PiecewiseMotion.through(slower * times, [states[0], states[1] / slower])
+
+
+def _refuse_unlimited(limits):
+    for name, values in limits.items():
+        values = np.atleast_1d(np.asarray(values, float))
+        if not (np.isfinite(values) & (values > 0.0)).all():
+            hint = f"give the largest {name} of each joint"
+            raise DesignError(
+                "is not given", field=f"limits.{name}", value=values.tolist(), hint=hint
+            )
+
+
+def _library(name):
+    """Import one of the two libraries."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        hint = f"install it: pip install {name}"
+        raise DesignError("is not installed", field=name, hint=hint) from error
