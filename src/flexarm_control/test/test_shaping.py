@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.motions import robust_shapers, shapers
 from flexarm_control.shaping import modes as modes_module
-from flexarm_control.shaping import trajectory_shaper
+from flexarm_control.shaping import time_law, trajectory_shaper
 from flexarm_control.shaping.modes import Modes
 from flexarm_control.shaping.piecewise import PiecewiseMotion
 from flexarm_control.shaping.shaped_motion import ShapedMotion
@@ -327,3 +327,129 @@ def test_a_stream_over_changing_frequencies_ends_where_it_should_and_hardly_ring
 def test_malformed_inputs_of_a_stream_are_refused(values, problem):
     with pytest.raises(MessageError, match=problem):
         StreamShaper(made_modes(frequencies=[1.0]), NAMES).check(values)
+
+
+# New time laws for straight motions: what they leave of modes that change on the way, stopped and replaced, too.
+
+FAR = 2.0
+ALONG = {
+    "type": "retimed",
+    "frequencies": [3.0, 2.0],
+    "configurations": [0.0, 0.0, FAR, -0.5 * FAR],
+}
+
+
+def trapezoid(far=FAR, span=1.2):
+    """From rest to rest with a third of the time each for the ramps, from 0 to (far, -far / 2)."""
+    end, ramp = np.array([far, -0.5 * far]), span / 3.0
+    speed = end / (span - ramp)
+    done = 0.5 * ramp * speed
+    times = [0.0, ramp, span - ramp, span]
+    return trajectory(
+        times, [0.0 * end, done, end - done, end], [0.0 * end, speed, speed, 0.0 * end]
+    )
+
+
+def frequency(y):
+    """Of the mode at positions of joint 0 (k,): even on the way, constant beyond [Hz]."""
+    return np.interp(y, [0.0, FAR], [3.0, 2.0])
+
+
+def off(factor):
+    return lambda y: factor * frequency(y)
+
+
+def test_a_mode_that_changes_along_a_short_motion_is_left_alone_also_15_per_cent_off():
+    left = {}
+    for kind, settings in (("none", {"type": "none"}), ("retimed", ALONG)):
+        shaped = shaper(**settings).offer(trapezoid(), NOW)
+        end = shaped.times_ns[-1] / S
+        left[kind] = [ringing(joined(shaped).position, 0.0, end, off(f)) for f in (1.0, 0.85, 1.15)]
+    assert shaped.added == pytest.approx(
+        0.5, rel=0.02
+    )  # a period of the lowest frequency on the way
+    assert left["retimed"][0] < 0.03 * left["none"][0]
+    assert max(left["retimed"][1:]) < 0.06 * max(left["none"])
+
+
+@pytest.mark.parametrize("limit", [None, 0.8])
+def test_start_end_line_speed_and_acceleration_stay(limit):
+    given = trapezoid()
+    own = joined_given(given)
+    speed, bend = FAR / 0.8, FAR / 0.8 / 0.4
+    limits = {} if limit is None else {"velocity": [limit * speed], "acceleration": [limit * bend]}
+    shaped = shaper(limits, **ALONG).offer(given, NOW)
+    made = joined(shaped)
+    t = np.linspace(0.0, shaped.times_ns[-1] / S, 3001)
+    p, v, a = made.states(t)
+    assert_allclose(p[:, 1], -0.5 * p[:, 0], atol=1e-9)
+    assert_allclose(made.end, own.end)
+    assert v[:, 0].min() > -1e-3
+    assert v[:, 0].max() <= (limit or 1.0) * speed * (1.0 + 1e-6)
+    assert np.abs(a[:, 0]).max() <= (limit or 1.0) * bend * (1.0 + 1e-4)
+
+
+def joined_given(data):
+    return PiecewiseMotion.through(data.times_ns / S, data.fields)
+
+
+def test_what_is_not_straight_from_rest_to_rest_gets_the_robust_shaper_for_the_modes_of_all_rows():
+    own = shaper(**ALONG)
+    bent = trajectory(
+        [0.0, 0.6, 1.2],
+        [[0.0, 0.0], [1.0, 0.3], [2.0, -1.0]],
+        [[0.0, 0.0], [2.0, -1.0], [0.0, 0.0]],
+    )
+    train = own.modes.constant()
+    other = shaper(type="robust", frequencies=[3.0, 2.0]).modes.constant()
+    assert_allclose(train.times, other.times)
+    t = np.linspace(0.0, 2.0, 400)
+    wanted = train.apply(joined_given(bent)).position(t)
+    assert_allclose(joined(own.offer(bent, NOW)).position(t), wanted, atol=2e-6)
+    assert time_law.retimed(joined_given(there(1)), own.modes) is None  # without speeds
+
+
+def commanded(own, first, when, second):
+    """Positions over time of a trajectory that another one takes the place of at `when` [s], and their end [s]."""
+    at = joined(first).derivative
+    state = [at(k, np.array([when]))[0] for k in range(len(second.fields))]
+    fields = [np.vstack([a, f]) for a, f in zip(state, second.fields, strict=True)]
+    whole = PiecewiseMotion.through(np.append(0.0, second.times_ns / S), fields)
+
+    def position(t):
+        return np.where((t < when)[:, None], joined(first).position(t), whole.position(t - when))
+
+    return position, whole, when + second.times_ns[-1] / S
+
+
+@pytest.mark.parametrize("when", [0.1, 0.4, 0.7, 1.3])
+def test_a_stop_ends_on_the_line_without_ringing(when):
+    own = shaper(**ALONG)
+    unshaped = shaper(type="none").offer(trapezoid(), NOW)
+    swing = ringing(joined(unshaped).position, 0.0, 1.2, frequency)
+    first = own.offer(trapezoid(), NOW)
+    stop = own.stop(NOW + round(when * S))
+    position, whole, end = commanded(own, first, when, stop)
+    assert 0.0 < whole.end[0] <= FAR + 1e-9
+    assert whole.end[0] < 0.9 * FAR or when > 0.6
+    assert whole.end[1] == pytest.approx(-0.5 * whole.end[0])
+    assert end < 1.2 + 0.5 + 0.05
+    assert ringing(position, 0.0, end, frequency) < 0.05 * swing
+    assert (
+        np.abs(whole.acceleration(np.linspace(0.0, end - when, 500))[:, 0]).max() < 1.3 * FAR / 0.32
+    )
+
+
+def test_a_trajectory_that_replaces_one_goes_on_from_it_without_ringing():
+    own, when = shaper(**ALONG), 0.6
+    first = own.offer(trapezoid(), NOW)
+    second = own.offer(trajectory([1.0], [[0.4, 0.3]], [[0.0, 0.0]]), NOW + round(when * S))
+    position, whole, end = commanded(own, first, when, second)
+    assert not second.fresh
+    assert_allclose(whole.end, [0.4, 0.3])
+    # Of a frequency that is the same everywhere, the shaper of the change is exact.
+    unshaped = shaper(type="none").offer(trapezoid(), NOW)
+    swing = ringing(joined(unshaped).position, 0.0, 1.2, frequency)
+    assert ringing(position, 0.0, end, frequency) < 0.1 * swing
+    steps = np.diff(position(np.linspace(0.0, end, 4000)), axis=0)
+    assert np.abs(steps).max() < 1.5 * FAR / 0.8 * end / 4000

@@ -13,6 +13,9 @@ at constant phases :math:`\varphi_i`, and
     \dot\tau_i = \frac{f(t)}{f(\tau_i)}, \qquad
     \ddot\tau_i = \frac{\dot f(t) - \dot\tau_i^2 \dot f(\tau_i)}{f(\tau_i)}.
 
+A motion r that leaves no vibration by itself (see `time_law`) and is changed to w on the way, by a stop, say, is
+:math:`r + S(w - r)`: only the change is shaped, and nothing steps. Where it is not changed, it stays as it is.
+
 For several modes this is done one after the other. All A_i are at least 0 and add up to 1: every position lies between
 the motion's own, start and end are its own, and with constant frequencies speed and acceleration are never larger. The
 frequency at a time is that at the shaped position of that time, so what is shaped already never depends on what is
@@ -104,10 +107,13 @@ class ShapedMotion:
     ----------
     motion : PiecewiseMotion
     modes : Modes
+        Whose frequencies are constant where there is a `quiet` motion.
+    quiet : PiecewiseMotion, optional
+        Which leaves no vibration, and which `motion` departs from.
     """
 
-    def __init__(self, motion, modes):
-        self.motion = motion
+    def __init__(self, motion, modes, quiet=None):
+        self.motion, self._quiet = motion, quiet
         first, last = motion.knots[0], motion.knots[-1]
         if modes.varies:
             step = self._fine(modes)
@@ -119,7 +125,7 @@ class ShapedMotion:
                     (s.cycles, s.amplitudes, Warp(times, found[:, s.mode])) for s in modes.stages
                 ]
                 where = self.states(times)[0]
-        elif modes.stages:  # as one, since delays add up
+        elif modes.stages and quiet is not motion:  # as one, since delays add up
             train = modes.constant()
             self._stages = [(train.times, train.amplitudes, Constant(1.0))]
         else:
@@ -128,6 +134,8 @@ class ShapedMotion:
         self._grid = self._fine(modes) if fine else None
         #: When the shaped motion begins and ends [s].
         self.begin, self.end = float(first), float(last)
+        if quiet is not None:
+            self.end = float(max(last, quiet.knots[-1]))
         for cycles, _, law in self._stages:
             self.end = float(law.advanced(np.array([self.end]), cycles[-1])[0])
 
@@ -139,8 +147,12 @@ class ShapedMotion:
     def knots(self):
         """Times between which the shaped motion is a polynomial, or close to one, (k,) [s]."""
         knots = self.motion.knots
+        if self._quiet is not None:
+            knots = np.concatenate([knots, self._quiet.knots])
         for cycles, _, law in self._stages:
             knots = np.concatenate([law.advanced(knots, c) for c in cycles])
+        if self._quiet is not None:
+            knots = np.concatenate([knots, self._quiet.knots])
         if self._grid is not None:
             count = int((self.end - self.begin) / self._grid) + 2
             knots = np.concatenate([knots, np.linspace(self.begin, self.end, count)])
@@ -151,11 +163,14 @@ class ShapedMotion:
 
     def states(self, times):
         """Position, velocity and acceleration, (3, k, n), at times (k,) [s]."""
-        return self._states(len(self._stages), np.asarray(times, float))
+        times = np.asarray(times, float)
+        found = self._states(len(self._stages), times)
+        return found if self._quiet is None else found + _states(self._quiet, times)
 
     def _states(self, level, t):
         if level == 0:
-            return np.stack([self.motion.derivative(order, t) for order in range(3)])
+            own = _states(self.motion, t)
+            return own if self._quiet is None else own - _states(self._quiet, t)
         cycles, amplitudes, law = self._stages[level - 1]
         out = 0.0
         for cycle, amplitude in zip(cycles, amplitudes, strict=True):
@@ -166,3 +181,8 @@ class ShapedMotion:
             own[1] *= slope
             out = out + amplitude * own
         return out
+
+
+def _states(motion, times):
+    """Position, velocity and acceleration, (3, k, n), of a motion at times (k,)."""
+    return np.stack([motion.derivative(order, times) for order in range(3)])

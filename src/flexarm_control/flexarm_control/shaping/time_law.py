@@ -44,6 +44,10 @@ FLOOR = 0.3
 ROUNDS = 3
 #: A motion is straight if it stays this close to its line, over its length [-].
 STRAIGHT = 1e-4
+#: A stop is given so many times what the largest acceleration needs, and `modes.periods`; longer by so much if needed.
+STOP, LONGER = 1.3, 1.3
+#: Rounding of the speeds [-].
+SLACK = 1e-9
 #: A linear programme is given up after this time [s].
 PATIENCE = 1.0
 
@@ -96,129 +100,227 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
     progress = along(motion)
     if progress is None:
         return None
-    problem = _Problem(motion, progress, modes)
+    line = _Line(motion, modes, progress)
+    norms = line.norms()
+    if not min(norm.min() for norm in norms) > 0.0:
+        return None
     limits = [
         min(own, float((np.asarray(limit) / np.maximum(np.abs(motion.angle), 1e-300)).min()))
-        for own, limit in zip(problem.own, (velocity, acceleration), strict=True)
+        for own, limit in zip(line.own, (velocity, acceleration), strict=True)
     ]
-    found = problem.solution(*limits)
-    if found is None:
+    duration = motion.duration + modes.periods / line.lowest
+    law = _Law(line, duration, limits)
+    times = np.linspace(*motion.knots[[0, -1]], law.middles.size)
+    x = law.solution(norms, progress(0, times))
+    if x is None:
         return None
-    sigma, speed, bend = problem.nodes(found)
+    states = law.states(x)
     # Between two nodes the speed is a parabola, whose top may be above both.
-    slower = max(_top(speed, bend, problem.step) / limits[0], 1.0)
-    states = [motion.start + sigma[:, None] * motion.angle]
-    states += [speed[:, None] * motion.angle / slower, bend[:, None] * motion.angle / slower**2]
-    states[0][-1], states[1][-1] = motion.end, 0.0
-    times = motion.knots[0] + slower * problem.step * np.arange(sigma.size)
-    return PiecewiseMotion.through(times, states[: motion.fields])
+    slower = max(law.top(x) / limits[0], 1.0)
+    times = motion.knots[0] + slower * law.nodes
+    made = [values / slower**order for order, values in enumerate(states)]
+    made[0][-1], made[1][-1] = motion.end, 0.0
+    return PiecewiseMotion.through(times, made[: motion.fields])
 
 
-def _top(speed, bend, step):
-    """Largest speed of an acceleration that is linear between nodes."""
-    before, after = bend[:-1], bend[1:]
-    falls = (before > 0.0) & (after < 0.0)
-    rise = 0.5 * step * before**2 / np.where(falls, before - after, np.inf)
-    return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
+def stopped(motion, modes, time):
+    """A motion of `retimed` up to a time, then to rest on its line: the stop takes out what was excited before.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+    modes : Modes
+    time : float
+        [s]
+
+    Returns
+    -------
+    PiecewiseMotion
+        The motion itself where it ends as early.
+    """
+    progress = along(motion)
+    if progress is None or time >= motion.knots[-1]:
+        return motion
+    line = _Line(motion, modes, progress)
+    state = [float(progress(order, np.array([time]))[0]) for order in range(3)]
+    norms = [np.full(FACTORS, line.own[1] / (2.0 * np.pi * line.lowest))] * line.modes_count
+    duration = STOP * state[1] / line.own[1] + modes.periods / line.lowest
+    while time + duration < motion.knots[-1]:
+        law = _Law(line, duration, line.own, state, time)
+        x = law.solution(norms, np.full(law.middles.size, state[0]))
+        if x is not None:
+            states = law.states(x)
+            states[1][-1] = 0.0
+            stop = PiecewiseMotion.through(time + law.nodes, states[: motion.fields])
+            return motion.then(stop)
+        duration *= LONGER
+    return motion
 
 
-class _Problem:
-    """The linear programme of one motion, in the accelerations x (N - 1,) at the inner nodes."""
+class _Line:
+    """The line of a motion, what the motion does on it, and the modes along it."""
 
-    def __init__(self, motion, progress, modes):
-        self._motion, self._modes = motion, modes
-        first, span = motion.knots[0], motion.duration
-        middle = (np.arange(PLACES) + 0.5) / PLACES
-        self._given = first + span * middle
-        self._progress, self._bend = (progress(order, self._given) for order in (0, 2))
-        ends = np.concatenate([self._given, motion.knots[:-1] + 1e-12, motion.knots[1:] - 1e-9])
+    def __init__(self, motion, modes, progress):
+        self.motion, self.progress, self._modes = motion, progress, modes
+        knots = motion.knots
+        ends = np.concatenate([self._cells(knots[-1])[0], knots[:-1] + 1e-12, knots[1:] - 1e-9])
+        #: Largest speed and acceleration of the progress [1/s], [1/s^2].
         self.own = tuple(float(np.abs(progress(order, ends)).max()) for order in (1, 2))
-        lowest = self._frequencies(self._progress)[0].min()
-        duration = span + modes.periods / lowest
-        self.count = int(np.clip(np.ceil(PER_PERIOD * duration * lowest), FEWEST, MOST))
-        self.step = duration / self.count
-        self._fine = duration * (np.arange(self.count * FINE) + 0.5) / (self.count * FINE)
-        nodes = self.step * np.arange(self.count + 1)
-        hats = np.eye(self.count + 1)[1:-1]
-        self._hats = np.array([np.interp(self._fine, nodes, hat) for hat in hats]).T
-        self._matrices = [matrix[:, 1:-1] for matrix in _integrals(self.count, self.step)]
-        # The speed in the middle of each piece.
-        across = np.eye(self.count + 1)[:, 1:-1]
-        self._middle = self._matrices[1][:-1] + self.step / 8.0 * (3.0 * across[:-1] + across[1:])
+        frequencies = self.at(progress(0, ends))[0]
+        #: Lowest frequency on the way [Hz], number of modes.
+        self.lowest, self.modes_count = float(frequencies.min()), frequencies.shape[1]
 
-    def _frequencies(self, progress):
+    def at(self, progress):
         """Frequencies (k, m) [Hz] and damping ratios (k, m) at places of the line (k,)."""
-        motion = self._motion
+        motion = self.motion
         return self._modes.along(motion.start + progress[:, None] * motion.angle)
 
-    def nodes(self, x):
-        """Progress, its speed and its acceleration at all nodes (N + 1,)."""
-        sigma, speed = (matrix @ x for matrix in self._matrices)
-        return sigma, speed, np.concatenate([[0.0], x, [0.0]])
+    def _cells(self, time):
+        """Middles (k,) and durations (k,) of equal parts of the motion up to a time [s]."""
+        first = self.motion.knots[0]
+        step = (time - first) / PLACES
+        return first + step * (np.arange(PLACES) + 0.5), np.full(PLACES, step)
 
-    def solution(self, velocity, acceleration):
-        """The accelerations that leave least within limits of the progress [1/s], [1/s^2]; None: there are none."""
-        given = self._left(self._progress, self._given, self._bend[:, None])
-        norms = [np.abs(left[:, 0]) for left in given]
-        norms = [np.maximum(norm, FLOOR * norm.max()) for norm in norms]
-        if not min(norm.min() for norm in norms) > 0.0:
-            return None
-        sigma = np.interp(
-            self._fine / self._fine[-1], np.linspace(0.0, 1.0, PLACES), self._progress
-        )
-        x = None
-        for _ in range(ROUNDS):
-            left = self._left(sigma, self._fine, self._hats)
-            x = self._programme(left, norms, velocity, acceleration)
-            if x is None:
-                return None
-            nodes = self.nodes(x)[0]
-            sigma = np.interp(self._fine, self.step * np.arange(nodes.size), nodes)
-        return x
+    def history(self, time):
+        """Progress, durations [s] and accelerations of the motion up to a time, in cells (k,)."""
+        middles, steps = self._cells(time)
+        return self.progress(0, middles), steps, self.progress(2, middles)
 
-    def _left(self, progress, times, parts):
-        """What accelerations (k, p) at equal times leave of each mode, list of (factors, p) complex."""
-        frequencies, dampings = self._frequencies(progress)
-        step = times[1] - times[0]
+    def norms(self):
+        """What the motion leaves of each mode, at least `FLOOR` of its largest, list of (factors,)."""
+        progress, steps, bend = self.history(self.motion.knots[-1])
+        left = [np.abs(values[:, 0]) for values in self.left(progress, steps, bend[:, None])]
+        return [np.maximum(values, FLOOR * values.max()) for values in left]
+
+    def left(self, progress, steps, parts):
+        """What accelerations (k, p) in cells of durations `steps` leave of each mode, list of (factors, p) complex."""
+        frequencies, dampings = self.at(progress)
         factors = np.linspace(1.0 - self._modes.spread, 1.0 + self._modes.spread, FACTORS)
         found = []
         for frequency, damping in zip(frequencies.T, dampings.T, strict=True):
             w = 2.0 * np.pi * frequency
-            pole = w * (-damping + 1j * np.sqrt(1.0 - damping**2))
-            phase = np.cumsum(pole) * step
-            phase = phase[-1] - phase + 0.5 * step * pole
-            size = step * np.sqrt(w[-1] / w)
+            turn = w * (-damping + 1j * np.sqrt(1.0 - damping**2)) * steps
+            phase = np.cumsum(turn)
+            phase = phase[-1] - phase + 0.5 * turn
+            size = steps * np.sqrt(w[-1] / w)
             found.append((size * np.exp(factors[:, None] * phase)) @ parts)
         return found
 
-    def _programme(self, left, norms, velocity, acceleration):
+
+class _Law:
+    """The linear programme of one time law, in the accelerations x (N - 1,) at the inner nodes.
+
+    Parameters
+    ----------
+    line : _Line
+    duration : float
+        [s]
+    limits : sequence of 2 floats
+        Of speed and acceleration of the progress [1/s], [1/s^2].
+    state : sequence of 3 floats, optional
+        Progress, speed and acceleration at which a stop begins; not given: a motion from rest to the end of the line.
+    time : float, optional
+        When the stop begins [s].
+    """
+
+    def __init__(self, line, duration, limits, state=None, time=None):
+        self._line, self._limits, self._stops = line, limits, state is not None
+        self._state = np.zeros(3) if state is None else np.array(state)
+        self._past = line.history(time) if self._stops else (np.zeros(0),) * 3
+        self.count = int(np.clip(np.ceil(PER_PERIOD * duration * line.lowest), FEWEST, MOST))
+        self._step = duration / self.count
+        self.nodes = self._step * np.arange(self.count + 1)
+        cells = self.count * FINE
+        self.middles = duration * (np.arange(cells) + 0.5) / cells
+        hats = np.array([np.interp(self.middles, self.nodes, h) for h in np.eye(self.count + 1)]).T
+        # Of the acceleration at the start, then of the inner ones; what was before stands in the first column.
+        self._parts = np.zeros((self._past[0].size + cells, self.count))
+        self._parts[: self._past[0].size, 0] = self._past[2]
+        self._parts[self._past[0].size :] = hats[:, :-1] * np.append(
+            self._state[2], np.ones(self.count - 1)
+        )
+        self._steps = np.append(self._past[1], np.full(cells, duration / cells))
+        self._way, self._speed = _integrals(self.count, self._step)
+        across = np.eye(self.count + 1)
+        middle = self._speed[:-1] + self._step / 8.0 * (3.0 * across[:-1] + across[1:])
+        self._speeds = np.vstack([self._speed[1:], middle])
+
+    def states(self, x):
+        """Positions, velocities and accelerations of the joints at the nodes, three (N + 1, n) arrays."""
+        motion, (sigma, speed, _) = self._line.motion, self._state
+        bend = self._all(x)
+        sigma = sigma + speed * self.nodes + self._way @ bend
+        along = sigma, speed + self._speed @ bend, bend
+        states = [values[:, None] * motion.angle for values in along]
+        states[0] += motion.start
+        return states
+
+    def _all(self, x):
+        return np.concatenate([[self._state[2]], x, [0.0]])
+
+    def top(self, x):
+        """Largest speed of the progress, between nodes, too."""
+        bend = self._all(x)
+        speed = self._state[1] + self._speed @ bend
+        before, after = bend[:-1], bend[1:]
+        falls = (before > 0.0) & (after < 0.0)
+        rise = 0.5 * self._step * before**2 / np.where(falls, before - after, np.inf)
+        return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
+
+    def solution(self, norms, sigma):
+        """The accelerations x that leave least; None: there are none within the limits.
+
+        Parameters
+        ----------
+        norms : list of (factors,) ndarrays
+            In which what is left of each mode counts.
+        sigma : (k,) ndarray
+            Progress to begin with, at the middles.
+        """
+        x = None
+        for _ in range(ROUNDS):
+            left = self._line.left(np.append(self._past[0], sigma), self._steps, self._parts)
+            x = self._programme(left, norms)
+            if x is None:
+                return None
+            bend = self._all(x)
+            sigma = self._state[0] + self._state[1] * self.nodes + self._way @ bend
+            sigma = np.interp(self.middles, self.nodes, sigma)
+        return x
+
+    def _programme(self, left, norms):
         """Solve one linear programme; its x, None where the limits contradict each other."""
         around = np.exp(-2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
-        rows = [
-            np.real(around[:, None, None] * (values / norm[:, None])).reshape(-1, values.shape[1])
+        rows = np.concatenate([
+            np.real(around[:, None, None] * (values / norm[:, None])).reshape(-1, self.count)
             for values, norm in zip(left, norms, strict=True)
-        ]
+        ])  # fmt: skip
         wanted = np.ones(FACTORS)
         wanted[FACTORS // 2] = AT_DESIGN
-        rows, limits = np.concatenate(rows), np.tile(wanted, DIRECTIONS * len(left))
-        sigma, speed = self._matrices
-        places = np.vstack([speed[1:], self._middle])
-        none = np.zeros((len(places), 1))
-        upper = np.vstack(
-            [
-                np.column_stack([rows, -limits]),
-                np.hstack([places, none]),
-                np.hstack([-places, none]),
-            ]
-        )
-        bounds = np.concatenate(
-            [np.zeros(len(rows)), np.full(len(places), velocity), np.zeros(len(places))]
-        )
-        ends = np.column_stack([np.stack([speed[-1], sigma[-1]]), np.zeros(2)])
+        wanted = np.tile(wanted, DIRECTIONS * len(left))
+        _, speed, bend = self._state
+        velocity, acceleration = self._limits
+        inner, own = self._speeds[:, 1:-1], speed + self._speeds[:, 0] * bend
+        none = np.zeros((len(inner), 1))
+        upper = [
+            np.column_stack([rows[:, 1:], -wanted]),
+            np.hstack([inner, none]),
+            np.hstack([-inner, none]),
+        ]
+        bounds = [-rows[:, 0], velocity * (1.0 + SLACK) - own, own + SLACK * velocity]
+        way = self._way[-1]
+        ahead = 1.0 - self._state[0] - speed * self.nodes[-1] - way[0] * bend
+        ends, values = [np.append(self._speed[-1, 1:-1], 0.0)], [-speed - self._speed[-1, 0] * bend]
+        if self._stops:
+            upper.append(np.append(way[1:-1], 0.0)[None])
+            bounds.append([ahead])
+        else:
+            ends.append(np.append(way[1:-1], 0.0))
+            values.append(ahead)
         cost = np.zeros(self.count)
         cost[-1] = 1.0
         made = linprog(
-            cost, upper, bounds, ends, [0.0, 1.0],
+            cost, np.vstack(upper), np.concatenate(bounds), np.stack(ends), values,
             bounds=[(-acceleration, acceleration)] * (self.count - 1) + [(0.0, None)],
             method="highs", options={"time_limit": PATIENCE},
         )  # fmt: skip

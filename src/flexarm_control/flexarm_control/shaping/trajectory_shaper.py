@@ -4,7 +4,8 @@ r"""Trajectories in, shaped trajectories out: what the node `shaper` does, witho
 The unshaped motion is kept as long as it still acts: a trajectory that replaces another one takes over from its own
 start, and the whole is shaped, so that no vibration is left of either. The same holds for a stop: the unshaped
 motion's own time slows down (see `trajectory.path.Slowing`), at most as hard as the limits of acceleration allow, and
-the result is shaped.
+the result is shaped. A motion with a new time law (`time_law`) needs no shaper; it stops by another time law, and of a
+trajectory that replaces it, the change is shaped.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ from flexarm_dynamics.parameters import parameter
 
 from ..trajectory.path import Slowing
 from ..trajectory.values import SECOND, SPEED_ROUNDING
-from .modes import Modes
+from . import time_law
+from .modes import RETIMED, Modes
 from .piecewise import PiecewiseMotion
 from .shaped_motion import ShapedMotion
 
@@ -96,7 +98,7 @@ class TrajectoryShaper:
             for name in ("velocity", "acceleration")
         )
         self._epoch_ns = 0
-        self._motion = self._shaped = None
+        self._motion = self._shaped = self._quiet = None
 
     # Where it is -----------------------------------------------------------------------------
 
@@ -115,7 +117,7 @@ class TrajectoryShaper:
 
     def forget(self):
         """The joints were moved by others: the next trajectory begins where it is measured."""
-        self._motion = self._shaped = None
+        self._motion = self._shaped = self._quiet = None
 
     # Trajectories ----------------------------------------------------------------------------
 
@@ -154,11 +156,22 @@ class TrajectoryShaper:
         fields = [values[keep] for values in trajectory.fields]
         before = self._motion if moving else None
         begin = self._begin(before, start, times, fields, measured)
-        motion, stretch = self._within_limits(before, begin, start, times, fields)
+        quiet = self._replaced(start) if moving else None
+        motion, stretch = self._within_limits(before, quiet, begin, start, times, fields)
         now, last = (now_ns - epoch_ns) / SECOND, start + times[-1]
         motion = motion.since(now - self.modes.max_duration - 2.0 * self.modes.delay)
         fresh = before is None
-        return self._take(motion, epoch_ns, start if fresh else now, last, stretch, fresh)
+        if fresh and self.modes.kind == RETIMED:
+            quiet = time_law.retimed(motion, self.modes, self._velocity, self._acceleration)
+            motion = motion if quiet is None else quiet
+        begin = start if fresh else now
+        return self._take(motion, quiet, epoch_ns, begin, last, stretch, fresh)
+
+    def _replaced(self, start):
+        """The motion that leaves no vibration, where another one takes over at `start` [s]; None: there is none."""
+        if self._quiet is None or self._quiet is not self._motion:
+            return self._quiet
+        return time_law.stopped(self._quiet, self.modes, start)
 
     def _begin(self, before, start, times, fields, measured):
         """State (3, n) at which the trajectory begins."""
@@ -201,7 +214,7 @@ class TrajectoryShaper:
         moved = measured is not None and (np.abs(measured - end) > START_TOLERANCE).any()
         return measured if moved else end
 
-    def _within_limits(self, before, begin, start, times, fields):
+    def _within_limits(self, before, quiet, begin, start, times, fields):
         """The unshaped motion, slowed down where the shaped one would exceed its limits; and by which factor."""
         if np.isfinite(self._acceleration).any() and len(fields) == 1:
             raise TrajectoryError(
@@ -212,7 +225,7 @@ class TrajectoryShaper:
         stretch = 1.0
         for _ in range(ATTEMPTS):
             motion = _joined(before, begin, start, times * stretch, _slower(fields, stretch))
-            excess = self._excess(motion, start)
+            excess = self._excess(motion, quiet, start)
             if excess <= 1.0 + SPEED_ROUNDING:
                 return motion, stretch
             stretch *= excess * MARGIN
@@ -223,11 +236,11 @@ class TrajectoryShaper:
             hint="raise limits.velocity or limits.acceleration, or give it a start with less speed",
         )
 
-    def _excess(self, motion, start):
+    def _excess(self, motion, quiet, start):
         """By which factor time must be stretched, 1 or less where the limits are kept from `start` on."""
         if np.isinf(self._velocity).all() and np.isinf(self._acceleration).all():
             return 1.0
-        shaped = ShapedMotion(motion, self.modes)
+        shaped = ShapedMotion(motion, self.modes, quiet)
         knots = shaped.knots()
         knots = knots[np.searchsorted(knots, start) :]
         lengths = np.diff(knots)[:, None] * PLACES[1]
@@ -259,12 +272,15 @@ class TrajectoryShaper:
         """
         if not self.moving(now_ns):
             return None
-        start, motion = self._seconds(now_ns), self._motion
-        if start >= motion.knots[-1]:  # only the shaper's own delay is left
+        start, motion, quiet = self._seconds(now_ns), self._motion, self._quiet
+        if quiet is motion and quiet is not None:
+            quiet = stopped = time_law.stopped(quiet, self.modes, start)
+        elif start >= motion.knots[-1]:  # only the shaper's own delay is left
             stopped = motion
         else:
             stopped = self._slowed(motion, start)
-        return self._take(stopped, self._epoch_ns, start, stopped.knots[-1], 1.0, fresh=False)
+        last = stopped.knots[-1]
+        return self._take(stopped, quiet, self._epoch_ns, start, last, 1.0, fresh=False)
 
     def _slowed(self, motion, start):
         """The motion up to `start` [s], then along its own way to rest, no harder than allowed."""
@@ -280,9 +296,9 @@ class TrajectoryShaper:
             duration *= LONGER
         return motion.then(PiecewiseMotion.through(start + elapsed, states[: motion.fields]))
 
-    def _take(self, motion, epoch_ns, begin, last, stretch, fresh):
+    def _take(self, motion, quiet, epoch_ns, begin, last, stretch, fresh):
         """Shape a whole motion, and write what is left of it from a time on."""
-        shaped = ShapedMotion(motion, self.modes)
+        shaped = ShapedMotion(motion, self.modes, quiet)
         knots = shaped.knots()
         knots = knots[knots > begin + (0.0 if fresh else HANDOVER)]
         if fresh:
@@ -299,7 +315,7 @@ class TrajectoryShaper:
             )
         states = shaped.states(knots)[: motion.fields]
         states[0][-1], states[1:, -1] = motion.end, 0.0
-        self._motion, self._shaped, self._epoch_ns = motion, shaped, epoch_ns
+        self._motion, self._quiet, self._shaped, self._epoch_ns = motion, quiet, shaped, epoch_ns
         times_ns = np.rint((knots - begin) * SECOND).astype(np.int64)
         begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
         added = float(shaped.end - last)
