@@ -60,8 +60,9 @@ START_PART, START_SECONDS = 0.35, 10.0
 START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
 #: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
 FIRST_TOLERANCE = 1e-4
-#: The weights belong to the values once a pass leaves at least this fraction of the sum of squares [-].
-SETTLED = 0.98
+#: The weights belong to the values once a pass leaves at least this fraction of the sum of squares, and the
+#: autoregression that follows from its residuals is within this of the one that weighed them [-].
+SETTLED, SAME_MEMORY = 0.98, 0.01
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-4
 #: Deviation of the prior about the file's value, in scales: what strains hardly tell stays near it [-].
@@ -401,24 +402,28 @@ class StrainProblem:
     def finish(self, report, state):
         """From the values of the best start to the end: passes with new weights, parameters that act alike left out."""
         stage = 0 if state is None or state.best is None else state.best["stage"]
+        self.weigh()
+        settled = stage >= PASSES
         for number in range(stage, PASSES):
-            self.weigh()
+            memory = self.memory
             self.solve(
                 PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number)
             )
             report(f"pass {number + 1} of {PASSES}: {self.cost:.6g}")
             if number == 0:
                 self.leave_out_alike()
+            self.weigh()
             if state is not None:
                 state.keep_best(self.snapshot(number + 1))
-            if number > 0 and self.cost > SETTLED * self.used:
+            same = np.abs(self.memory - memory).max() < SAME_MEMORY
+            settled = number > 0 and same and self.cost > SETTLED * self.used
+            if settled:
                 break
-        else:
+        if not settled:
             self.warnings.append(
                 f"the fit has not settled after {PASSES} passes: its intervals may be too narrow; fit from other"
                 " values (--starts), or hold what you know"
             )
-        self.weigh()
 
     def _keeper(self, state, number):
         if state is None:
