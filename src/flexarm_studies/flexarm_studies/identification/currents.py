@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..recordings.trends import regression
+from .fit import bandwidth
 from .prescribed import MotionPredictor, prescribed_torque
 
-#: Lags of the residuals' correlation in the intervals [s].
-CORRELATED = 0.5
 #: A joint is explained if no more than this is left of its current [-].
 EXPLAINED = 0.5
 
@@ -107,11 +106,16 @@ def motor_fits(found, run, fitted, scored, corner):
                 np.tanh(speed / joint.friction.smoothing), np.ones(len(speed)),
             ]
         )  # fmt: skip
-        lags = int(CORRELATED / run.period)
-        value, width = regression(X[fitted], current[fitted], lags)
+        value, width = _regressed(X[fitted], current[fitted])
         predicted = X @ value
         made.append(_made(joint.name, value, width, current, predicted, fitted, scored))
     return made
+
+
+def _regressed(X, y):
+    """As `regression`, with as many lags as the residuals' correlation from one sample to the next asks for."""
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    return regression(X, y, min(bandwidth(left[:, None]), len(y) // 4))
 
 
 def _made(name, value, width, current, predicted, fitted, scored):
