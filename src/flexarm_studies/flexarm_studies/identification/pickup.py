@@ -9,9 +9,8 @@ Beside the strain of its link every gauge c reads the same filter of the motor c
 e being measured less predicted strain. Both sides are high-passed without phase: below that frequency the currents
 follow the motion, and a regression on them would hide what the model lacks. That h is one filter for all gauges makes
 it noise: a vibration reads differently on each. The sum of :math:`(r_c/\sigma_c)^2` is least where h is fitted to the
-mean of the gauges with the weights :math:`1/\sigma_c^2`. This is a ridge regression, whose strength
-is chosen by cross-validation in blocks of the fitted part. The filter counts only if it explains blocks that it was
-not fitted to.
+mean of the gauges with the weights :math:`1/\sigma_c^2`, by ridge regression (`ridge`). The filter counts only if it
+explains blocks of the fitted part that it was not fitted to.
 """
 
 from dataclasses import dataclass
@@ -20,12 +19,11 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
 
+from . import ridge
 from .scores import filled, high_passed
 
-#: Past that counts [s], and blocks of the cross-validation.
-PAST, BLOCKS = 0.2, 5
-#: Strengths of the ridge, beside the mean square of the currents [-].
-RIDGES = 10.0 ** np.arange(-4.0, 3.1, 0.5)
+#: Past that counts [s].
+PAST = 0.2
 #: The filter counts if it leaves less than this of the sum of squares of blocks that it was not fitted to [-].
 USEFUL = 0.99
 #: Smallest mean square.
@@ -92,36 +90,12 @@ def fit(run, error, fitted, above):
             hint="leave out --pickup, or map a column to the quantity `current`",
         )  # fmt: skip
     size = 1 + round(PAST / run.period)
-    X = _past(run, known, above, size)[fitted]
     fast = high_passed(filled(error), run.period, above)[fitted]
     weight = 1.0 / np.maximum(np.mean(fast**2, axis=0), LEAST)
-    y = fast @ weight / weight.sum()
-    power = len(X) * np.maximum(np.mean(X**2), LEAST)
-    left = [_left(X, y, fast, weight, ridge * power) for ridge in RIDGES]
-    best = int(np.argmin(left))
-    taps = _ridge(X, y, RIDGES[best] * power).reshape(size, -1)
-    return Pickup(taps, tuple(int(j) for j in known), above, float(left[best]))
+    taps, left = ridge.chosen(_past(run, known, above, size)[fitted], fast, weight)
+    return Pickup(taps.reshape(size, -1), tuple(int(j) for j in known), above, left)
 
 
 def _past(run, joints, above, size):
     """High-passed currents of this sample and the ones before, shape (s, size c) [A]."""
-    current = high_passed(run.current[:, joints], run.period, above)
-    late = [np.roll(current, k, axis=0) for k in range(size)]
-    for k, rows in enumerate(late):
-        rows[:k] = 0.0
-    return np.hstack(late)
-
-
-def _ridge(X, y, strength):
-    return np.linalg.solve(X.T @ X + strength * np.eye(X.shape[1]), X.T @ y)
-
-
-def _left(X, y, fast, weight, strength):
-    """What is left in blocks that were not fitted, as a fraction."""
-    left = 0.0
-    for block in np.array_split(np.arange(len(X)), BLOCKS):
-        others = np.ones(len(X), bool)
-        others[block] = False
-        picked = X[block] @ _ridge(X[others], y[others], strength)
-        left += np.sum((fast[block] - picked[:, None]) ** 2 @ weight)
-    return left / np.maximum(np.sum(fast**2 @ weight), LEAST)
+    return ridge.lagged(high_passed(run.current[:, joints], run.period, above), 0, size - 1)
