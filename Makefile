@@ -1,7 +1,7 @@
 # `make help` says what there is.
 PYTHON ?= python3
 PYTEST_ARGS ?=
-BENCH_ARGS ?=
+BENCH_ARGS ?= --write docs/performance.md
 COMPARE_ARGS ?=
 FUZZ_ARGS ?= --inputs 1000000 --dds 10000
 SOAK_ARGS ?= --minutes 30

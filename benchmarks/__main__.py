@@ -18,6 +18,9 @@ VERSIONS = ("numpy", "scipy", "numba", *PEERS)
 
 MISSED, MISSING = 1, 2
 
+#: Markers of the tables in docs/performance.md.
+BEGIN, END = "<!-- bench: begin -->", "<!-- bench: end -->"
+
 
 def parser():
     """The argument parser."""
@@ -29,6 +32,9 @@ def parser():
     top.add_argument("--quick", action="store_true", help="few turns and few arm sizes")
     top.add_argument("--out", default="results/bench", help="directory of the results")
     top.add_argument("--json", action="store_true", help="print summary.json in place of tables")
+    top.add_argument(
+        "--write", metavar="FILE", help="put the tables between the markers of a Markdown file"
+    )
     top.add_argument("--no-check", action="store_true", help="measure only: no criteria")
     return top
 
@@ -79,12 +85,13 @@ def measure(quick, note):
     for case in cases.TARGETS:
         note(f"{case}: all codes")
         summary["cases"][case] = compare.all_codes(case, effort)
-    for case in ("one_link_pulse", "two_link_torque_x0p1"):
-        note(f"{case}: generated code and hand-written loops")
-        summary["same_step"][case] = compare.same_step(case, effort)
+    for name in compare.BY_HAND:
+        note(f"{name}: generated code and hand-written loops")
+        summary["same_step"][name] = compare.same_step(name, effort)
     note("cost against links (compiles code for each arm the first time)")
     links = (1, 2, 4, 8) if quick else range(1, 9)
     summary["links"] = scaling.costs([(n, 2) for n in links], effort)
+    summary["stiffening"] = scaling.costs([(n, 2) for n in links], effort, foreshortening=True)
     note("cost against modes")
     modes = (1, 2, 4) if quick else range(1, 7)
     summary["modes"] = scaling.costs([(n, m) for n in (1, 2) for m in modes], effort)
@@ -100,6 +107,8 @@ def main(arguments=None):
     if what:
         print(what, file=sys.stderr)
         return MISSING
+    from flexarm_studies.markdown import write_between
+
     from . import criteria, plots, tables
 
     summary = measure(options.quick, lambda text: print(f"... {text}", file=sys.stderr, flush=True))
@@ -109,6 +118,8 @@ def main(arguments=None):
     text = json.dumps(summary, indent=1)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
     plots.draw(summary, out)
+    if options.write:
+        write_between(options.write, BEGIN, END, tables.markdown(summary))
     print(text if options.json else tables.text(summary))
     print(f"{out}: summary.json, figures", file=sys.stderr)
     return MISSED if any(c["met"] is False for c in summary["criteria"]) else 0

@@ -20,6 +20,7 @@ CODES = (
     (".peers.hand_loops", "HandLoops", "hand"),
     (".peers.mujoco_chain", "MujocoChain", "peer"),
     (".peers.mujoco_chain", "MujocoChainEuler", "peer"),
+    (".peers.mujoco_tubes", "MujocoTubes", "peer"),
     (".peers.exudyn_cable", "ExudynCable", "peer"),
     (".peers.numpy_equations", "NumpyRk4", "peer"),
     (".peers.numpy_equations", "NumpyDop853", "peer"),
@@ -28,6 +29,13 @@ CODES = (
 
 #: The project's entry in the results.
 OWN = own.Flexarm.name
+
+#: Cases whose equations are also written by hand, and whether the links stiffen in them.
+BY_HAND = {
+    "one link": ("one_link_pulse", False),
+    "two links": ("two_link_torque_x0p1", False),
+    "one link that stiffens": ("one_link_pulse", True),
+}
 
 #: Steps of the comparison with the hand-written loops [s].
 SAME_STEPS = (1e-3, 1e-2)
@@ -82,33 +90,40 @@ def all_codes(case, effort):
     return {"target": cases.TARGETS[case], "codes": found}
 
 
-def same_step(case, effort, steps=4000):
+def same_step(name, effort, steps=4000):
     """The compiled loops alone, RK4 with the same steps, so many `steps` in one call, torques ready.
 
-    For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second] and their ``ratio``, by
-    the best turns.
+    `name` is in `BY_HAND`. For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second]
+    by the best turns, and their ``ratio``, the median over turns next to each other.
     """
-    from .peers import hand_loops
-    from .peers.numpy_equations import equations, links
-
-    parameters = cases.parameters(case)
-    torque, arm, result = Torque(case, parameters), equations(parameters), []
-    if case.startswith("two_link"):
-        run, constants = hand_loops.run_two, hand_loops.two_links_constants(*links(parameters))
-    else:
-        run, constants = hand_loops.run_one, hand_loops.one_link_constants(*links(parameters))
-    stepper = cases.chain(parameters).stepper(METHODS["rk4"])
+    case, stiffens = BY_HAND[name]
+    parameters, result = cases.parameters(case), []
+    torque, chain = Torque(case, parameters), cases.chain(parameters, foreshortening=stiffens)
+    run, constants = _by_hand(chain, parameters, stiffens)
+    stepper, size = chain.stepper(METHODS["rk4"]), 2 * (chain.n_joints + chain.n_modes)
     for step in SAME_STEPS:
         every = steps_per_sample(step)
         rows = steps // every
         stages = torque.stages(steps, step)
         starts, ends = own.linear_torque(torque, rows, 1.0 / RATE)
-        states = np.zeros((2, rows + 1, 2 * arm.size))
+        states = np.zeros((2, rows + 1, size))
         tasks = {
             "generated": lambda a=(states[0], starts, ends, step, every): stepper.trajectory(*a),
             "hand": lambda a=(constants, step, every, stages, states[1]): run(*a),
         }
         times = round_robin(tasks, effort.rounds, effort.turn)
         entry = {name: 1e3 * least(t) / (steps * step) for name, t in times.items()}
-        result.append({"step": step, **entry, "ratio": entry["generated"] / entry["hand"]})
+        result.append({"step": step, **entry, "ratio": paired(times["generated"], times["hand"])})
     return result
+
+
+def _by_hand(chain, parameters, stiffens):
+    """Loops written by hand for a chain's equations, and their constants."""
+    from .peers import hand_loops, hand_stiffening
+    from .peers.numpy_equations import links
+
+    if stiffens:
+        return hand_stiffening.run, hand_stiffening.constants(chain.data, parameters)
+    if chain.n_joints == 2:
+        return hand_loops.run_two, hand_loops.two_links_constants(*links(parameters))
+    return hand_loops.run_one, hand_loops.one_link_constants(*links(parameters))

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the figures have to be."""
 
+import numpy as np
+
 from .compare import OWN
+from .timing import paired
 
 
 def _fastest_peer(result):
@@ -30,14 +33,22 @@ def check(summary):
     for case, result in summary["cases"].items():
         error = result["codes"][OWN]["tip_error"]
         criterion(f"{case}: tip error [um]", 1e6 * error, 1e6 * result["target"], False)
-    for links, case, times_faster, hand in (
-        ("one link", "one_link_pulse", 5.0, 2.0),
-        ("two links", "two_link_torque_x0p1", 3.0, 1.5),
+    for links, case, times_faster in (
+        ("one link", "one_link_pulse", 5.0),
+        ("two links", "two_link_torque_x0p1", 3.0),
+        ("two links that stiffen", "two_link_torque", 10.0),
+        ("three links that stiffen", "three_link_torque", 10.0),
+        ("two tubes in space that stiffen", "spatial_torque", 5.0),
     ):
         ratio, name = _fastest_peer(summary["cases"][case])
         criterion(f"{links}: times faster than {name}", ratio, times_faster, True)
-        worst = max(entry["ratio"] for entry in summary["same_step"][case])
-        criterion(f"{links}: time over hand-written loops, same step", worst, hand, False)
+    for name, hand in (("one link", 2.0), ("two links", 1.5), ("one link that stiffens", 1.5)):
+        worst = max(entry["ratio"] for entry in summary["same_step"][name])
+        criterion(f"{name}: time over hand-written loops, same step", worst, hand, False)
+    turns = {e["links"]: e["turns"].get("generated") for e in summary["stiffening"]}
+    most = max(turns)
+    ratio = turns[most] and paired(np.array(turns[most]), np.array(turns[1]))
+    criterion(f"{most} links that stiffen over 1", ratio, 1.5 * most, False)
     general = {entry["links"]: entry["loops"] for entry in summary["links"]}
     most = max(general)
     criterion(f"{most} links over 1, general code", general[most] / general[1], 1.5 * most, False)

@@ -15,10 +15,15 @@ BEST = {
         "one_link_pulse": {"step": 1e-2},
         "two_link_torque_x0p1": {"step": 1e-2},
         "two_link_torque": {"step": 1e-2, "foreshortening": True},
+        "three_link_torque": {"step": 1e-2, "foreshortening": True},
+        "spatial_torque": {"step": 1e-2, "foreshortening": True},
     },
     "FlexarmLoops": {
         "one_link_pulse": {"step": 1e-2},
         "two_link_torque_x0p1": {"step": 1e-2},
+        "two_link_torque": {"step": 1e-2, "foreshortening": True},
+        "three_link_torque": {"step": 1e-2, "foreshortening": True},
+        "spatial_torque": {"step": 1e-2, "foreshortening": True},
     },
 }
 
@@ -71,7 +76,9 @@ class Flexarm(Peer):
         frames = [self.chain.frames(state[:n], state[n : self.size]) for state in result]
         points = np.array([p for _, p in frames])
         columns = {"theta1": result[:, 0], "tip_x": points[:, -1, 0], "tip_y": points[:, -1, 1]}
-        if not self.two_links:
+        if self.chain.planar_axis is None:
+            return columns | {"tip_z": points[:, -1, 2]}
+        if self.links != 2:
             return columns
         turns = np.array([R[1] for R, _ in frames])
         return columns | {

@@ -14,6 +14,8 @@ TITLES = {
     "one_link_pulse": "One link, torque pulse",
     "two_link_torque_x0p1": "Two links, small torque",
     "two_link_torque": "Two links, large torque",
+    "three_link_torque": "Three links",
+    "spatial_torque": "Two tubes in space",
 }
 
 

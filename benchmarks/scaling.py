@@ -31,13 +31,13 @@ BLOCK = bytes(1 << 22)
 CASE = "two_link_torque_x0p1"
 
 
-def costs(arms, effort, steps=200):
+def costs(arms, effort, steps=200, foreshortening=False):
     """Cost of one evaluation of the accelerations, in loops and in generated code, in calls of so many RK4 `steps`.
 
     `arms` are pairs of links and modes per link. For each ``links``, ``modes``, and ``loops`` and ``generated``
     [us per evaluation], the latter None where the project generates no code, by the best turns; ``turns`` of both.
     """
-    chains = {arm: cases.chain(cases.parameters(CASE), *arm) for arm in arms}
+    chains = {arm: cases.chain(cases.parameters(CASE), *arm, foreshortening) for arm in arms}
     tasks = {}
     for arm, chain in chains.items():
         tasks["loops", arm] = _evaluations(chain, False, steps)

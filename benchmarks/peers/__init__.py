@@ -18,15 +18,22 @@ EDGE = 1e-9
 _SINE = re.compile(r"\s*([-+.\deE]+)\*sin\(2\*pi\*([.\deE]+)\*t\)\s*")
 
 
+def hubs(parameters):
+    """Inertia of the hub of each link of a case [kg m^2], as a list."""
+    if "Jh" in parameters:
+        return [parameters["Jh"]]
+    return [parameters[f"Jh{i}"] for i in range(1, 9) if f"Jh{i}" in parameters]
+
+
 class Peer:
     """A simulation of one reference case that starts at rest.
 
     Parameters
     ----------
     case : str
-        ``one_link_pulse``, ``two_link_torque`` or ``two_link_torque_x0p1``.
+        One of `cases.TARGETS`.
     parameters : dict
-        That case's entry of ``parameters.json``.
+        Of that case, see `cases.parameters`.
     **settings
         The settings of the code: step, segments, tolerance.
     """
@@ -35,7 +42,7 @@ class Peer:
 
     def __init__(self, case, parameters, **settings):
         self.case, self.parameters, self.settings = case, parameters, settings
-        self.two_links = case.startswith("two_link")
+        self.links = len(hubs(parameters))
         self.torque = Torque(case, parameters)
 
     def integrate(self, duration):
@@ -48,7 +55,7 @@ class Peer:
     def report(self, result):
         """Kinematics of what `integrate` returned, `RATE` a second, start and end included, each (n,).
 
-        By name: theta1, tip_x, tip_y, and with two links elbow_x, elbow_y, alpha2 [rad, m].
+        By name: theta1, tip_x, tip_y, of a spatial arm tip_z, of two planar links elbow_x, elbow_y, alpha2 [rad, m].
         """
         raise NotImplementedError
 
@@ -78,8 +85,9 @@ class Torque:
             self.count, self.edges, self.level = 1, (0.5, 1.0), (height, -height, 0.0)
             self.sines = []
         else:
-            self.count, self.edges, self.level, self.sines = 2, (), (), []
-            for key in ("tau1", "tau2"):
+            keys = [f"tau{i + 1}" for i in range(len(hubs(parameters)))]
+            self.count, self.edges, self.level, self.sines = len(keys), (), (), []
+            for key in keys:
                 match = _SINE.fullmatch(parameters[key])
                 if match is None:
                     raise ValueError(f"{key}: {parameters[key]!r} is not amplitude*sin(2*pi*f*t)")
@@ -139,6 +147,8 @@ def errors(columns, reference):
         return columns[key] - reference[key][:n]
 
     return {
-        "tip": float(np.max(np.hypot(off("tip_x"), off("tip_y")))),
+        "tip": float(
+            np.max(np.linalg.norm([off(k) for k in columns if k.startswith("tip_")], axis=0))
+        ),
         "theta1": float(np.max(np.abs(off("theta1")))),
     }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Exudyn model of one or two planar flexible links from ANCF cable elements.
+r"""Exudyn model of planar flexible links from ANCF cable elements.
 
 Every node has a position and a slope vector :math:`r'` (`NodePoint2DSlope1`); the cables' axial
 stiffness keeps :math:`|r'|` near one, so that an inertia J on :math:`\dot r'` in both directions is
@@ -25,7 +25,7 @@ from exudyn.itemInterface import (
 )
 from exudyn.utilities import CreateSymbolicUserFunction
 
-from . import Peer, steps_per_sample, times
+from . import Peer, hubs, steps_per_sample, times
 
 #: Version tried; wheels for CPython 3.10 to 3.14.
 PINNED = "exudyn==1.13.6"
@@ -40,8 +40,11 @@ BEST = {
         "one_link_pulse": {"elements": 1, "step": 1e-2, "rtol": 1e-4, "atol": 1e-6},
         "two_link_torque_x0p1": {"elements": 1, "step": 1e-2, "rtol": 1e-4, "atol": 1e-6},
         "two_link_torque": {"elements": 2, "step": 5e-3, "rtol": 1e-4, "atol": 1e-6},
+        "three_link_torque": {
+            "elements": 3, "step": 2.5e-3, "axial": 1e6, "spectral_radius": 0.8, "rtol": 1e-4, "atol": 1e-6,
+        },
     }
-}
+}  # fmt: skip
 
 
 class ExudynCable(Peer):
@@ -95,10 +98,9 @@ class ExudynCable(Peer):
     def _build(self):
         """Nodes, cables, masses, pivots, torques and sensors."""
         p, system = self.parameters, self.system
-        hubs = (p["Jh1"], p["Jh2"]) if self.two_links else (p["Jh"],)
         ground = system.AddNode(NodePointGround())
         ends, pivot, self.sensors = [], None, []
-        for number, hub in enumerate(hubs):
+        for number, hub in enumerate(hubs(p)):
             start = number * p["L"]
             nodes = [
                 system.AddNode(NodePoint2DSlope1(referenceCoordinates=[start + x, 0.0, 1.0, 0.0]))
@@ -215,11 +217,10 @@ class ExudynCable(Peer):
         data = [self.system.GetSensorStoredData(s)[:result, 1:] for s in self.sensors]
         length = self.parameters["L"]
         columns = {"theta1": np.arctan2(data[0][:, 3], 1.0 + data[0][:, 2])}
-        if not self.two_links:
-            return columns | {"tip_x": length + data[1][:, 0], "tip_y": data[1][:, 1]}
+        columns |= {"tip_x": self.links * length + data[-1][:, 0], "tip_y": data[-1][:, 1]}
+        if self.links != 2:
+            return columns
         return columns | {
-            "tip_x": 2.0 * length + data[3][:, 0],
-            "tip_y": data[3][:, 1],
             "elbow_x": length + data[1][:, 0],
             "elbow_y": data[1][:, 1],
             "alpha2": np.arctan2(data[2][:, 3], 1.0 + data[2][:, 2]),

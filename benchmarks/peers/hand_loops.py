@@ -167,36 +167,47 @@ def two_links(k, q, x1, x2, al, y1, y2, r, v1, v2, s, u1, u2, torque1, torque2):
     )
 
 
-@njit(cache=True)
-def run_one(k, h, every, torque, out):
-    """Runge-Kutta 4 from ``out[0]``: (q, delta, rates) into every row, `every` steps apart."""
-    q, x, y, r, v, w = out[0]
-    half, sixth = 0.5 * h, h / 6.0
-    quarter, half2, sixth2 = half * half, half * h, h * h / 6.0
-    i = 0
-    for row in range(1, out.shape[0]):
-        for _ in range(every):
-            start, middle, end = torque[i, 0, 0], torque[i, 1, 0], torque[i, 2, 0]
-            i += 1
-            a1, b1, c1 = one_link(k, x, y, r, v, w, start)
-            xm, ym = x + half * v, y + half * w
-            a2, b2, c2 = one_link(k, xm, ym, r + half * a1, v + half * b1, w + half * c1, middle)
-            a3, b3, c3 = one_link(
-                k, xm + quarter * b1, ym + quarter * c1,
-                r + half * a2, v + half * b2, w + half * c2, middle,
-            )  # fmt: skip
-            a4, b4, c4 = one_link(
-                k, x + h * v + half2 * b2, y + h * w + half2 * c2,
-                r + h * a3, v + h * b3, w + h * c3, end,
-            )  # fmt: skip
-            q += h * r + sixth2 * (a1 + a2 + a3)
-            x += h * v + sixth2 * (b1 + b2 + b3)
-            y += h * w + sixth2 * (c1 + c2 + c3)
-            r += sixth * (a1 + 2.0 * (a2 + a3) + a4)
-            v += sixth * (b1 + 2.0 * (b2 + b3) + b4)
-            w += sixth * (c1 + 2.0 * (c2 + c3) + c4)
-        out[row, 0], out[row, 1], out[row, 2] = q, x, y
-        out[row, 3], out[row, 4], out[row, 5] = r, v, w
+def one_link_runner(accelerations):
+    """Runge-Kutta 4 of one link whose `accelerations` are compiled: ``run(constants, step, every, torques, rows)``."""
+
+    @njit
+    def run(k, h, every, torque, out):
+        """Runge-Kutta 4 from ``out[0]``: (q, delta, rates) into every row, `every` steps apart."""
+        q, x, y, r, v, w = out[0]
+        half, sixth = 0.5 * h, h / 6.0
+        quarter, half2, sixth2 = half * half, half * h, h * h / 6.0
+        i = 0
+        for row in range(1, out.shape[0]):
+            for _ in range(every):
+                start, middle, end = torque[i, 0, 0], torque[i, 1, 0], torque[i, 2, 0]
+                i += 1
+                a1, b1, c1 = accelerations(k, x, y, r, v, w, start)
+                xm, ym = x + half * v, y + half * w
+                a2, b2, c2 = accelerations(
+                    k, xm, ym, r + half * a1, v + half * b1, w + half * c1, middle
+                )
+                a3, b3, c3 = accelerations(
+                    k, xm + quarter * b1, ym + quarter * c1,
+                    r + half * a2, v + half * b2, w + half * c2, middle,
+                )  # fmt: skip
+                a4, b4, c4 = accelerations(
+                    k, x + h * v + half2 * b2, y + h * w + half2 * c2,
+                    r + h * a3, v + h * b3, w + h * c3, end,
+                )  # fmt: skip
+                q += h * r + sixth2 * (a1 + a2 + a3)
+                x += h * v + sixth2 * (b1 + b2 + b3)
+                y += h * w + sixth2 * (c1 + c2 + c3)
+                r += sixth * (a1 + 2.0 * (a2 + a3) + a4)
+                v += sixth * (b1 + 2.0 * (b2 + b3) + b4)
+                w += sixth * (c1 + 2.0 * (c2 + c3) + c4)
+            out[row, 0], out[row, 1], out[row, 2] = q, x, y
+            out[row, 3], out[row, 4], out[row, 5] = r, v, w
+
+    return run
+
+
+#: From ``out[0]``: (q, delta, rates) into every row, `every` steps apart.
+run_one = one_link_runner(one_link)
 
 
 @njit(cache=True)
@@ -267,7 +278,7 @@ class HandLoops(Peer):
         super().__init__(case, parameters, step=step)
         self.arm = equations(parameters, tip_mass, tip_inertia)
         arm = links(parameters, tip_mass, tip_inertia)
-        self.constants = (two_links_constants if self.two_links else one_link_constants)(*arm)
+        self.constants = (two_links_constants if self.links == 2 else one_link_constants)(*arm)
         self.step, self.every = step, steps_per_sample(step)
         self.integrate(1.0 / RATE)  # compiles
 
@@ -287,7 +298,7 @@ class HandLoops(Peer):
             States in the same coordinates.
         """
         out = np.empty((1 + len(torque) // self.every, len(start)))
-        if not self.two_links:
+        if self.links == 1:
             out[0] = start
             run_one(self.constants, self.step, self.every, torque, out)
             return out
@@ -307,7 +318,7 @@ class HandLoops(Peer):
 
     def accelerations(self, state, torque):
         """Second derivatives of (q, delta) or (q1, q2, delta1, delta2)."""
-        if not self.two_links:
+        if self.links == 1:
             return np.array(one_link(self.constants, *state[1:], torque[0]))
         slope = self.arm.inner.slope
         x, v = state[:6], state[6:]

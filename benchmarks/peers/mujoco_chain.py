@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""MuJoCo model of one or two planar flexible links as chains of rigid segments.
+r"""MuJoCo model of planar flexible links as chains of rigid segments.
 
 A link is a chain of rigid segments with a spring hinge between neighbours. With hinges at the nodes
 :math:`x_k` of a quadrature rule on the link and stiffness :math:`EI/(w_k L)` the chain's deflection
@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from . import RATE, Peer, steps_per_sample
+from . import RATE, Peer, hubs, steps_per_sample
 
 #: Versions tried: mujoco 3.17.0 (wheels for CPython 3.10 to 3.14; 4.0.0 has none for 3.10).
 PINNED = "mujoco==3.17.0"
@@ -36,6 +36,7 @@ BEST = {
         "one_link_pulse": {"segments": 3, "step": 5e-3},
         "two_link_torque_x0p1": {"segments": 2, "step": 1e-2},
         "two_link_torque": {"segments": 4, "step": 2.5e-3},
+        "three_link_torque": {"segments": 3, "step": 2.5e-3},
     },
     "MujocoChainEuler": {
         "one_link_pulse": {"segments": 3, "step": 1.0 / 600.0},
@@ -89,11 +90,10 @@ def chain(parameters, segments, layout, step, integrator):
     length, rho, stiffness = p["L"], p["rhoA"], p["EI"]
     places, weights = hinges(segments, layout)
     bounds = np.concatenate([[0.0], places * length, [length]])
-    two = "Jh2" in p
-    hubs = (p["Jh1"], p["Jh2"]) if two else (p["Jh"],)
     text, depth, offset = [], 0, 0.0
-    for number, hub in enumerate(hubs):
-        last = number == len(hubs) - 1
+    inertias = hubs(p)
+    for number, hub in enumerate(inertias):
+        last = number == len(inertias) - 1
         for k in range(segments + 1):
             size = float(bounds[k + 1] - bounds[k])
             points, spin = [], hub if k == 0 else 0.0
@@ -112,7 +112,7 @@ def chain(parameters, segments, layout, step, integrator):
                 f' mass="{mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>'
             )
             offset, depth = size, depth + 1
-    motors = "".join(f'<motor joint="q{n + 1}"/>' for n in range(len(hubs)))
+    motors = "".join(f'<motor joint="q{n + 1}"/>' for n in range(len(inertias)))
     return (
         "<mujoco>"
         + _OPTION.format(step=float(step), integrator=integrator)
@@ -140,9 +140,7 @@ class MujocoChain(Peer):
     def __init__(self, case, parameters, *, step=1e-3, segments=4, layout="gauss"):
         super().__init__(case, parameters, step=step, segments=segments, layout=layout)
         self.step, self.every, self.segments = step, steps_per_sample(step), segments
-        self.model = mujoco.MjModel.from_xml_string(
-            chain(parameters, segments, layout, step, self.integrator)
-        )
+        self.model = mujoco.MjModel.from_xml_string(self._model(parameters, segments, layout, step))
         self.data = mujoco.MjData(self.model)
         places, _ = hinges(segments, layout)
         self.sizes = np.diff(np.concatenate([[0.0], places, [1.0]])) * parameters["L"]
@@ -150,6 +148,9 @@ class MujocoChain(Peer):
         self.start = np.empty(mujoco.mj_stateSize(self.model, kind))
         mujoco.mj_getState(self.model, self.data, self.start, kind)
         self.rollout = rollout.Rollout(nthread=0)
+
+    def _model(self, parameters, segments, layout, step):
+        return chain(parameters, segments, layout, step, self.integrator)
 
     def integrate(self, duration):
         steps = round(duration * RATE) * self.every
@@ -167,16 +168,13 @@ class MujocoChain(Peer):
         """Report columns from joint angles, shape (n, joints)."""
         direction = np.cumsum(angles, axis=1)
         cos, sin = np.cos(direction), np.sin(direction)
-        n = self.segments + 1
-        x, y = cos[:, :n] @ self.sizes, sin[:, :n] @ self.sizes
-        if not self.two_links:
-            return {"theta1": angles[:, 0], "tip_x": x, "tip_y": y}
-        return {
-            "theta1": angles[:, 0],
-            "tip_x": x + cos[:, n:] @ self.sizes,
-            "tip_y": y + sin[:, n:] @ self.sizes,
-            "elbow_x": x,
-            "elbow_y": y,
+        n, sizes = self.segments + 1, np.tile(self.sizes, self.links)
+        columns = {"theta1": angles[:, 0], "tip_x": cos @ sizes, "tip_y": sin @ sizes}
+        if self.links != 2:
+            return columns
+        return columns | {
+            "elbow_x": cos[:, :n] @ self.sizes,
+            "elbow_y": sin[:, :n] @ self.sizes,
             "alpha2": direction[:, n],
         }
 
