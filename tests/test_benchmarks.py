@@ -124,7 +124,7 @@ def summary(own_ms, available=2.0):
     same = {"step": 1e-3, "generated": own_ms, "hand": 0.1, "ratio": own_ms / 0.1}
     cost = {"modes": 2, "generated": None}
     stiff = [
-        {"links": n, "modes": 2, "loops": 9.0 * n, "generated": n, "turns": {"generated": [n, n]}}
+        {"links": n, "modes": 2, "loops": 9.0 * n, "generated": n, "turns": {"loops": [n, n]}}
         for n in (1, 8)
     ]
     cores = [
