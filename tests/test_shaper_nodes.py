@@ -9,8 +9,9 @@ from action_msgs.msg import GoalStatus
 from harness import Bench
 from in_process import InProcess
 from rclpy.action import ActionClient, ActionServer
+from rclpy.parameter import Parameter
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -191,6 +192,42 @@ def test_parameters_that_can_not_be_used_keep_the_node_from_starting(bench, sett
     assert problem in str(refused.value)
 
 
+def set_at(node, **values):
+    """Set parameters of a node all together; what it answers."""
+    return node.set_parameters_atomically([Parameter(k, value=v) for k, v in values.items()])
+
+
+def test_type_and_modes_change_at_the_next_rest_and_what_does_not_fit_is_refused(bench):
+    shaper = Shaper(bench)
+    node = bench.nodes["shaper"]
+    refused = set_at(node, **{"shaper.frequencies": [4.0, 9.0], "shaper.dampings": [0.1, 0.1, 0.1]})
+    assert not refused.successful
+    assert "shaper.dampings: 3 values" in refused.reason
+    assert list(node.get_parameter("shaper.frequencies").value) == [4.0]
+    _, state = shaper.send(THERE)
+    before = state.added_time
+    assert set_at(node, **{"shaper.type": "zv", "shaper.frequencies": [2.0]}).successful
+    shaper.settle()
+    assert shaper.states.newest.shaper == "zvd"  # the motion is under way
+    end = stamp_ns(state.end)
+    node.now_ns = lambda: end + 1
+    bench.wait_for("the change", lambda: shaper.states.newest.shaper == "zv")
+    _, state = shaper.send(message((0.0, 0.6, -0.3), (1.0, 0.0, 0.0)))
+    assert before == pytest.approx(1.0 / 4.0, rel=1e-2)
+    assert state.added_time == pytest.approx(0.5 / 2.0, rel=1e-2)
+
+
+def test_a_path_without_times_gets_the_quickest_time_law_within_the_limits(bench):
+    limits = {"limits.velocity": [1.0], "limits.acceleration": [5.0]}
+    shaper = Shaper(bench, **{"time_law": "time_optimal", **limits, "shaper.type": "none"})
+    (out,), state = shaper.send(message((0.0, 0.0, 0.0), (0.0, 0.6, -0.3), (0.0, 1.2, 0.0)))
+    assert state.rejected_reason == ""
+    assert 1.4 < stamp_ns(out.points[-1].time_from_start) / 1e9 < 2.2
+    assert list(out.points[-1].positions) == [1.2, 0.0]
+    speeds = np.array([p.velocities for p in out.points])
+    assert 0.95 < np.abs(speeds).max() < 1.001
+
+
 def test_a_stream_of_positions_is_shaped_and_malformed_inputs_are_ignored(bench):
     topic = "forward_position_controller/commands"
     shaper = Shaper(bench, stream_output=topic, stream_rate=500.0)
@@ -279,9 +316,62 @@ def test_a_push_is_damped_in_the_stream_by_strain_until_the_sensor_is_silent(ben
     assert values["damping"] == "off: the sensor is silent"
 
 
+IMU = {
+    **DAMPING,
+    "damping.sensor": "imu",
+    "damping.axis": "z",
+    "damping.full_scale": 40.0,
+    "damping.sensitivity": SENSITIVITY * (2.0 * np.pi * FREQUENCY) ** 2,
+    "damping.phase": 1.57 - np.pi,
+}
+
+
+@pytest.mark.parametrize(
+    ("value", "late", "problem"),
+    [
+        (np.nan, 0.0, "not finite"),
+        (50.0, 0.0, "beyond its full scale"),
+        (9.81, 0.5, "not of now"),
+        (9.81, None, "not of now"),
+    ],
+)
+def test_a_push_is_damped_by_an_imu_until_it_is_in_doubt(bench, value, late, problem):
+    Shaper(bench, **IMU)
+    node = bench.nodes["shaper"]
+    node.now_ns = lambda: round(1e9 * (100.0 + bench.queue.time))
+    commands = bench.tap(Float64MultiArray, "commands")
+    imu = bench.publisher(Imu, "imu")
+    bench.publisher(Float64MultiArray, "stream").publish(Float64MultiArray(data=[0.2, 0.1]))
+    swing, p = 1e-3 + 0j, strain_damping.pole(FREQUENCY, 0.005)
+
+    def period(acceleration, stamp_ns):
+        nonlocal swing
+        msg = Imu()
+        msg.linear_acceleration.z = float(acceleration)
+        set_stamp(msg.header.stamp, stamp_ns)
+        imu.publish(msg)
+        seen = len(commands.messages)
+        bench.wait_for("a command", lambda: len(commands.messages) > seen)
+        u = commands.newest.data[1] - 0.1
+        swing = strain_damping.moved(swing, p, 1j * SENSITIVITY, u, 0.008)
+        return u
+
+    for _ in range(200):
+        period(9.81 - swing.real * abs(p) ** 2, node.now_ns())
+    assert abs(swing) < 0.4e-3
+    swing, stuck = 1e-3 + 0j, node.now_ns()
+    for _ in range(20):
+        period(9.81 - swing.real * abs(p) ** 2, node.now_ns())
+    for _ in range(60):
+        u = period(value, stuck if late is None else node.now_ns() - round(1e9 * late))
+    assert u == 0.0
+    assert problem in node.diagnose()[1]
+
+
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [
+        ({"damping.sensor": "imu"}, "less than an accelerometer's"),
         ({"damping.joint": "x"}, "no joint of the stream"),
         ({"stream_output": ""}, "no positions to correct"),
         ({"stream_kind": "velocities"}, "no positions to correct"),

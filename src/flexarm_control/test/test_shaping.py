@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shaped trajectories and streams: exact, from and to where they were, within limits, stopped and replaced smoothly."""
 
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +18,7 @@ from flexarm_control.shaping.shaped_motion import ShapedMotion
 from flexarm_control.shaping.stream import StreamShaper
 from flexarm_control.shaping.trajectory_shaper import TrajectoryShaper
 from flexarm_control.trajectory import validate
-from flexarm_dynamics.errors import MessageError, ParameterError, TrajectoryError
+from flexarm_dynamics.errors import DesignError, MessageError, ParameterError, TrajectoryError
 from flexarm_dynamics.parameters import check_all
 
 NAMES = ("a", "b")
@@ -28,10 +30,10 @@ def made_modes(**settings):
     return Modes(check_all(modes_module.PARAMETERS, settings), 2)
 
 
-def shaper(limits=None, **settings):
+def shaper(limits=None, law="given", **settings):
     settings = {"frequencies": [2.0]} | settings
     checked = check_all(trajectory_shaper.PARAMETERS, limits or {}, {"joints": 2})
-    return TrajectoryShaper(made_modes(**settings), NAMES, checked)
+    return TrajectoryShaper(made_modes(**settings), NAMES, checked, law)
 
 
 def trajectory(times, positions, velocities=None, accelerations=None, stamp=0):
@@ -453,3 +455,65 @@ def test_a_trajectory_that_replaces_one_goes_on_from_it_without_ringing():
     assert ringing(position, 0.0, end, frequency) < 0.1 * swing
     steps = np.diff(position(np.linspace(0.0, end, 4000)), axis=0)
     assert np.abs(steps).max() < 1.5 * FAR / 0.8 * end / 4000
+
+
+# The quickest time laws within limits.
+
+LIMITS = {"velocity": [1.0, 0.4], "acceleration": [4.0, 3.0], "jerk": [30.0, 20.0]}
+
+
+@pytest.mark.parametrize("law", ["jerk_limited", "time_optimal"])
+def test_a_quickest_time_law_keeps_the_line_and_the_limits_and_meets_one_of_them(law):
+    own = shaper(LIMITS, law, type="none")
+    first = own.offer(trajectory([5.0], [[1.0, -0.5]]), NOW, measured=np.zeros(2))
+    motion = joined(first)
+    t = np.linspace(0.0, first.times_ns[-1] / S, 4001)
+    p, v, a = motion.states(t)
+    assert_allclose(p[:, 1], -0.5 * p[:, 0], atol=1e-6)
+    assert_allclose(motion.end, [1.0, -0.5])
+    parts = [np.abs(x).max(axis=0) / LIMITS[k] for k, x in (("velocity", v), ("acceleration", a))]
+    assert max(part.max() for part in parts) <= 1.0 + 1e-5
+    assert parts[0][1] == pytest.approx(1.0, abs=1e-3)  # the slower joint goes as fast as it may
+    if law == "jerk_limited":
+        jerk = np.abs(np.diff(a, axis=0)).max(axis=0) / np.diff(t)[0]
+        assert (jerk <= np.array(LIMITS["jerk"]) * (1.0 + 1e-5)).all()
+
+
+def test_a_time_optimal_motion_passes_all_points_and_a_jerk_limited_one_refuses_a_corner():
+    corner = trajectory([1.0, 2.0], [[0.5, 0.0], [0.5, 0.5]])
+    made = joined(shaper(LIMITS, "time_optimal", type="none").offer(corner, NOW, np.zeros(2)))
+    p, v, a = made.states(np.linspace(0.0, made.duration, 4001))
+    for point in corner.positions:
+        assert np.abs(p - point).max(axis=1).min() < 1e-3
+    assert (np.abs(v).max(axis=0) <= np.array(LIMITS["velocity"]) * (1.0 + 1e-6)).all()
+    assert (np.abs(a).max(axis=0) <= np.array(LIMITS["acceleration"]) * (1.0 + 1e-3)).all()
+    with pytest.raises(
+        TrajectoryError, match=r"points\[0\].positions of joint .* beside the straight line"
+    ):
+        shaper(LIMITS, "jerk_limited", type="none").offer(corner, NOW, np.zeros(2))
+
+
+def test_a_jerk_limited_motion_is_replaced_on_the_way_and_a_time_optimal_one_is_not():
+    there_and = trajectory([1.0], [[1.0, -0.5]])
+    back = trajectory([1.0], [[0.0, 0.0]])
+    own = shaper(LIMITS, "jerk_limited", type="zvd")
+    own.offer(there_and, NOW, np.zeros(2))
+    at = own.state(NOW + S // 2)
+    replaced = own.offer(back, NOW + S // 2)
+    assert not replaced.fresh
+    assert_allclose(replaced.fields[0][0], at[0], atol=0.1)
+    assert_allclose(replaced.fields[0][-1], [0.0, 0.0])
+    own = shaper(LIMITS, "time_optimal", type="zvd")
+    own.offer(there_and, NOW, np.zeros(2))
+    with pytest.raises(TrajectoryError, match="begins at rest"):
+        own.offer(back, NOW + S // 2)
+
+
+def test_a_quickest_time_law_needs_its_limits_and_its_library(monkeypatch):
+    with pytest.raises(
+        ParameterError, match=r"limits.jerk: .*needs limits.velocity, .*limits.jerk"
+    ):
+        shaper({**LIMITS, "jerk": [1.0, 0.0]}, "jerk_limited")
+    monkeypatch.setitem(sys.modules, "toppra", None)
+    with pytest.raises(DesignError, match="pip install toppra"):
+        shaper(LIMITS, "time_optimal")

@@ -275,3 +275,43 @@ def test_whatever_comes_the_correction_is_finite_and_bounded(inputs):
 def test_records_that_say_nothing_are_refused(corrections, readings, match):
     with pytest.raises(DesignError, match=match):
         identified(F, RATIO, T, corrections, readings)
+
+
+class Tip(Link):
+    """The same mode seen by an accelerometer, which moves with the joint as well: eta'' and q'' times a reach."""
+
+    #: Over the answer of the mode to the joint's acceleration [-]: a tip's is about 1.
+    REACH = 1.0
+
+    def __init__(self, **others):
+        super().__init__(**others)
+        self.sent = [0.0] * 3
+
+    @property
+    def strain(self):
+        """The reading, an acceleration: that of the mode is -w^2 times what bends."""
+        joint = (self.sent[-1] - 2.0 * self.sent[-2] + self.sent[-3]) / T**2
+        return -(self.z * abs(self.p) ** 2).real + abs(C) * self.REACH * joint + self.bias
+
+    def command(self, u):
+        self.sent.append(u)
+        super().command(u)
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.0, 1.15])
+def test_a_push_is_damped_by_an_accelerometer_whose_answer_a_burst_finds(factor):
+    sent = np.append(burst(F, 0.01, T), np.zeros(300))
+    link, readings = Tip(bias=9.81), []
+    for u in sent:
+        readings.append(link.strain)
+        link.command(u)
+    beta, left = identified(F, RATIO, T, sent, readings)
+    assert left < 1e-6
+    assert abs(beta) == pytest.approx(abs(C) * W**3, rel=0.02)
+    found = {"sensitivity": abs(beta), "phase": cmath.phase(beta), "full_scale": 40.0}
+    given = check_all(PARAMETERS, {"frequency": F, "damping": RATIO, "target": 0.1, **found})
+    law = StrainDamping(given, T)
+    law.update(-T, 9.81)
+    amplitudes, _ = run(law, Tip(factor=factor, bent=1e-4, bias=9.81), 2.0)
+    decay = -math.log(amplitudes[120] / amplitudes[40]) / (80 * T * W)
+    assert decay == pytest.approx(0.1, rel=0.3 if factor == 1.0 else 0.5)

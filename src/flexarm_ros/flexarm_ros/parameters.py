@@ -12,7 +12,7 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 
-from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.errors import FlexarmError, ParameterError
 
 
 def descriptor(parameter):
@@ -81,7 +81,7 @@ class NodeParameters:
             prefix + p.name: (prefix, p) for prefix, group in groups.items() for p in group
         }
         self._sizes = {}
-        self._listener = None
+        self._listener = self._judge = None
         for name, (prefix, parameter) in self._declared.items():
             _give_empty_list(node, name, parameter)
             try:
@@ -143,6 +143,10 @@ class NodeParameters:
         """Call ``listener(set of changed names)`` after a set has been taken."""
         self._listener = listener
 
+    def judged_by(self, judge):
+        """Call ``judge(all values by full names)`` before a set is taken; a `FlexarmError` of it refuses the set."""
+        self._judge = judge
+
     def __getitem__(self, name):
         return self._values[name]
 
@@ -177,8 +181,10 @@ class NodeParameters:
     def _on_set(self, parameters):
         # Validates only: nothing is applied here, so that a refused set leaves no trace.
         try:
-            self._checked({p.name: p.value for p in parameters})
-        except ParameterError as error:
+            changed = self._checked({p.name: p.value for p in parameters})
+            if changed and self._judge is not None:
+                self._judge({**self._values, **changed})
+        except FlexarmError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 

@@ -48,19 +48,46 @@ def test_modes_of_both_ends_are_given_once():
     assert_allclose(both.dampings, [0.08, 0.01, 0.06])
 
 
-def test_a_motion_along_which_the_frequency_rises_by_a_quarter_needs_the_modes_of_both_ends():
+def test_modes_along_a_motion_keep_their_order_and_one_that_is_missing_is_close_to_another():
+    def row(frequencies):
+        return study.Measured(np.array(frequencies), 0.01 * np.arange(1.0, 1.0 + len(frequencies)))
+
+    # The loudest comes first; half-way two modes are one; of three at the start the two loudest count.
+    frequencies, dampings = study.rows(row([8.3, 7.1]), (row([7.7]), row([8.6, 13.2, 20.0])))
+    assert_allclose(frequencies, [[8.6, 13.2], [7.7, 7.7], [7.1, 8.3]])
+    assert_allclose(dampings, [[0.01, 0.02], [0.01, 0.01], [0.02, 0.01]])
+    # Twice a frequency is another mode: what is found at the end alone stays as it is.
+    frequencies, _ = study.rows(row([2.5, 5.2]), (row([2.3]), row([])))
+    assert_allclose(frequencies, [[2.3, 5.2], [2.3, 5.2], [2.5, 5.2]])
+
+
+def test_the_quickest_motions_on_a_line_are_the_trapezoid_and_one_with_less_jerk():
+    motion = trapezoid([0.0, 1.0], [1.5, 1.0], 3.0)
+    found = study.quickest(motion, 2.0)
+    t = np.linspace(0.0, 3.0, 301)
+    assert_allclose(found["toppra"].position(t), motion.position(t), atol=1e-5)
+    smooth = found["ruckig, one period"]
+    t = np.linspace(0.0, smooth.duration, 4001)
+    assert np.abs(np.diff(smooth.acceleration(t)[:, 0])).max() / t[1] <= 0.75 / 2.0 * (1.0 + 1e-6)
+    assert 3.0 < smooth.duration < 6.0
+
+
+def test_a_motion_along_which_the_frequency_rises_needs_the_modes_of_both_ends_and_is_best_retimed():
     case = cases.random_arm(2)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion, window = case.motions[1], study.WINDOW * case.period
-    end = study.measured(arm, motion.end, motion.angle, case.period)
-    start = study.measured(arm, motion.start, -motion.angle, case.period)
-    assert end.frequencies[0] > 1.2 * start.frequencies[0]
-    both = study.together(end, start)
-    unshaped, one, two = (
-        arm.follow(m, window).residual(window)
-        for m in (motion, *(study.shaped(motion, "robust", f) for f in (end, both)))
+    places = [motion.end, 0.5 * (motion.start + motion.end), motion.start]
+    ways = [motion.angle, motion.angle, -motion.angle]
+    end, *others = (
+        study.measured(arm, p, w, case.period) for p, w in zip(places, ways, strict=True)
     )
+    assert end.frequencies[0] > 1.2 * others[-1].frequencies[0]
+    both, along = study.together(end, others[-1]), study.rows(end, others)
+    made = [motion, *(study.shaped(motion, "robust", f) for f in (end, both))]
+    made += [study.retimed(motion, along, off) for off in (1.0, 0.85, 1.15)]
+    unshaped, one, two, *new = (arm.follow(m, window).residual(window) for m in made)
     assert two < 0.1 * unshaped < one
+    assert max(new) < 0.06 * unshaped
 
 
 def test_the_table_counts_what_is_within_what_is_wanted():
@@ -82,13 +109,18 @@ def test_a_push_decays_five_times_faster_with_damping_by_strain():
     assert found.without > 5.0 * max(found.damped, found.low, found.high, found.noisy)
     assert found.largest < 0.01
     assert found.motion < 0.5
+    assert found.without > 5.0 * found.imu
+    assert found.imu_motion < 0.5
 
 
 def test_the_table_of_pushes_has_times_and_factors():
-    found = pushes.Decay(1.0, 3.0, 0.01, np.pi / 2.0, 6.0, 1.0, 1.2, 1.5, 2.0, 3.0, 0.004, 0.25)
+    found = pushes.Decay(
+        1.0, 3.0, 0.01, np.pi / 2.0, 6.0, 1.0, 1.2, 1.5, 2.0, 3.0, 0.004, 0.25, 1.5, 0.3
+    )
     row = dict(zip(pushes.COLUMNS, found.row(), strict=True))
     assert row["faster"] == 6.0
     assert (row["-15 %"], row["+15 %"], row["made for payload 1"]) == (5.0, 4.0, 3.0)
     assert row["noise 1e-5"] == 2.0
     assert row["phase, degrees"] == pytest.approx(90.0)
     assert row["largest correction, mrad"] == pytest.approx(4.0)
+    assert (row["IMU: faster"], row["IMU: after a motion"]) == (4.0, 0.3)

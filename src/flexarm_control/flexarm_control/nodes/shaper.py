@@ -43,6 +43,12 @@ PARAMETERS = (
     parameter("synchronised_clocks", True, read_only=True).described(
         "Whether the controller's clock is this node's; false: stamps are 0, which means now."
     ),
+    parameter(
+        "time_law", trajectory_shaper.GIVEN, choices=trajectory_shaper.TIME_LAWS, read_only=True
+    ).described(
+        "Time law of trajectories before they are shaped: that of their points, or the quickest within the limits: "
+        "jerk_limited along a straight line, time_optimal through all points, which then need no times."
+    ),
     parameter("stream_output", "", read_only=True).described(
         "Topic to which the shaped stream goes, forward_position_controller/commands, say; empty: no streams."
     ),
@@ -56,6 +62,8 @@ PARAMETERS = (
         "Without inputs for so long, velocities are 0, and a stream that stands is no longer published."
     ),
 )
+#: Prefix of the parameters that may change at run time.
+GROUP = "shaper."
 #: Between two looks at whether a motion has ended; measured positions are used while they are not older [s].
 LOOK, FRESH = 0.01, 1.0
 
@@ -79,16 +87,11 @@ class ShaperNode(ArmNode):
     def build(self):
         names = self._names = joint_names(self.parameters["joint_names"])
         self.parameters.resolve({"joints": len(names)})
-        own = Modes(self.parameters.group("shaper."), len(names))
-        none = Modes({**self.parameters.group("shaper."), "type": modes.NONE}, len(names))
-        limits = self.parameters.group("limits.")
-        self._shapers = {
-            False: TrajectoryShaper(own, names, limits),
-            True: TrajectoryShaper(none, names, limits),
-        }
-        self._streams = {False: StreamShaper(own, names), True: StreamShaper(none, names)}
-        self._bypass = self._wanted = False
+        self._bypass = self._wanted = self._changed = False
+        own = self._make_shapers()
         self.core = self._shapers[False]
+        self.parameters.judged_by(self._refuse_unfit)
+        self.parameters.on_change(self._on_change)
         self._measured, self._measured_at = None, -math.inf
         self._state = ShaperState(joint_names=names, shaper=own.kind, stretch=1.0)
         output, given = self.parameters["output"], qos.overridable()
@@ -117,6 +120,27 @@ class ShaperNode(ArmNode):
         self._goals = ShaperGoals(self, output)
         self._build_stream()
         self.make_timer(LOOK, self._look)
+
+    def _make_shapers(self):
+        """Make the shapers of the parameters, with and without bypass; their `Modes`."""
+        names, limits = self._names, self.parameters.group("limits.")
+        own = Modes(self.parameters.group(GROUP), len(names))
+        none = Modes({**self.parameters.group(GROUP), "type": modes.NONE}, len(names))
+        law = self.parameters["time_law"]
+        both = {False: own, True: none}
+        self._shapers = {k: TrajectoryShaper(m, names, limits, law) for k, m in both.items()}
+        self._streams = {k: StreamShaper(m, names) for k, m in both.items()}
+        return own
+
+    def _refuse_unfit(self, values):
+        """Refuse parameters of the shaper that do not fit together, before they are set."""
+        wanted = {k.removeprefix(GROUP): v for k, v in values.items() if k.startswith(GROUP)}
+        Modes(wanted, len(self._names))
+
+    def _on_change(self, names):
+        self._changed = self._changed or any(name.startswith(GROUP) for name in names)
+        if self.active:
+            self._settle(self.now_ns())
 
     def start(self):
         self._publish_state()
@@ -147,7 +171,7 @@ class ShaperNode(ArmNode):
             Where it can't be used; nothing changes then, but the state says it.
         """
         now = self.now_ns()
-        self._settle_bypass(now)
+        self._settle(now)
         if not msg.points:
             stopped = self.stopping("asked for by a trajectory without points")
             return msg if stopped is None else stopped
@@ -156,7 +180,7 @@ class ShaperNode(ArmNode):
                 msg.joint_names,
                 self._names,
                 msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec,
-                rows(msg),
+                self._rows(msg),
             )
             shaped = self.core.offer(data, now, self._measurement())
         except TrajectoryError as error:
@@ -173,6 +197,17 @@ class ShaperNode(ArmNode):
             text = f"slowed down {shaped.stretch:.4g} times to keep its limits"
             self.report(f"trajectory {state.trajectory_id} {text}", info=True)
         return self._message(shaped, data.stamp_ns)
+
+    def _rows(self, msg):
+        """Points of a trajectory; where the node makes the time law, without speeds, and also without times."""
+        given = rows(msg)
+        if self.parameters["time_law"] == trajectory_shaper.GIVEN:
+            return given
+        untimed = not any(row[0] for row in given)
+        return [
+            (i * 1_000_000_000 if untimed else row[0], row[1], [], [], [])
+            for i, row in enumerate(given)
+        ]
 
     def stopping(self, reason):
         """The trajectory that stops the motion under way, None where nothing moves; the state gives the `reason`."""
@@ -228,7 +263,7 @@ class ShaperNode(ArmNode):
 
     def _on_bypass(self, request, response):
         self._wanted = request.data
-        self._settle_bypass(self.now_ns())
+        self._settle(self.now_ns())
         response.success = True
         if self._bypass == self._wanted:
             response.message = "bypassed" if self._bypass else "shaping"
@@ -236,11 +271,16 @@ class ShaperNode(ArmNode):
             response.message = "taken once the motion that is under way has ended"
         return response
 
-    def _settle_bypass(self, now_ns):
-        """Change over where nothing moves: a change in the middle would be a step."""
+    def _settle(self, now_ns):
+        """Take a bypass or new parameters where nothing moves: a change in the middle would be a step."""
         stream = self._streams[self._bypass]
-        if self._bypass == self._wanted or self.core.moving(now_ns) or not stream.settled():
+        if self._bypass == self._wanted and not self._changed:
             return
+        if self.core.moving(now_ns) or not stream.settled():
+            return
+        if self._changed:
+            self._state.shaper = self._make_shapers().kind
+            self._changed = False
         self._bypass = self._state.bypassed = self._wanted
         self.core = self._shapers[self._bypass]
         self.core.forget()
@@ -263,7 +303,7 @@ class ShaperNode(ArmNode):
         if self._state.moving and not self.core.moving(now):
             self._state.moving = False
             self._publish_state()
-        self._settle_bypass(now)
+        self._settle(now)
 
     def _publish_state(self):
         set_stamp(self._state.header.stamp, self.now_ns())

@@ -1,24 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping by strain in the shaper's stream: readings of one gauge in, a correction of one joint's positions out."""
+"""Damping in the shaper's stream: readings of a gauge or an IMU in, a correction of one joint's positions out."""
 
 from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray
 
 from flexarm_dynamics.errors import ParameterError
 from flexarm_dynamics.parameters import parameter
 from flexarm_ros import qos
+from flexarm_ros.messages import stamp_ns
 
 from ..shaping import strain_damping
 
 PARAMETERS = (
     parameter("joint", "", read_only=True).described(
-        "Joint whose streamed positions are corrected to damp a mode that strain shows; empty: no damping."
+        "Joint whose streamed positions are corrected to damp a mode that a sensor shows; empty: no damping."
+    ),
+    parameter("sensor", "strain", choices=("strain", "imu"), read_only=True).described(
+        "What shows the mode: a reading in the topic strain, or an acceleration in the topic imu [m/s^2]."
+    ),
+    parameter("axis", "y", choices=("x", "y", "z"), read_only=True).described(
+        "Of the IMU: the axis along which the mode moves it."
     ),
     parameter("gauge", 0, "-", 0, 1000, read_only=True).described(
         "Which of the readings in strain sees the mode, counted from 0."
     ),
     *strain_damping.PARAMETERS,
 )
+#: Less than this is no full scale of an accelerometer [m/s^2].
+MIN_SCALE = 1.0
 
 
 class StreamDamping:
@@ -54,13 +64,30 @@ class StreamDamping:
         self.law = strain_damping.StrainDamping(settings, period)
         self._node, self._joint = node, names.index(settings["joint"])
         self._gauge, self._reading = settings["gauge"], None
+        self._stamp, self._axis = None, settings["axis"]
+        imu = settings["sensor"] == "imu"
+        if imu and settings["full_scale"] < MIN_SCALE:
+            raise ParameterError(
+                "m/s^2 is less than an accelerometer's",
+                field="damping.full_scale",
+                value=settings["full_scale"],
+                limit=f"at least {MIN_SCALE:g}",
+                hint="give the sensor's; at rest it shows gravity",
+            )
         node.make_subscription(
-            Float64MultiArray,
-            "strain",
-            self._on_strain,
+            Imu if imu else Float64MultiArray,
+            "imu" if imu else "strain",
+            self._on_imu if imu else self._on_strain,
             qos_profile_sensor_data,
             qos_overriding_options=qos.overridable(),
         )
+
+    def _on_imu(self, msg):
+        self._reading = getattr(msg.linear_acceleration, self._axis)
+        # A clock of its own says nothing about now, and 0 is no stamp.
+        stamp = stamp_ns(msg.header.stamp)
+        own = self._node.parameters["synchronised_clocks"] and stamp
+        self._stamp = 1e-9 * stamp if own else None
 
     def _on_strain(self, msg):
         if len(msg.data) <= self._gauge:
@@ -72,5 +99,5 @@ class StreamDamping:
         """Positions (n,) [rad] with the correction of a time `now` [s]; call once in each period."""
         reading, self._reading = self._reading, None
         out = positions.copy()
-        out[self._joint] += self.law.update(now, reading)
+        out[self._joint] += self.law.update(now, reading, self._stamp)
         return out

@@ -2,7 +2,8 @@
 """The quickest time laws within limits: of jerk by Ruckig, of speed and acceleration along a path by TOPP-RA.
 
 Ruckig (Berscheid & Kroeger 2021) joins two states in the shortest time within limits of speed, acceleration and jerk;
-from rest all joints stay on the straight line between. TOPP-RA (Pham & Pham 2018) moves along the cubic spline
+from rest all joints stay on the straight line between, whose progress
+has the limits of the joints. TOPP-RA (Pham & Pham 2018) moves along the cubic spline
 through points, by length, in the shortest time within limits of speed and acceleration.
 
 Both are libraries of their own, imported where they are used: `ruckig` and `toppra` on PyPI.
@@ -43,17 +44,34 @@ def jerk_limited(begin, end, velocity, acceleration, jerk) -> PiecewiseMotion:
     TrajectoryError
         Where there is no such motion.
     """
-    ruckig = _library("ruckig")
+    ruckig = library("ruckig")
     begin, end = np.asarray(begin, float), np.asarray(end, float)
     limits = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
     _refuse_unlimited(limits)
+    limits = {k: np.broadcast_to(v, end.shape).astype(float) for k, v in limits.items()}
+    way = end - begin[0]
+    if begin[1:].any():
+        knots, states = _joined(ruckig, begin, end, limits)
+    else:  # all joints together on the straight line
+        size = np.maximum(np.abs(way), 1e-300)
+        own = {name: np.array([(values / size).min()]) for name, values in limits.items()}
+        one = np.abs(way).max() > SAME
+        knots, states = _joined(ruckig, np.zeros((3, 1)), np.ones(1) * one, own)
+        states = states * way
+        states[:, 0] += begin[0]
+    if knots.size == 1:
+        return PiecewiseMotion.resting(end, 0.0)
+    states[-1] = end, 0.0 * end, 0.0 * end
+    return PiecewiseMotion.through(knots, list(states.transpose(1, 0, 2)))
+
+
+def _joined(ruckig, begin, end, limits):
+    """Knots (k,) [s] and states there (k, 3, n) of Ruckig's motion from a state (3, n) to rest at an end (n,)."""
     asked = ruckig.InputParameter(end.size)
     asked.current_position, asked.current_velocity, asked.current_acceleration = begin.tolist()
     asked.target_position = end.tolist()
     for name, values in limits.items():
-        setattr(asked, f"max_{name}", np.broadcast_to(values, end.shape).tolist())
-    if not begin[1:].any():
-        asked.synchronization = ruckig.Synchronization.Phase
+        setattr(asked, f"max_{name}", values.tolist())
     found = ruckig.Trajectory(end.size)
     try:
         done = ruckig.Ruckig(end.size).calculate(asked, found)
@@ -61,17 +79,13 @@ def jerk_limited(begin, end, velocity, acceleration, jerk) -> PiecewiseMotion:
         raise TrajectoryError(f"has no time law: {error}", field="trajectory") from error
     if done not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise TrajectoryError(f"has no time law: {done}", field="trajectory")
-    if found.duration < MOMENT:
-        return PiecewiseMotion.resting(end, 0.0)
     knots = [0.0, found.duration]
     for profile in found.profiles[0]:
         steps = np.concatenate([profile.brake.t, profile.t])
         knots += np.cumsum(np.maximum(steps, 0.0)).tolist()
     knots = np.unique(np.clip(knots, 0.0, found.duration))
     knots = knots[np.concatenate([[True], np.diff(knots) > MOMENT])]
-    states = np.array([found.at_time(float(t)) for t in knots])
-    states[-1] = end, 0.0 * end, 0.0 * end
-    return PiecewiseMotion.through(knots, list(states.transpose(1, 0, 2)))
+    return knots, np.array([found.at_time(float(t)) for t in knots])
 
 
 def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
@@ -91,7 +105,7 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
     TrajectoryError
         Where there is no such motion.
     """
-    toppra = _library("toppra")
+    toppra = library("toppra")
     points = np.asarray(points, float)
     _refuse_unlimited({"velocity": velocity, "acceleration": acceleration})
     away = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -109,18 +123,15 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
         toppra.constraint.JointAccelerationConstraint(bounds[1]),
     ]
     grid = np.linspace(0.0, length[-1], max(GRID * (len(points) - 1), FEWEST) + 1)
-    problem = toppra.algorithm.TOPPRA(
-        constraints,
-        toppra.SplineInterpolator(length, points, bc_type="natural"),
-        gridpoints=np.union1d(grid, length),
-        parametrizer="ParametrizeConstAccel",
-    )
-    found = problem.compute_trajectory(0.0, 0.0)
-    if found is None:
+    path = toppra.SplineInterpolator(length, points, bc_type="natural")
+    grid = np.union1d(grid, length)
+    problem = toppra.algorithm.TOPPRA(constraints, path, gridpoints=grid)
+    rate = problem.compute_parameterization(0.0, 0.0)[1]
+    if rate is None or not (rate[1:] + rate[:-1] > 0.0).all():
         raise TrajectoryError("has no time law within the limits", field="trajectory")
-    count = len(problem.gridpoints)
-    times = np.linspace(0.0, float(found.duration), 2 * count)
-    states = [np.array(found(times, order)) for order in range(2)]
+    # The acceleration along the path is constant between the points of the grid.
+    times = np.append(0.0, np.cumsum(2.0 * np.diff(grid) / (rate[1:] + rate[:-1])))
+    states = [np.array(path(grid)), np.array(path(grid, 1)) * rate[:, None]]
     states[0][[0, -1]], states[1][[0, -1]] = points[[0, -1]], 0.0
     motion = PiecewiseMotion.through(times, states)
     # Between the points of the grid the limits are exceeded a little.
@@ -140,8 +151,14 @@ def _refuse_unlimited(limits):
             )
 
 
-def _library(name):
-    """Import one of the two libraries."""
+def library(name):
+    """One of the two libraries, `name`.
+
+    Raises
+    ------
+    DesignError
+        Where it is not installed.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -26,23 +26,23 @@ KINDS = (*SHAPERS, ROBUST, RETIMED, NONE)
 ALIKE = 0.02
 
 PARAMETERS = (
-    parameter("type", "zvd", choices=KINDS, read_only=True).described(
+    parameter("type", "zvd", choices=KINDS).described(
         "Shaper: robust is optimal for the spread of all modes in shaper.periods; retimed gives straight motions from "
         "rest to rest a new time law, else it is robust; none passes motions as they are."
     ),
-    parameter("frequencies", [], "Hz", 0.01, 1000.0, kind="float_array", read_only=True).described(
+    parameter("frequencies", [], "Hz", 0.01, 1000.0, kind="float_array").described(
         "Natural frequencies of the modes to shape; with configurations, one row of modes after the other."
     ),
-    parameter("dampings", [0.0], "-", 0.0, 0.99, read_only=True).described(
+    parameter("dampings", [0.0], "-", 0.0, 0.99).described(
         "Damping ratios, as many as frequencies, or one for all."
     ),
-    parameter("configurations", [], "rad", -1e3, 1e3, kind="float_array", read_only=True).described(
+    parameter("configurations", [], "rad", -1e3, 1e3, kind="float_array").described(
         "Joint positions at which the frequencies were measured, one row after the other; empty: everywhere the same."
     ),
-    parameter("spread", 0.15, "-", 0.0, 0.5, read_only=True).described(
+    parameter("spread", 0.15, "-", 0.0, 0.5).described(
         "Of the types robust and retimed: frequencies may be off by this fraction."
     ),
-    parameter("periods", 1.0, "-", 0.25, 3.0, read_only=True).described(
+    parameter("periods", 1.0, "-", 0.25, 3.0).described(
         "Of the types robust and retimed: how much longer a motion gets, in periods of the lowest mode."
     ),
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Damping of a mode by strain, for arms that take positions: a small correction of the position command.
+r"""Damping of a mode by a sensor, for arms that take positions: a small correction of the position command.
 
 With a joint that follows its command q, a strain :math:`\eta` that sees one mode obeys
 
@@ -24,6 +24,9 @@ the method of averaging (Sanders, Verhulst & Murdock 2007, chapter 2). z and b c
 
 It is narrow, so that other modes and the noise hardly pass. Where the loop of this model would be unstable with a
 frequency that is off by `MARGIN`, the constructor refuses it.
+
+An accelerometer is a reading, too, of another phase. That it also moves with the joint is left out: this part is mostly
+in phase with the correction, and changes the frequency a little, not the damping.
 
 The bounds keep the correction a sine: clipped it would come late. A sensor that sticks is taken for bias: the
 correction dies out.

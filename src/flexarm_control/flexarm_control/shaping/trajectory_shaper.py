@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexarm_dynamics.errors import TrajectoryError
+from flexarm_dynamics.errors import ParameterError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
 from ..trajectory.path import Slowing
 from ..trajectory.values import SECOND, SPEED_ROUNDING
-from . import time_law
+from . import limited
+from . import time_law as time_laws
 from .modes import RETIMED, Modes
 from .piecewise import PiecewiseMotion
 from .shaped_motion import ShapedMotion
@@ -31,7 +32,19 @@ PARAMETERS = (
     ).described(
         "Largest accelerations, likewise; 0: not limited. Trajectories must then give velocities."
     ),
+    parameter("jerk", [0.0], "rad/s^3", 0.0, 1e9, length="joints", read_only=True).described(
+        "Largest jerks, of the time law jerk_limited."
+    ),
 )
+#: Time laws of the unshaped motion: that of its points, the quickest of `limited`.
+GIVEN, JERK_LIMITED, TIME_OPTIMAL = TIME_LAWS = "given", "jerk_limited", "time_optimal"
+#: What each needs of the limits, and the library that makes it.
+NEEDS = {
+    JERK_LIMITED: (("velocity", "acceleration", "jerk"), "ruckig"),
+    TIME_OPTIMAL: (("velocity", "acceleration"), "toppra"),
+}
+#: How far a point may be from the straight line of the time law jerk_limited [rad].
+BESIDE = 1e-3
 #: A shaped trajectory of more points is refused.
 MAX_POINTS = 20_000
 #: How far a first point at time 0 may be from where the joints are [rad].
@@ -89,10 +102,22 @@ class TrajectoryShaper:
         n joints.
     limits : mapping
         Checked values of `PARAMETERS`.
+    time_law : str
+        One of `TIME_LAWS`; all but the first need limits.
+
+    Raises
+    ------
+    ParameterError
+        Where the time law needs a limit that is not given.
+    DesignError
+        Where its library is not installed.
     """
 
-    def __init__(self, modes: Modes, joint_names, limits):
+    def __init__(self, modes: Modes, joint_names, limits, time_law=GIVEN):
         self.modes, self.joint_names = modes, tuple(joint_names)
+        self._law, self._limits = time_law, limits
+        if time_law != GIVEN:
+            _refuse_without(time_law, limits)
         self._velocity, self._acceleration = (
             np.where(np.array(limits[name]) > 0.0, limits[name], np.inf)
             for name in ("velocity", "acceleration")
@@ -156,13 +181,15 @@ class TrajectoryShaper:
         fields = [values[keep] for values in trajectory.fields]
         before = self._motion if moving else None
         begin = self._begin(before, start, times, fields, measured)
+        if self._law != GIVEN:
+            times, fields = self._quickest(begin, fields[0])
         quiet = self._replaced(start) if moving else None
         motion, stretch = self._within_limits(before, quiet, begin, start, times, fields)
         now, last = (now_ns - epoch_ns) / SECOND, start + times[-1]
         motion = motion.since(now - self.modes.max_duration - 2.0 * self.modes.delay)
         fresh = before is None
         if fresh and self.modes.kind == RETIMED:
-            quiet = time_law.retimed(motion, self.modes, self._velocity, self._acceleration)
+            quiet = time_laws.retimed(motion, self.modes, self._velocity, self._acceleration)
             motion = motion if quiet is None else quiet
         begin = start if fresh else now
         return self._take(motion, quiet, epoch_ns, begin, last, stretch, fresh)
@@ -171,7 +198,7 @@ class TrajectoryShaper:
         """The motion that leaves no vibration, where another one takes over at `start` [s]; None: there is none."""
         if self._quiet is None or self._quiet is not self._motion:
             return self._quiet
-        return time_law.stopped(self._quiet, self.modes, start)
+        return time_laws.stopped(self._quiet, self.modes, start)
 
     def _begin(self, before, start, times, fields, measured):
         """State (3, n) at which the trajectory begins."""
@@ -205,6 +232,44 @@ class TrajectoryShaper:
             for order, values in enumerate(fields):
                 own[order] = values[0]
         return own
+
+    def _quickest(self, begin, positions):
+        """Times (k,) [s] and fields (k, n) of the quickest motion from a state (3, n) through positions (k, n)."""
+        points = np.vstack([begin[:1], positions])
+        limits = [self._limits[name] for name in NEEDS[self._law][0]]
+        if self._law == JERK_LIMITED:
+            self._refuse_bent(points)
+            motion = limited.jerk_limited(begin, points[-1], *limits)
+        else:
+            self._refuse_moving(begin)
+            motion = limited.time_optimal(points, *limits)
+        return motion.knots, list(motion.states(motion.knots)[: motion.fields])
+
+    def _refuse_bent(self, points):
+        """Refuse points (k, n) that are not on the straight line from the first to the last."""
+        way = points[-1] - points[0]
+        part = np.clip((points - points[0]) @ way / max(way @ way, 1e-300), 0.0, 1.0)
+        away = np.abs(points - points[0] - part[:, None] * way)
+        point, joint = np.unravel_index(int(np.argmax(away)), away.shape)
+        if away[point, joint] > BESIDE:
+            raise TrajectoryError(
+                "rad beside the straight line to the last point",
+                field=f"points[{point - 1}].positions of joint {self.joint_names[joint]}",
+                value=float(away[point, joint]),
+                limit=f"at most {BESIDE:g} with the time law {JERK_LIMITED}",
+                hint=f"send one straight line at a time, or set time_law to {TIME_OPTIMAL}",
+            )
+
+    def _refuse_moving(self, begin):
+        """Refuse a state (3, n) that is not at rest."""
+        joint = int(np.argmax(np.abs(begin[1])))
+        if begin[1, joint]:
+            raise TrajectoryError(
+                f"rad/s at the start: the time law {TIME_OPTIMAL} begins at rest",
+                field=f"velocity of joint {self.joint_names[joint]}",
+                value=float(begin[1, joint]),
+                hint="wait for the end of the motion under way, or stop it",
+            )
 
     def _rest(self, measured):
         """Where the joints stand (n,): where the last motion has ended, unless they were moved since."""
@@ -274,7 +339,7 @@ class TrajectoryShaper:
             return None
         start, motion, quiet = self._seconds(now_ns), self._motion, self._quiet
         if quiet is motion and quiet is not None:
-            quiet = stopped = time_law.stopped(quiet, self.modes, start)
+            quiet = stopped = time_laws.stopped(quiet, self.modes, start)
         elif start >= motion.knots[-1]:  # only the shaper's own delay is left
             stopped = motion
         else:
@@ -320,6 +385,20 @@ class TrajectoryShaper:
         begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
         added = float(shaped.end - last)
         return Shaped(begin_ns, fresh, times_ns, list(states), end_ns, added, stretch)
+
+
+def _refuse_without(time_law, limits):
+    """Refuse a time law whose limits, a mapping, are not all given, or whose library is missing."""
+    names, library = NEEDS[time_law]
+    for name in names:
+        joints = np.flatnonzero(np.asarray(limits[name]) <= 0.0)
+        if joints.size:
+            raise ParameterError(
+                f"of joint {joints[0]} is not given",
+                field=f"limits.{name}",
+                hint=f"time_law {time_law} needs {', '.join('limits.' + n for n in names)}",
+            )
+    limited.library(library)
 
 
 def _along(motion, start, duration):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One link behind a position loop, pushed aside and released: how fast it comes to rest, damped by its strain and not.
+"""One link behind a position loop, pushed aside and released: how fast it comes to rest, damped by a sensor and not.
 
 What the damping knows is measured on the same simulated arm, behind the same drives, with the payload that it has:
 frequency and damping from the ringing after a small motion, the answer to corrections from a burst of the command.
@@ -27,6 +27,8 @@ PAYLOADS = (0.0, 1.0, 2.0, 3.0)
 PUSH, NOISE = 0.01, 1e-6
 #: More noise that is tried [-].
 NOISY = 1e-5
+#: Noise of the accelerometer at the tip, at the rate of the commands, and its full scale [m/s^2].
+IMU_NOISE, IMU_SCALE = 0.05, 40.0
 #: Which way the small motion goes whose ringing is measured [rad].
 WAY = np.array([1.2])
 #: Amplitude of the burst [rad], and periods of ringing recorded with it.
@@ -49,6 +51,8 @@ COLUMNS = (
     "noise 1e-5",
     "largest correction, mrad",
     "after a motion",
+    "IMU: faster",
+    "IMU: after a motion",
 )
 
 
@@ -76,6 +80,10 @@ class Decay:
         Correction [rad].
     motion : float
         Residual swing after the case's first motion, damped over not damped [-].
+    imu : float
+        The time, damped by an accelerometer at the tip in place of strain [s].
+    imu_motion : float
+        The residual swing with that [-].
     """
 
     payload: float
@@ -90,6 +98,8 @@ class Decay:
     noisy: float
     largest: float
     motion: float
+    imu: float
+    imu_motion: float
 
     def row(self):
         """The values of `COLUMNS`."""
@@ -100,23 +110,27 @@ class Decay:
         angles = 100.0 * self.ratio, float(np.degrees(self.phase))
         times = self.without, self.damped
         rest = 1e3 * self.largest, self.motion
-        return (self.payload, self.frequency, *angles, *times, *factors, *rest)
+        imu = self.without / self.imu, self.imu_motion
+        return (self.payload, self.frequency, *angles, *times, *factors, *rest, *imu)
 
 
 class Bench:
-    """An arm, and the first of its gauges.
+    """An arm, and the first of its gauges or an accelerometer at its tip.
 
     Parameters
     ----------
     arm : PositionArm
         With one joint.
+    imu : bool
+        Whether the sensor is the accelerometer, across the link as it is not bent.
     """
 
-    def __init__(self, arm):
-        self._arm = arm
+    def __init__(self, arm, imu=False):
+        self._arm, self._imu = arm, imu
+        self._noise = IMU_NOISE if imu else NOISE
         self._row = gauge_rows(arm.plant.model, arm.plant.model.arm.gauges)[0]
 
-    def drive(self, references, correct, pushed=0.0, noise=NOISE):
+    def drive(self, references, correct, pushed=0.0, noise=None):
         """Command the arm from rest.
 
         Parameters
@@ -128,7 +142,7 @@ class Bench:
         pushed : float
             First modal amplitude at the start [m].
         noise : float
-            Of the strain [-].
+            Of the sensor; not given: the usual one.
 
         Returns
         -------
@@ -138,22 +152,36 @@ class Bench:
             [-], [rad]
         """
         plant, loop = self._arm.plant, self._arm.loop
+        noise = self._noise if noise is None else noise
         added = np.random.default_rng(0).normal(0.0, noise, references.size)
         every = round(DRIVE_RATE / COMMAND_RATE)
         bent = np.array(plant.model.static_deflection(references[:1]), float)
         bent[0] += pushed
         plant.reset(references[:1], bent)
         loop.begin(references[:1])
-        tip, strains, corrections = [], [], []
+        tip, strains, corrections, path = [], [], [], [self._tip()] * 3
         for k, reference in enumerate(references):
             now = k * PERIOD
-            tip.append(np.array(plant.model.tip_position(plant.q, plant.delta)))
-            strains.append(float(self._row @ plant.delta) + added[k])
+            tip.append(path[-1])
+            strains.append(self._reading(path) + added[k])
             corrections.append(correct(now, strains[-1]))
             loop.command(now, [reference + corrections[-1]])
             for i in range(every):
                 loop.drive(plant, now + i / DRIVE_RATE)
+                path = [*path[1:], self._tip()]
         return np.array(tip), np.array(strains), np.array(corrections)
+
+    def _tip(self):
+        plant = self._arm.plant
+        return np.array(plant.model.tip_position(plant.q, plant.delta))
+
+    def _reading(self, path):
+        """Of the sensor, with the last three places of the tip, a sample of the drives apart."""
+        plant = self._arm.plant
+        if not self._imu:
+            return float(self._row @ plant.delta)
+        across = np.array([-np.sin(plant.q[0]), np.cos(plant.q[0]), 0.0])
+        return float(across @ (path[2] - 2.0 * path[1] + path[0])) * DRIVE_RATE**2
 
     def settings(self, found):
         """Settings of the damping: of the mode `found`, and its answer to a burst."""
@@ -164,14 +192,16 @@ class Bench:
         beta, _ = strain_damping.identified(frequency, ratio, PERIOD, sent, strains)
         given = {"frequency": frequency, "damping": ratio}
         answer = {"sensitivity": abs(beta), "phase": float(np.angle(beta))}
+        if self._imu:
+            answer["full_scale"] = IMU_SCALE
         return check_all(strain_damping.PARAMETERS, {**given, **answer})
 
 
-def prepared(payload, seed=0):
+def prepared(payload, seed=0, imu=False):
     """The case of a payload, its bench, and the settings of the damping that are measured on it."""
     case = cases.payload(payload, seed)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
-    bench = Bench(arm)
+    bench = Bench(arm, imu)
     return case, bench, bench.settings(measured(arm, np.zeros(1), WAY, case.period))
 
 
@@ -181,7 +211,7 @@ def decay(payload, seed=0) -> Decay:
     known = settings if payload == 1.0 else prepared(1.0, seed)[2]
     still = np.zeros(int(WATCHED * case.period / PERIOD))
 
-    def pushed(correct, noise=NOISE):
+    def pushed(correct, noise=None, bench=bench):
         tip, _, corrections = bench.drive(still, correct, PUSH, noise)
         return _time(tip), float(np.abs(corrections).max())
 
@@ -189,8 +219,12 @@ def decay(payload, seed=0) -> Decay:
     times, largest = zip(*map(pushed, (_no_correction, *laws)), strict=True)
     noisy, _ = pushed(_law(settings), NOISY)
     swings = [_swing(case, bench, correct) for correct in (_no_correction, _law(settings))]
+    _, other, by_imu = prepared(payload, seed, imu=True)
+    imu, _ = pushed(_law(by_imu), bench=other)
+    swings.append(_swing(case, other, _law(by_imu)))
     mode = settings["frequency"], settings["damping"], settings["phase"]
-    return Decay(payload, *mode, *times, noisy, max(largest[:4]), swings[1] / swings[0])
+    after = swings[1] / swings[0], imu, swings[2] / swings[0]
+    return Decay(payload, *mode, *times, noisy, max(largest[:4]), *after)
 
 
 def _swing(case, bench, correct):
