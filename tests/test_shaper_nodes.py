@@ -373,8 +373,12 @@ def test_a_push_is_damped_by_an_imu_until_it_is_in_doubt(bench, value, late, pro
     [
         ({"damping.sensor": "imu"}, "less than an accelerometer's"),
         ({"damping.joint": "x"}, "no joint of the stream"),
-        ({"stream_output": ""}, "no positions to correct"),
-        ({"stream_kind": "velocities"}, "no positions to correct"),
+        ({"stream_output": ""}, "no stream of positions"),
+        ({"stream_kind": "velocities"}, "no stream of positions"),
+        (
+            {"damping.joint": "", "play_trajectories": True, "stream_output": ""},
+            "no stream of positions",
+        ),
         ({"damping.target": 0.01, "damping.damping": 0.02}, "no more than the mode has"),
     ],
 )
@@ -382,6 +386,41 @@ def test_a_damping_that_can_not_be_is_refused(bench, changes, problem):
     with pytest.raises((ParameterError, DesignError, AssertionError)) as refused:
         Shaper(bench, **{**DAMPING, **changes})
     assert problem in str(refused.value)
+
+
+def test_trajectories_are_played_as_positions_with_the_damping_and_need_joint_states(bench):
+    shaper = Shaper(bench, **{**DAMPING, **PLAYS})
+    node = bench.nodes["shaper"]
+    node.now_ns = lambda: round(1e9 * (100.0 + bench.queue.time))
+    commands = bench.tap(Float64MultiArray, "commands")
+    out, state = shaper.send(THERE)
+    assert not out
+    assert "joint_states: have not come" in state.rejected_reason
+    joints = bench.publisher(JointState, "joint_states")
+    joints.publish(JointState(name=["a", "b"], position=[0.0, 0.0]))
+    out, state = shaper.send(THERE)
+    assert state.moving
+    assert not out  # nothing goes to the controller of trajectories
+    strain, swing, p = (
+        bench.publisher(Float64MultiArray, "strain"),
+        1e-3 + 0j,
+        strain_damping.pole(3.0, 0.005),
+    )
+    corrections, ways = [], []
+    while state.moving or len(ways) < 250:
+        strain.publish(Float64MultiArray(data=[0.0, swing.real]))
+        seen = len(commands.messages)
+        bench.wait_for("a command", lambda seen=seen: len(commands.messages) > seen)
+        played = node.core.state(node.now_ns())[0]
+        ways.append(commands.newest.data[0] - played[0])
+        corrections.append(commands.newest.data[1] - played[1])
+        swing = strain_damping.moved(swing, p, 1j * SENSITIVITY, corrections[-1], 0.008)
+        state = shaper.states.newest
+    assert np.abs(ways).max() < 0.02  # a period's way at most
+    assert list(node.core.state(node.now_ns())[0]) == [0.6, -0.3]
+    assert commands.newest.data[0] == 0.6
+    assert abs(swing) < 0.3e-3
+    assert 1e-3 < np.abs(corrections[-250:]).max() < 0.04
 
 
 class Controller:
@@ -405,31 +444,73 @@ class Controller:
         self._ends[number].set_result(succeeds)
 
 
+class Goals:
+    """A client of the shaper's server."""
+
+    def __init__(self, bench):
+        self._bench = bench
+        self._client = ActionClient(bench.node, Follow, "shaper/follow_trajectory")
+        bench.wait_for("the shaper", self._client.server_is_ready)
+
+    def send(self, msg):
+        """A goal's handle, and its feedback."""
+        feedback, futures, again = [], [], 0.0
+
+        def answered():
+            nonlocal again
+            # A server that has not found the client yet drops its answer.
+            if time.monotonic() > again:
+                again = time.monotonic() + 3.0
+                goal = Follow.Goal(trajectory=msg)
+                futures.append(self._client.send_goal_async(goal, feedback.append))
+            return next((f.result() for f in futures if f.done()), None)
+
+        return self._bench.wait_for("the answer", answered), feedback
+
+    def result(self, handle):
+        """Status and result of a goal."""
+        future = handle.get_result_async()
+        self._bench.wait_for("the result", future.done)
+        return future.result().status, future.result().result
+
+
+PLAYS = {"play_trajectories": True, "stream_output": "commands"}
+
+
+def test_a_goal_that_is_played_succeeds_at_its_end_and_is_cancelled_by_a_smooth_stop(tmp_path):
+    with Bench(tmp_path) as bench:
+        bench.start("shaper", {**SETTINGS, **PLAYS})
+        goals = Goals(bench)
+        states = bench.publisher(JointState, "joint_states")
+        at = JointState(name=["a", "b"], position=[0.0, 0.0])
+
+        def known():
+            states.publish(at)
+            return goals.result(goals.send(message((0.0, 0.0, 0.0), (0.05, 0.0, 0.0)))[0])[0] == (
+                GoalStatus.STATUS_SUCCEEDED
+            )
+
+        bench.wait_for("the joint states", known)
+        commands = bench.tap(Float64MultiArray, "commands")
+        handle, feedback = goals.send(message((0.0, 0.0, 0.0), (0.2, 0.1, -0.1)))
+        status, found = goals.result(handle)
+        assert status == GoalStatus.STATUS_SUCCEEDED
+        assert found.error_code == Follow.Result.SUCCESSFUL
+        bench.wait_for("the end", lambda: list(commands.newest.data) == [0.1, -0.1])
+        assert feedback
+        handle, _ = goals.send(message((20.0, 2.0, 2.0)))
+        handle.cancel_goal_async()
+        status, found = goals.result(handle)
+        assert status == GoalStatus.STATUS_CANCELED
+        assert "stopped" in found.error_string
+        assert commands.newest.data[0] < 1.0
+
+
 def test_goals_are_shaped_and_sent_on_and_results_sent_back(tmp_path):
     with Bench(tmp_path) as bench:
         bench.start("shaper", SETTINGS)
-        client = ActionClient(bench.node, Follow, "shaper/follow_trajectory")
-        bench.wait_for("the shaper", client.server_is_ready)
-
-        def send(msg):
-            """A goal's handle, and its feedback."""
-            feedback, futures, again = [], [], 0.0
-
-            def answered():
-                nonlocal again
-                # A server that has not found the client yet drops its answer.
-                if time.monotonic() > again:
-                    again = time.monotonic() + 3.0
-                    goal = Follow.Goal(trajectory=msg)
-                    futures.append(client.send_goal_async(goal, feedback.append))
-                return next((f.result() for f in futures if f.done()), None)
-
-            return bench.wait_for("the answer", answered), feedback
-
-        def result(handle):
-            future = handle.get_result_async()
-            bench.wait_for("the result", future.done)
-            return future.result().status, future.result().result
+        goals = Goals(bench)
+        send, result = goals.send, goals.result
 
         status, found = result(send(THERE)[0])
         assert status == GoalStatus.STATUS_ABORTED

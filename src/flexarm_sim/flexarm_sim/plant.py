@@ -89,11 +89,15 @@ class Plant:
         if self._drives is None or self._drives[0] is not damping:
             table = self._friction.copy()
             table[:, 0] += damping
-            self._drives = damping, table, self.substeps * self._refined(damping)
+            self._drives = damping, table, self.damped_substeps(damping)
         self._damping.release(fraction * self.period)
         before = self.q.copy()
         self._run(torque, self._drives[1], fraction, self._drives[2])
         return torque - damping * (self.q - before) / (fraction * self.period)
+
+    def damped_substeps(self, damping):
+        """Substeps of a period under a `damping` (n,) of the joints [N m s/rad]: with an explicit method, many."""
+        return self.substeps * self._refined(damping)
 
     def advance_safely(self, fraction=1.0):
         """Advance by one period, or a fraction of it, without drive torque, under each joint's safe action."""

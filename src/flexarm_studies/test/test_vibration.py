@@ -6,8 +6,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from flexarm_dynamics.models import model
+from flexarm_sim.plant import Plant
 from flexarm_studies.vibration import cases, pushes, report, study
-from flexarm_studies.vibration.position_arm import PositionArm
+from flexarm_studies.vibration.position_arm import MAX_SUBSTEPS, PositionArm
 from flexarm_studies.vibration.time_laws import jerk_limited, resampled, trapezoid
 
 
@@ -38,6 +39,20 @@ def test_a_shaped_motion_leaves_a_tenth_of_the_swing_with_what_ringing_shows():
     off = arm.follow(study.shaped(motion, "robust", found, 0.85), window).residual(window)
     assert left < 0.1 * unshaped
     assert off < 0.2 * unshaped
+
+
+def test_a_stiff_arm_is_integrated_implicitly_and_moves_alike():
+    case = cases.random_arm(
+        14
+    )  # the drive of its last joint, which is light, needs 3510 explicit steps per ms
+    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
+    start, way = case.motions[0].start, case.motions[0].angle
+    motion = trapezoid(start, start + 0.02 * way, 0.05)
+    implicit = arm.follow(motion, 0.0)
+    assert arm.plant.damped_substeps(arm.loop.kd) == arm.plant.substeps
+    arm.plant = Plant(arm.plant.model, arm.plant.period)
+    assert arm.plant.damped_substeps(arm.loop.kd) > MAX_SUBSTEPS
+    assert_allclose(implicit.tip, arm.follow(motion, 0.0).tip, atol=5e-6)
 
 
 def test_modes_of_both_ends_are_given_once():

@@ -52,6 +52,10 @@ PARAMETERS = (
     parameter("stream_output", "", read_only=True).described(
         "Topic to which the shaped stream goes, forward_position_controller/commands, say; empty: no streams."
     ),
+    parameter("play_trajectories", False, read_only=True).described(
+        "Send shaped trajectories as positions to stream_output, with the damping's correction, in place of to output; "
+        "the topic stream is then not taken."
+    ),
     parameter("stream_kind", POSITIONS, choices=(POSITIONS, VELOCITIES), read_only=True).described(
         "What the stream has: positions [rad] or velocities [rad/s] of all joints."
     ),
@@ -158,9 +162,16 @@ class ShaperNode(ArmNode):
         if not self.active:
             return
         try:
-            self._trajectories.publish(self.shape(msg))
+            self._send(self.shape(msg))
         except TrajectoryError as error:
             self.get_logger().warning(f"trajectory refused: {error}")
+            return
+        self._goals.replaced()
+
+    def _send(self, message):
+        """Pass a shaped trajectory on, unless it is played."""
+        if not self.plays:
+            self._trajectories.publish(message)
 
     def shape(self, msg):
         """The shaped trajectory that takes the place of one; without points: a stop, as the controller has it.
@@ -182,7 +193,7 @@ class ShaperNode(ArmNode):
                 msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec,
                 self._rows(msg),
             )
-            shaped = self.core.offer(data, now, self._measurement())
+            shaped = self.core.offer(data, now, self._where())
         except TrajectoryError as error:
             self._state.rejected_reason = str(error)
             self._publish_state()
@@ -253,6 +264,24 @@ class ShaperNode(ArmNode):
             return
         self._measured, self._measured_at = found, self._steady_s()
 
+    def _where(self):
+        """Where the joints are (n,), None where that is unknown; what is played must not step.
+
+        Raises
+        ------
+        TrajectoryError
+        """
+        found = self._measurement()
+        if not self.plays or found is not None:
+            return found
+        if self._played is None:
+            raise TrajectoryError(
+                "have not come: where the joints are is unknown",
+                field="joint_states",
+                hint="publish them, so that the first position played is no step",
+            )
+        return self._played
+
     def _measurement(self):
         return self._measured if self._steady_s() - self._measured_at < FRESH else None
 
@@ -293,7 +322,7 @@ class ShaperNode(ArmNode):
         response.success = True
         response.message = "nothing moves" if message is None else "stops"
         if message is not None and not self._goals.replace(message):
-            self._trajectories.publish(message)
+            self._send(message)
         return response
 
     def _look(self):
@@ -303,6 +332,7 @@ class ShaperNode(ArmNode):
         if self._state.moving and not self.core.moving(now):
             self._state.moving = False
             self._publish_state()
+            self._goals.ended()
         self._settle(now)
 
     def _publish_state(self):
@@ -314,22 +344,43 @@ class ShaperNode(ArmNode):
     def _build_stream(self):
         topic, rate = self.parameters["stream_output"], self.parameters["stream_rate"]
         self._wish, self._wished_at, self._step = None, -math.inf, 1.0 / rate
-        self._damping = None
+        self._damping = self._played = None
+        self.plays = self.parameters["play_trajectories"]
         damping = self.parameters.group("damping.")
         if damping["joint"]:
-            self._refuse_damping_without_positions(topic)
+            self._refuse_without_positions(topic, "damping.joint")
             self._damping = StreamDamping(self, self._names, damping, self._step)
+        if self.plays:
+            self._refuse_without_positions(topic, "play_trajectories")
         if not topic:
             return
         self._commands = self.make_publisher(Float64MultiArray, topic)
+        if self.plays:
+            self.make_timer(self._step, self._on_play)
+            return
         self.make_subscription(Float64MultiArray, "stream", self._on_stream)
         self.make_timer(self._step, self._on_tick)
 
-    def _refuse_damping_without_positions(self, topic):
-        """Refuse a damping that has no stream of positions to correct; `topic` of the stream."""
+    def _refuse_without_positions(self, topic, field):
+        """Refuse what needs a stream of positions where there is none; `topic` of the stream, `field` that needs it."""
         if not topic or self.parameters["stream_kind"] != POSITIONS:
             hint = f"give stream_output, with stream_kind {POSITIONS}"
-            raise ParameterError("has no positions to correct", field="damping.joint", hint=hint)
+            raise ParameterError("has no stream of positions", field=field, hint=hint)
+
+    def _on_play(self):
+        """Send the position of the shaped motion now, from the first trajectory on."""
+        now = self.now_ns()
+        state = self.core.state(now) if self.active else None
+        if state is not None:
+            self._played = state[0]
+            if self.core.moving(now):
+                self._goals.tell(state, self._measurement())
+        if not self.active or self._played is None:
+            return
+        value = self._played
+        if self._damping is not None:
+            value = self._damping.corrected(value, 1e-9 * now)
+        self._commands.publish(Float64MultiArray(data=value.tolist()))
 
     def _on_stream(self, msg):
         if not self.active:
@@ -396,6 +447,8 @@ class ShaperNode(ArmNode):
             values["damping"] = f"{law.state}: {law.reason}" if law.reason else law.state
             if law.reason:
                 return WARN, f"no damping: {law.reason}", values
+        if self.plays:
+            return OK, "bypassed" if state.bypassed else "", values
         if not self._trajectories.get_subscription_count() and not self._goals.served():
             topic = self._trajectories.topic_name
             return WARN, f"nothing listens on {topic}: is parameter output right?", values

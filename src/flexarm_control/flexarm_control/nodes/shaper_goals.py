@@ -2,13 +2,15 @@
 """Action servers of the shaper: goals are shaped and sent on to the controller's own server, results sent back.
 
 A goal that is cancelled ends in a stop that is shaped: the stop goes to the controller as a goal that replaces the one
-that it follows, and the result is sent once that is done.
+that it follows, and the result is sent once that is done. Where the node plays trajectories itself, there is no
+controller to ask: a goal has succeeded once its motion has ended.
 """
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient, CancelResponse, GoalResponse
 
 from flexarm_dynamics.errors import TrajectoryError
+from flexarm_ros.messages import set_stamp
 
 from ..trajectory.goal import Code
 from .goals import Server, kinds
@@ -67,7 +69,7 @@ class ShaperGoals:
         """Shape an accepted goal, and send it on."""
         kind, request = server.action_type, handle.request
         goal = Goal(server, handle, self._clients[kind])
-        if not goal.client.server_is_ready():
+        if not self._node.plays and not goal.client.server_is_ready():
             text = f"no action server {goal.client._action_name}: is parameter output right?"
             self._end(goal, Code.INVALID_GOAL, text)
             return
@@ -81,7 +83,8 @@ class ShaperGoals:
         if before is not None:
             self._end(before, Code.INVALID_GOAL, "replaced by a newer goal")
         request.trajectory = shaped
-        self._send(goal, request)
+        if not self._node.plays:
+            self._send(goal, request)
 
     def may_cancel(self, handle):
         """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
@@ -98,9 +101,41 @@ class ShaperGoals:
         """Send a trajectory in place of that of the goal under way; whether there is one."""
         if self._current is None:
             return False
+        if self._node.plays:
+            self._current.reason = self._current.reason or "stopped"
+            return True
         request = self._current.server.action_type.Goal(trajectory=message)
         self._send(self._current, request)
         return True
+
+    def replaced(self):
+        """A trajectory has taken over from a goal that was played."""
+        if self._node.plays and self._current is not None:
+            self._end(self._current, Code.INVALID_GOAL, "replaced by a trajectory")
+
+    def ended(self):
+        """The motion has ended: so has a goal that was played; one that was stopped without being cancelled fails."""
+        goal = self._current
+        if not self._node.plays or goal is None:
+            return
+        if goal.reason and not goal.handle.is_cancel_requested:
+            self._end(goal, Code.PATH_TOLERANCE_VIOLATED, goal.reason)
+            return
+        result = goal.server.action_type.Result(error_string=goal.reason)
+        self._finish(goal, GoalStatus.STATUS_SUCCEEDED, result)
+
+    def tell(self, state, measured):
+        """Feedback of a goal that is played: its state (3, n) in SI units, and the joints as measured (n,) [rad]."""
+        if self._current is None:
+            return
+        feedback = self._current.server.action_type.Feedback(joint_names=self._node._names)
+        set_stamp(feedback.header.stamp, self._node.now_ns())
+        point = feedback.desired
+        point.positions, point.velocities, point.accelerations = state.tolist()
+        if measured is not None:
+            feedback.actual.positions = measured.tolist()
+            feedback.error.positions = (state[0] - measured).tolist()
+        self._current.handle.publish_feedback(feedback)
 
     def _send(self, goal, request):
         goal.sent += 1

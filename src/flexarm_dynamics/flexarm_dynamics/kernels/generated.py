@@ -38,7 +38,7 @@ def low_storage(
 #: state, whose coefficients are in a vector; from `chain.sums_at_nodes`, at every evaluation.
 NONE, POLYNOMIALS, AT_NODES = "none", "polynomials", "at nodes"
 #: Longer code takes too long to compile; arms for which there is none use the recursion in loops.
-MAX_OPERATIONS = 6000
+MAX_OPERATIONS = {NONE: 6000, POLYNOMIALS: 4000, AT_NODES: 6000}
 #: What generated code is then given in the place of its constants alone.
 UNPACK = {NONE: (), POLYNOMIALS: ("c, m = c",), AT_NODES: ("c, data, scratch, m = c",)}
 

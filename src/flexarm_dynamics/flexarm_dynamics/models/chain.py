@@ -610,7 +610,7 @@ class Chain(ArmModel):
             sources, constants, operations = generated.right_hand_side(
                 self.data, work_space(self.data, object), way
             )
-            if operations <= generated.MAX_OPERATIONS:
+            if operations <= generated.MAX_OPERATIONS[way]:
                 given = self.kernel if way == generated.AT_NODES else None
                 return load.joined("generated", sources, inline=INLINE, given=given), constants, way
         return None

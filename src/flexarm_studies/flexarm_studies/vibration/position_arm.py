@@ -16,6 +16,9 @@ DRIVE_RATE, COMMAND_RATE, DELAY = 1000.0, 125.0, 0.008
 TIMES, BANDWIDTH = 4.0, (20.0, 125.0)
 #: A loop that is unstable gets so much slower, at most so often.
 SLOWER, ATTEMPTS = 0.7, 20
+#: A plant whose drives make it stiffer than this for an explicit method, in substeps per sample of the drives, is
+#: integrated implicitly: a light joint behind a flexible link takes thousands.
+MAX_SUBSTEPS = 1000
 #: The tip is looked at in every second sample.
 TIP_EVERY = 2
 
@@ -86,6 +89,8 @@ class PositionArm:
         else:
             raise DesignError("no stable position loop", field=plant.arm.name)
         self.bandwidth = bandwidth
+        if self.plant.damped_substeps(self.loop.kd) > MAX_SUBSTEPS:
+            self.plant = Plant(plant, 1.0 / DRIVE_RATE, "implicit")
 
     def follow(self, motion, after) -> Swing:
         """Follow a motion from rest, and hold.
