@@ -28,7 +28,7 @@ from flexarm_dynamics.arm.description import (
     Piece,
 )
 from flexarm_dynamics.errors import ModelError, ShapeError
-from flexarm_dynamics.kernels import generated
+from flexarm_dynamics.kernels import generated, native
 from flexarm_dynamics.models.chain import Chain, work_space
 from flexarm_dynamics.models.fixed_step import METHODS
 from flexarm_dynamics.models.model import Tableau, rotation
@@ -921,13 +921,12 @@ def test_straight_line_code_of_any_structure(seed, layout, plain, level):
     chain = Chain(arm)
     way = generated.ways(chain.data)[0]
     room = work_space(chain.data, object)
-    sources, constants, _ = generated.right_hand_side(chain.data, room, way)
-    names = {}
-    exec(sources[0], names)
+    program, constants, _ = generated.right_hand_side(chain.data, room, way)
     state = np.concatenate(random_state(seed, arm))
     torque = np.random.default_rng(seed).standard_normal(chain.n_joints)
-    out, expected = np.zeros(state.size), chain.derivative(state, torque)
-    names["derivative"](state, torque, constants, out)
+    expected = chain.derivative(state, torque)
+    c, m = (constants, ()) if way == generated.NONE else constants
+    out = np.array(native.run(program, x=state, u=torque, c=c, m=m))
     # A joint about a light link's own axis makes the equations ill-conditioned.
     M = chain.mass_matrix(*np.split(state, [chain.n_joints, state.size // 2])[:2])
     scale = np.sqrt(np.diag(M))

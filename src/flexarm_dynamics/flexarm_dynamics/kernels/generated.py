@@ -9,25 +9,34 @@ DERIVATIVE = '''"""Equations of motion of one structure of arm, written by flexa
 
 import numpy as np
 
+from flexarm_dynamics.kernels import native
+
+PROGRAM = """\\
+{program}
+"""
+into_array, as_tuple = native.into_array(PROGRAM), native.as_tuple(PROGRAM, {size})
+
 
 def derivative(x, u, c, out):
-{begin}{body}
+    {unpack}
+{sums}    into_array(x, u, c, m, out)
 '''
 
-#: `integrators.low_storage` with the state in local variables and the right-hand side written out in its loop.
+#: `integrators.low_storage` with the state in local variables.
 LOW_STORAGE = """
 def low_storage(
     state, torque, change, step, substeps, below, weights, nodes, work, net, friction, c
 ):
-    p, share = weights.size, 1.0 / substeps
-{begin_all}{read}
+    p, share, point = weights.size, 1.0 / substeps, work[0]
+    {unpack}
+{read}
     for k in range(substeps):
 {begin}
         for i in range(p):
             now, gain = (k + nodes[i]) * share, step * weights[i]
             ahead = step * below[i + 1] if i + 1 < p else 0.0
 {torque}
-{sums}{body}
+{sums}            rate = as_tuple(({state},), ({net},), c, m)
 {move}
 {end}
 {write}
@@ -38,9 +47,9 @@ def low_storage(
 #: state, whose coefficients are in a vector; from `chain.sums_at_nodes`, at every evaluation.
 NONE, POLYNOMIALS, AT_NODES = "none", "polynomials", "at nodes"
 #: Longer code takes too long to compile; arms for which there is none use the recursion in loops.
-MAX_OPERATIONS = {NONE: 6000, POLYNOMIALS: 4000, AT_NODES: 6000}
+MAX_OPERATIONS = 6000
 #: What generated code is then given in the place of its constants alone.
-UNPACK = {NONE: (), POLYNOMIALS: ("c, m = c",), AT_NODES: ("c, data, scratch, m = c",)}
+UNPACK = {NONE: "m = c", POLYNOMIALS: "c, m = c", AT_NODES: "c, data, scratch, m = c"}
 
 
 def ways(data):
@@ -51,7 +60,7 @@ def ways(data):
 
 
 def right_hand_side(data, work, way):
-    """Sources of ``derivative(state, net torque, constants, out)`` and its integrators for arms of this structure.
+    """The right-hand side (state, net torque) of arms of this structure, as a program of `native`.
 
     Parameters
     ----------
@@ -63,15 +72,14 @@ def right_hand_side(data, work, way):
 
     Returns
     -------
-    sources : tuple of str
-        What `load.joined` makes a module of, with `chain.sums_at_nodes` where sums come from there. They depend on
-        which constants are zero, one, negative, or equal to one another, not on their values.
+    program : str
+        It depends on which constants are zero, one, negative, or equal to one another, not on their values.
     constants : ndarray, or tuple of two
         With the coefficients of polynomials.
     operations : int
     """
     n, K = data.links, data.s.shape[1]
-    m = int(data.count.sum()) + int((data.spring >= 0).sum())
+    m = modes(data)
     graph = symbols.Graph()
     state, torque = graph.inputs("x", 2 * (n + m)), graph.inputs("u", n)
     out = np.zeros(2 * (n + m), dtype=object)
@@ -93,15 +101,29 @@ def right_hand_side(data, work, way):
         given_sums(data, work, graph)
     packed = ((exact,), (work,), none, zeros, np.zeros(n, int), np.zeros(m, dtype=object))
     chain.derivative(state, torque, packed, out)
-    lines, words, constants, operations = symbols.emit(graph, out)
-    lines += [f"out[{i}] = {word}" for i, word in enumerate(words)]
-    begin = [*UNPACK[way]] + ["sums_at_nodes(data, scratch, x, m)"] * (way == AT_NODES)
-    source = DERIVATIVE.format(begin=_block(begin, 1), body=_indented(lines, 1))
-    parts = (source, load.source(integrators), _low_storage(graph, out, n, n + m, way))
+    program, constants, operations = symbols.program(graph, out)
     constants = np.array(constants or [0.0])
     if way == POLYNOMIALS:
         constants = constants, np.array(coefficients or [0.0])
-    return parts, constants, operations
+    return program, constants, operations
+
+
+def modes(data):
+    """Number of an arm's modes, deflections of transmissions included."""
+    return int(data.count.sum()) + int((data.spring >= 0).sum())
+
+
+def sources(program, data, way):
+    """What `load.joined` makes ``derivative(state, net torque, constants, out)`` and its integrators of.
+
+    With `chain.sums_at_nodes` where sums come from there. `data` and `way` as for `right_hand_side`, with its `program`.
+    """
+    n = data.links
+    half = n + modes(data)
+    begin = ["sums_at_nodes(data, scratch, x, m)"] * (way == AT_NODES)
+    given = {"unpack": UNPACK[way], "sums": _block(begin, 1)}
+    source = DERIVATIVE.format(program=program, size=2 * half, **given)
+    return source, load.source(integrators), _low_storage(n, half, way)
 
 
 class Polynomials:
@@ -287,11 +309,10 @@ def room_for_sums(data):
     return links + sum(2 + k for k in hosts if k)
 
 
-def _low_storage(graph, out, n, half, way):
-    lines, words, _, _ = symbols.emit(graph, out, scalars=True)
+def _low_storage(n, half, way):
     # Of each pair of states (z, rate): rate is the derivative of z, and a that of the rate.
     pairs = [(i, half + i) for i in range(half)]
-    move = [f"a{i} = {words[r]}" for i, r in pairs]
+    move = [f"a{i} = rate[{r}]" for i, r in pairs]
     move += [f"w{i} += gain * x{r}" for i, r in pairs] + [f"w{r} += gain * a{i}" for i, r in pairs]
     move += [f"x{i} = s{i} + ahead * x{r}" for i, r in pairs]
     move += [f"x{r} = s{r} + ahead * a{i}" for i, r in pairs]
@@ -303,18 +324,18 @@ def _low_storage(graph, out, n, half, way):
             f"    u{j} -= friction[{j}, 1] * np.tanh(x{half + j} / friction[{j}, 2])",
         ]
     every = range(2 * half)
-    scratch = [f"point[{i}] = x{i}" for i in (*range(n, half), *range(half + n, 2 * half))]
-    sums, begin = [], [*UNPACK[way]]
+    sums = []
     if way == AT_NODES:
-        sums = [*scratch, "sums_at_nodes(data, scratch, point, m)"]
-        begin.append("point = work[0]")
+        sums = [f"point[{i}] = x{i}" for i in (*range(n, half), *range(half + n, 2 * half))]
+        sums.append("sums_at_nodes(data, scratch, point, m)")
     return LOW_STORAGE.format(
-        begin_all=_block(begin, 1),
+        unpack=UNPACK[way],
         sums=_block(sums, 3),
         read=_indented([f"s{i} = state[{i}]" for i in every], 1),
         begin=_indented([f"x{i} = w{i} = s{i}" for i in every], 2),
         torque=_indented(torque, 3),
-        body=_indented(lines, 3),
+        state=", ".join(f"x{i}" for i in every),
+        net=", ".join(f"u{j}" for j in range(n)),
         move=_indented(move, 3),
         end=_indented([f"s{i} = w{i}" for i in every], 2),
         write=_indented([f"state[{i}] = s{i}" for i in every], 1),

@@ -9,8 +9,6 @@ import numpy as np
 
 #: Floats that are written into the code; all others go to a table, so that arms of one structure share code.
 LITERALS = (1.0, 2.0, 0.5)
-#: Nested expressions longer than this are split.
-MAX_LENGTH = 24
 
 
 class Graph:
@@ -193,69 +191,48 @@ class Symbol:
         return self.graph.symbol("np.sqrt", self)
 
 
-def emit(graph, outputs, scalars=False):
-    """Python statements that compute `outputs`.
+def program(graph, outputs):
+    """What computes `outputs`, as text for `native`: a line for each operation, in order.
+
+    A line has the operation's name and its operands: the number of an earlier line, ``c3`` for a constant, a float of
+    `LITERALS`; an input is ``x 3``. The last line, ``out``, has the outputs.
 
     Parameters
     ----------
     graph : Graph
     outputs : sequence of Symbol or float
-    scalars : bool
-        Inputs are ``x0`` instead of ``x[0]``, except those called m.
 
     Returns
     -------
-    lines : list of str
-        Assignments of temporaries.
-    words : list of str
-        What each output is then.
+    text : str
     constants : list of float
-        What ``c[0]``, ``c[1]`` ... stand for in them.
+        What c0, c1 ... stand for.
     operations : int
-        Nodes that are evaluated.
+        Lines without the last.
     """
-    uses = {}
-    stack = [o for o in outputs if isinstance(o, Symbol)]
-    for o in stack:
-        uses[o.index] = uses.get(o.index, 0) + 2  # a name of its own, so that it can be read twice
-    seen = set()
+    stack, seen = [o for o in outputs if isinstance(o, Symbol)], set()
     while stack:
         index = stack.pop().index
-        if index in seen:
-            continue
-        seen.add(index)
-        for o in graph.nodes[index][1]:
-            if isinstance(o, Symbol):
-                uses[o.index] = uses.get(o.index, 0) + 1
-                stack.append(o)
-    constants, places, text, size, lines = [], {}, {}, {}, []
+        if index not in seen:
+            seen.add(index)
+            stack += [o for o in graph.nodes[index][1] if isinstance(o, Symbol)]
+    number = {index: k for k, index in enumerate(sorted(seen))}
+    constants, places = [], {}
 
-    def word(o):
-        if isinstance(o, Symbol):
-            return text[o.index]
-        value = float(o)
+    def word(operand):
+        if isinstance(operand, Symbol):
+            return str(number[operand.index])
+        value = float(operand)
         if value in LITERALS:
             return repr(value)
         if value not in places:
             places[value] = len(constants)
             constants.append(value)
-        return f"c[{places[value]}]"
+        return f"c{places[value]}"
 
-    for index in sorted(seen):
-        op, operands = graph.nodes[index]
-        words = [word(o) for o in operands]
-        length = 1 + sum(size[o.index] for o in operands if isinstance(o, Symbol))
-        if not operands:
-            written_out = scalars and not op.startswith("m[")
-            expression = op.replace("[", "").replace("]", "") if written_out else op
-        elif op == "neg":
-            expression = f"(-{words[0]})"
-        elif len(op) == 1:
-            expression = f"({words[0]} {op} {words[1]})"
-        else:
-            expression = f"{op}({words[0]})"
-        if uses[index] > 1 or length > MAX_LENGTH:
-            lines.append(f"t{index} = {expression}")
-            expression, length = f"t{index}", 1
-        text[index], size[index] = expression, length
-    return lines, [word(o) for o in outputs], constants, len(seen)
+    lines = []
+    for index in number:
+        name, operands = graph.nodes[index]
+        lines.append(" ".join([name.replace("[", " ").replace("]", ""), *map(word, operands)]))
+    lines.append(" ".join(["out", *map(word, outputs)]))
+    return "\n".join(lines), constants, len(number)

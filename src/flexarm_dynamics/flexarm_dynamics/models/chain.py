@@ -607,10 +607,10 @@ class Chain(ArmModel):
         if not self._compiled:
             return None
         for way in generated.ways(self.data):
-            sources, constants, operations = generated.right_hand_side(
-                self.data, work_space(self.data, object), way
-            )
-            if operations <= generated.MAX_OPERATIONS[way]:
+            room = work_space(self.data, object)
+            program, constants, operations = generated.right_hand_side(self.data, room, way)
+            if operations <= generated.MAX_OPERATIONS:
+                sources = generated.sources(program, self.data, way)
                 given = self.kernel if way == generated.AT_NODES else None
                 return load.joined("generated", sources, inline=INLINE, given=given), constants, way
         return None
