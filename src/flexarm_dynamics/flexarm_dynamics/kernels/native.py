@@ -51,15 +51,14 @@ def values(program, known, literal, compute):
             return found[int(word)]
         return known("c", int(word[1:])) if word.startswith("c") else literal(float(word))
 
-    for line in program.split("\n"):
+    *lines, last = program.strip().split("\n")
+    for line in lines:
         name, *words = line.split()
-        if name == "out":
-            return [operand(word) for word in words]
         if name in ("x", "u", "m"):
             found.append(known(name, int(words[0])))
         else:
             found.append(compute(name, [operand(word) for word in words]))
-    raise ValueError("the program has no outputs")
+    return [operand(word) for word in last.split()[1:]]
 
 
 def run(program, **arrays):
