@@ -110,12 +110,12 @@ def test_the_table_counts_what_is_within_what_is_wanted():
     rows = [
         {**common, "motion": m, "method": method, "residual": r}
         for m, found in enumerate([(1.0, 0.05), (1.0, 0.3)])
-        for method, r in zip(("trapezoid", "robust"), found, strict=True)
+        for method, r in zip(("trapezoid", "retimed"), found, strict=True)
     ]
     (line,) = report.summary(rows)
-    assert line[0] == "robust"
+    assert line[0] == "retimed"
     assert line[3:7] == (pytest.approx(0.3), 0.1, "1 of 2", "0 of 2")
-    assert report.missed(rows) == ["- robust: 0.30 of unshaped; x, motion 1; measured 2.00 Hz"]
+    assert report.missed(rows) == ["- retimed: 0.30 of unshaped; x, motion 1; measured 2.00 Hz"]
 
 
 def test_a_push_decays_five_times_faster_with_damping_by_strain():

@@ -10,6 +10,7 @@ Both are libraries of their own, imported where they are used: `ruckig` and `top
 """
 
 import importlib
+import logging
 
 import numpy as np
 
@@ -113,7 +114,7 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
     if len(points) < 2:
         return PiecewiseMotion.resting(points[0], 0.0)
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-    toppra.setup_logging("ERROR")
+    logging.getLogger("toppra").setLevel(logging.ERROR)
     bounds = [
         np.broadcast_to(values, points[0].shape)[:, None] * np.array([-1.0, 1.0])
         for values in (velocity, acceleration)

@@ -21,6 +21,8 @@ WANTED = {
     "retimed +15 %": 0.2,
 }
 UNSHAPED = METHODS[0]
+#: Methods of which each motion that is not within what is wanted is listed; of the others it is counted.
+LISTED = ("retimed", "retimed -15 %", "retimed +15 %")
 COLUMNS = (
     "method",
     "median",
@@ -72,14 +74,14 @@ def groups(rows):
 
 
 def missed(rows):
-    """Lines about each motion that is not within what is wanted."""
-    lines = []
-    for method, pairs in ratios(rows).items():
-        for row, ratio in pairs:
-            if method in WANTED and ratio > WANTED[method]:
-                found = ", ".join(f"{f:.2f}" for f in row["frequencies"])
+    """Lines about each motion that is not within what is wanted, of the methods `LISTED`."""
+    lines, found = [], ratios(rows)
+    for method in LISTED:
+        for row, ratio in found[method]:
+            if ratio > WANTED[method]:
+                modes = ", ".join(f"{f:.2f}" for f in row["frequencies"])
                 where = f"{row['arm']}, motion {row['motion']}"
-                lines.append(f"- {method}: {ratio:.2f} of unshaped; {where}; measured {found} Hz")
+                lines.append(f"- {method}: {ratio:.2f} of unshaped; {where}; measured {modes} Hz")
     return lines
 
 
@@ -93,7 +95,7 @@ def text(rows):
         lines += [*table(COLUMNS, summary(found)), ""]
         if silent:
             lines += [f"No mode was found in the ringing of {len(silent)} motions.", ""]
-    lines += ["Not within what is wanted:", "", *(missed(rows) or ["- none"])]
+    lines += ["Not within what is wanted, of retimed:", "", *(missed(rows) or ["- none"])]
     return "\n".join(lines)
 
 
