@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from flexarm_control.motions import robust_shapers, shapers
+from flexarm_control.shaping import limited, time_law, trajectory_shaper
 from flexarm_control.shaping import modes as modes_module
-from flexarm_control.shaping import time_law, trajectory_shaper
 from flexarm_control.shaping.modes import Modes
 from flexarm_control.shaping.piecewise import PiecewiseMotion
 from flexarm_control.shaping.shaped_motion import ShapedMotion
@@ -491,6 +491,20 @@ def test_a_time_optimal_motion_passes_all_points_and_a_jerk_limited_one_refuses_
         TrajectoryError, match=r"points\[0\].positions of joint .* beside the straight line"
     ):
         shaper(LIMITS, "jerk_limited", type="none").offer(corner, NOW, np.zeros(2))
+
+
+def test_a_curved_path_of_many_points_takes_one_time_and_the_motion_does_not_grow_with_them():
+    v, a = np.array([1.0, 0.8]), np.array([4.0, 3.0])
+    made = []
+    for count in (20, 600):
+        x = np.linspace(0.0, 1.0, count)
+        made.append(limited.time_optimal(np.column_stack([np.sin(2.0 * x), x**2]), v, a))
+        t = np.linspace(0.0, made[-1].duration, 4001)
+        tops = [np.abs(made[-1].derivative(k, t)).max(axis=0) / m for k, m in ((1, v), (2, a))]
+        assert max(top.max() for top in tops) <= 1.0 + 1e-6
+        assert (tops[0] > 0.99).all()
+        assert made[-1].knots.size < 1500
+    assert made[0].duration == pytest.approx(made[1].duration, rel=1e-3)
 
 
 def test_a_jerk_limited_motion_is_replaced_on_the_way_and_a_time_optimal_one_is_not():

@@ -18,8 +18,9 @@ from flexarm_dynamics.errors import DesignError, TrajectoryError
 
 from .piecewise import PiecewiseMotion
 
-#: Points of the spline at which TOPP-RA keeps the limits, for each piece between two points; at least in all.
-GRID, FEWEST = 50, 100
+#: Points of the spline at which TOPP-RA keeps the limits, for each piece between two points; at least, and at most, in
+#: all beside the points themselves: each is a point of the motion, and a shaper multiplies them.
+GRID, FEWEST, MOST = 50, 100, 800
 #: Points closer to each other than this are one [rad].
 SAME = 1e-9
 #: Knots closer than this are one [s].
@@ -123,7 +124,8 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
         toppra.constraint.JointVelocityConstraint(bounds[0]),
         toppra.constraint.JointAccelerationConstraint(bounds[1]),
     ]
-    grid = np.linspace(0.0, length[-1], max(GRID * (len(points) - 1), FEWEST) + 1)
+    count = int(np.clip(GRID * (len(points) - 1), FEWEST, MOST))
+    grid = np.linspace(0.0, length[-1], count + 1)
     path = toppra.SplineInterpolator(length, points, bc_type="natural")
     grid = np.union1d(grid, length)
     problem = toppra.algorithm.TOPPRA(constraints, path, gridpoints=grid)
