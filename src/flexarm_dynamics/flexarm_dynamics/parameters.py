@@ -18,6 +18,8 @@ from .shown import show
 
 _KIND_OF = {float: "float", int: "int", bool: "bool", str: "string"}
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
+#: At the end of a length's name: any number of sets of that length.
+SETS = "*"
 #: A number that YAML reads as a string.
 POWER_OF_TEN = re.compile(r"[+-]?\d+(\.\d*)?[eE][+-]?\d+")
 
@@ -44,7 +46,8 @@ class Parameter:
         The values that a string may take.
     length : str or int, optional
         Length of an array: a number, or a name looked up in the sizes given to `check`
-        (`joints`, `modes`, `gauges`, `z`, `gain`). An array of one element is spread to that length.
+        (`joints`, `modes`, `gauges`, `z`, `gain`). An array of one element is spread to that length. A name that
+        ends in `*` takes any number of sets of that length.
     read_only : bool
         Whether the value is fixed once the node has started.
     """
@@ -143,13 +146,17 @@ class Parameter:
             wanted = ", ".join(str(float(v)) for v in value[:12])
             raise _refusal(where, [int(v) for v in value], problem, hint=f"write [{wanted}]")
         out = [self._float(f"{where}[{i}]", v) for i, v in enumerate(value)]
-        wanted = sizes.get(self.length) if isinstance(self.length, str) else self.length
+        name = self.length.rstrip(SETS) if isinstance(self.length, str) else ""
+        wanted = sizes.get(name) if name else self.length
         if wanted is None or len(out) == wanted:
             return out
         if len(out) == 1:
             return out * wanted
-        what = f" ({self.length})" if isinstance(self.length, str) else ""
-        problem = f"{len(out)} values where {wanted}{what} are needed"
+        several = name != self.length and name
+        if several and out and wanted and not len(out) % wanted:
+            return out
+        what = f" ({name})" if name else ""
+        problem = f"{len(out)} values where {wanted}{what}{', or sets of so many,' if several else ''} are needed"
         raise ParameterError(problem, field=where, hint="one value stands for all")
 
     def _in_range(self, where, value):

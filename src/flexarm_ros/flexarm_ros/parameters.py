@@ -13,6 +13,7 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 from flexarm_dynamics.errors import FlexarmError, ParameterError
+from flexarm_dynamics.parameters import SETS
 
 
 def descriptor(parameter):
@@ -28,7 +29,8 @@ def descriptor(parameter):
     if parameter.choices:
         limits.append("one of " + ", ".join(parameter.choices))
     if parameter.length is not None:
-        limits.append(f"length {parameter.length}, or one value for all")
+        length = str(parameter.length).replace(SETS, " or a multiple")
+        limits.append(f"length {length}, or one value for all")
     out = ParameterDescriptor(
         description=text,
         additional_constraints="; ".join(limits),

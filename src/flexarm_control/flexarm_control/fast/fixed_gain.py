@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Fast control with a gain that is given: u_fast = K_f z_f with the numbers of the parameter, and a low pass.
 
-The gain is the design's result itself: that of `flexarm design`, or of a method of your own.
+The gain is the design's result itself: that of `flexarm design`, or of a method of your own. It may be several sets,
+each made for a configuration of its own (`flexarm_control.schedule`).
 """
 
 import numpy as np
@@ -9,24 +10,31 @@ import numpy as np
 from flexarm_dynamics.parameters import parameter
 
 from ..low_pass import BANDWIDTH, LowPass
+from ..schedule import SCHEDULE, Schedule
 from .base import FastLaw
 from .lqr import CONFIGURATION
 
 
 class FixedGain(FastLaw):
-    """Constant feedback of amplitudes and rates; see the module."""
+    """Feedback of amplitudes and rates by given gains; see the module."""
 
     PARAMETERS = (
-        parameter("gain", [0.0], "N m/m, N m s/m", -1e12, 1e12, length="gain").described(
-            "K_f of fixed_gain, row by row: for each joint the modal amplitudes, then the modal rates."
+        parameter("gain", [0.0], "N m/m, N m s/m", -1e12, 1e12, length="gain*").described(
+            "K_f of fixed_gain, row by row: for each joint the modal amplitudes, then the modal rates; a set for each"
+            " configuration of the schedule, or one for all."
         ),
+        SCHEDULE,
         CONFIGURATION,
         BANDWIDTH,
     )
 
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
-        self.K_f = np.array(self.parameters["gain"]).reshape(model.n_joints, 2 * model.n_modes)
+        shape = model.n_joints, 2 * model.n_modes
+        self._schedule = Schedule(model, self.parameters["schedule"], "fast.schedule")
+        self._sets = self._schedule.sets(self.parameters["gain"], shape[0] * shape[1], "fast.gain")
+        self._now = np.zeros(shape)
+        self.K_f = self.gain(self.configuration).copy()
         self._low_pass = LowPass(model.n_joints, self.parameters["bandwidth"])
 
     def reset(self):
@@ -40,7 +48,11 @@ class FixedGain(FastLaw):
         self._low_pass.advance(dt)
 
     def torque(self, z_f, q):
-        return self._low_pass(self.K_f @ z_f)
+        return self._low_pass(self.gain(q) @ z_f)
+
+    def gain(self, q):
+        np.dot(self._schedule.weights(q), self._sets, out=self._now.reshape(-1))
+        return self._now
 
     def state_space(self, dt):
         if not self.parameters["bandwidth"]:

@@ -119,3 +119,20 @@ def horner(coefficients, x, out):
             for k in range(coefficients.shape[0] - 2, -1, -1):
                 value = value * x + coefficients[k, i, j]
             out[i, j] = value
+
+
+def weights_between(q, at, joints, weights):
+    """Fill `weights`, (k,), of sets of gains that are made for configurations `at`, (k, n), in q (n,) [rad].
+
+    `joints`: numbers of those that matter. Inverse squares of the distances, their sum 1.
+    """
+    total = 0.0
+    for k in range(weights.size):
+        square = 1e-12
+        for j in joints:
+            half = np.sin(0.5 * (q[j] - at[k, j]))
+            square += 4.0 * half * half
+        weights[k] = 1.0 / square
+        total += weights[k]
+    for k in range(weights.size):
+        weights[k] /= total

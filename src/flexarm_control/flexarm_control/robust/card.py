@@ -13,7 +13,7 @@ from flexarm_dynamics.models.model import build
 from .decay import eigenvalues
 from .loop import measured_amplitudes, sampled_loop
 from .tip import Tip, softest
-from .uncertain import richer, uncertain_loops
+from .uncertain import richer
 
 #: Bisections of a limit, and the farthest that is looked: factors, and periods of delay.
 BISECTIONS, FARTHEST, LATEST = 12, 16.0, 40.0
@@ -61,7 +61,8 @@ def card(design):
     """The `Card` of a design."""
     arm, sampling = richer(design.arm.whole), design.sampling
     nominal = build(design.arm.known)
-    plants, K = {}, design.K
+    plants = {}
+    gains = [design.gains_at(k) for k in range(len(design.configurations))]
 
     def loops(payload=1.0, stiffness=1.0, gain=1.0, delay=None):
         key = payload, stiffness
@@ -73,9 +74,12 @@ def card(design):
 
     def stable(phase=0.0, **off):
         # A loop with real numbers and a lag is as stable as one with the same lead.
-        turned = K * np.exp(-1j * phase) if phase else K
+        turn = np.exp(-1j * phase) if phase else 1.0
         try:
-            return all(np.abs(_poles(loop, turned)).max() < 1.0 for loop in loops(**off))
+            return all(
+                np.abs(_poles(loop, turn * K)).max() < 1.0
+                for loop, K in zip(loops(**off), gains, strict=True)
+            )
         except ModelError:  # it does not rest there
             return False
 
@@ -87,7 +91,7 @@ def card(design):
         return (0.0 if np.isinf(low) else 1.0 / low), high
 
     damping, stated = np.inf, list(loops())
-    for loop in stated:
+    for loop, K in zip(stated, gains, strict=True):
         s = np.log(eigenvalues(loop, K)[1]) / loop.period
         s = s[(np.abs(s) < design.omega_c) & (s.imag > 0.0)]
         damping = min(damping, float((-s.real / np.abs(s)).min(initial=np.inf)))
@@ -97,12 +101,13 @@ def card(design):
     slowest = min(-pole.real for _, pole, _ in design.slowest)
     tips = [Tip(plants[1.0, 1.0], q) for q in design.configurations]
     n, m, more = nominal.n_joints, nominal.n_modes, plants[1.0, 1.0]
-    given = np.hstack([K[:, :n], K[:, 3 * n : 3 * n + m] @ measured_amplitudes(nominal, more)])
+    seen = measured_amplitudes(nominal, more)
+    given = [np.hstack([K[:, :n], K[:, 3 * n : 3 * n + m] @ seen]) for K in gains]
     settling = np.inf
     if stable():
         settling = max(
-            tip.settling(loop, K, softest(tip.compliance(given))[1])
-            for tip, loop in zip(tips, stated, strict=True)
+            tip.settling(loop, K, softest(tip.compliance(held))[1])
+            for tip, loop, K, held in zip(tips, stated, gains, given, strict=True)
         )
     return Card(
         limits("gain"),
@@ -114,18 +119,15 @@ def card(design):
         settling,
         LEFT / slowest if slowest > 0.0 else np.inf,
         min(softest(tip.compliance())[0] for tip in tips),
-        min(softest(tip.compliance(given))[0] for tip in tips),
+        min(softest(tip.compliance(held))[0] for tip, held in zip(tips, given, strict=True)),
     )
 
 
 def poles(design):
     """Poles of all loops that a design is for: (name, fraction of the decay that is asked, s (k,)) of each [1/s]."""
-    found = uncertain_loops(
-        build(design.arm.known), design.configurations, design.sampling, design.uncertainty
-    )
     return [
-        (loop.name, loop.fraction, np.log(eigenvalues(loop, design.K)[1]) / loop.period)
-        for loop in found
+        (loop.name, loop.fraction, np.log(eigenvalues(loop, K)[1]) / loop.period)
+        for loop, K in design.loops()
     ]
 
 

@@ -118,6 +118,7 @@ class Slowest:
         self.loops, self.wanted, self.scale = loops, wanted, scale
         self.free = scale > 0.0
         self._unit = scale[self.free]
+        self.size = self._unit.size  # of x
 
     def gains(self, x):
         """K of scaled gains x."""
@@ -129,11 +130,15 @@ class Slowest:
         """Scaled gains x of K."""
         return K[self.free] / self._unit
 
+    def gains_of(self, loop, x):
+        """K that a loop has under scaled gains x."""
+        return self.gains(x)
+
     def values(self, x, loops=None):
         """The `Poles` of each loop, or of these loops, under scaled gains x."""
-        K, found = self.gains(x), []
+        found = []
         for loop in self.loops if loops is None else loops:
-            closed, z = eigenvalues(loop, K)
+            closed, z = eigenvalues(loop, self.gains_of(loop, x))
             s = np.log(z) / loop.period
             asked = self.wanted.decay(s, loop.fraction)
             v = s.real / asked
@@ -161,7 +166,7 @@ class Slowest:
             if v > 1e-9 or np.linalg.norm(slope) > UNMOVED:
                 return v, slope, loop, s, unmoved
             unmoved.append((loop, s))
-        return -np.inf, np.zeros(self.free.sum()), None, 0.0, unmoved
+        return -np.inf, np.zeros(self.size), None, 0.0, unmoved
 
     def smooth(self, loops, width):
         r"""A smooth function of x above the largest v of some loops, and its gradient.
@@ -195,3 +200,36 @@ class Slowest:
             return worst + w * np.log(total), slope / total
 
         return function
+
+
+class SlowestScheduled(Slowest):
+    """As `Slowest`, of several sets of gains at once: each loop has their mean with `weights` of its own.
+
+    Parameters
+    ----------
+    loops, wanted, scale
+        As of `Slowest`.
+    weights : sequence of ndarray, shape (k,)
+        Of each loop.
+    """
+
+    def __init__(self, loops, wanted, scale, weights):
+        super().__init__(loops, wanted, scale)
+        self._weights = {id(loop): np.array(w) for loop, w in zip(loops, weights, strict=True)}
+        self.size *= len(weights[0])
+
+    def gains(self, x):
+        """All sets of scaled gains x, (k, n, 3n + 2m)."""
+        return np.array([super(SlowestScheduled, self).gains(one) for one in self._split(x)])
+
+    def scaled(self, K):
+        return np.concatenate([super(SlowestScheduled, self).scaled(one) for one in K])
+
+    def gains_of(self, loop, x):
+        return super().gains(self._weights[id(loop)] @ self._split(x))
+
+    def _split(self, x):
+        return x.reshape(-1, self._unit.size)
+
+    def _slope(self, poles, i):
+        return np.outer(self._weights[id(poles.loop)], super()._slope(poles, i)).ravel()

@@ -82,6 +82,7 @@ class Default(NamedTuple):
     parameters: dict  # flat
     delay: float  # it is made for [s]
     bears_delay: float  # longest one with which it is stable [s]
+    reached: float  # `Design.reached` [-]
 
 
 def is_wanted(name, given, kind=AUTO):
@@ -142,7 +143,11 @@ def find(arm, settings, uncertainty):
         found.check()
     except DesignError as error:
         return {"refused": {"problem": error.problem, "hint": error.hint}}
-    return {"parameters": found.parameters(), "bears_delay": float(card(found).delay)}
+    return {
+        "parameters": found.parameters(),
+        "bears_delay": float(card(found).delay),
+        "reached": float(found.reached),
+    }
 
 
 def default(arm, settings, uncertainty, make=find):
@@ -160,7 +165,7 @@ def default(arm, settings, uncertainty, make=find):
         cache.write(name, entry)
     if "refused" in entry:
         raise DesignError(field=f"controller of {arm.name}", **entry["refused"])
-    return Default(entry["parameters"], settings.delay, entry["bears_delay"])
+    return Default(entry["parameters"], settings.delay, entry["bears_delay"], entry["reached"])
 
 
 def is_cached(arm, settings, uncertainty):

@@ -13,6 +13,7 @@ Overton 2006, HIFOO; Ackermann 1980 for the multi-model idea).
 """
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +22,12 @@ from flexarm_dynamics.models.model import build
 
 from ..fading import lowest
 from ..low_pass import POLES
-from .decay import Slowest, Wanted
+from ..schedule import matters
+from .decay import Slowest, SlowestScheduled, Wanted
+from .held import held_loops
 from .loop import Sampling
 from .noise import Noise
-from .search import STARTS, Search, race, start
+from .search import ROUNDS, STARTS, TOGETHER, Search, follow, race, start
 from .uncertain import (
     Uncertainty,
     configurations,
@@ -47,6 +50,8 @@ TRANSPORT = 1e-3
 #: A pole is hardly in reach of the torque where one unit of all gains changes its value by less than this [-], and fast
 #: for the loop where the torque's delay turns it by more than this [rad].
 HARDLY, FAST = 1.0, 0.5
+#: Where scheduled gains reach less of the decay than this, one set for all is tried, too [-].
+LITTLE = 0.05
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 
@@ -94,7 +99,7 @@ class Design:
     Attributes
     ----------
     K : ndarray, shape (n, 3n + 2m)
-        u = -K (q, qd, -w, delta, delta_d).
+        u = -K (q, qd, -w, delta, delta_d); where they are scheduled, those of the first configuration.
     decay : float
         Slowest decay of all poles that gains move, over what is wanted of them [-]; negative: unstable.
     omega_1 : float
@@ -111,6 +116,8 @@ class Design:
         Of each joint: rms torque of the sensors' noise over the torque limit [-].
     slope : float
         By how much one unit of all gains changes the value of the slowest pole [-].
+    sets : ndarray, shape (k, n, 3n + 2m)
+        One set of gains for all configurations, or one for each; see `flexarm_control.schedule`.
     """
 
     arm: object
@@ -127,6 +134,38 @@ class Design:
     evaluations: int = 0
     noise: tuple = field(default=())
     slope: float = np.inf
+    sets: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.sets is None:
+            object.__setattr__(self, "sets", self.K[None])
+
+    @property
+    def reached(self):
+        """The least decay over what is asked, of the arms with other payloads and stiffnesses alone [-]."""
+        return -max(value for name, _, value in self.slowest if name.startswith("payload"))
+
+    @property
+    def scheduled(self):
+        """Whether there is a set of gains for each configuration."""
+        return len(self.sets) > 1
+
+    def gains_at(self, number):
+        """K of a configuration, by its number from 0, (n, 3n + 2m)."""
+        return self.sets[number if self.scheduled else 0]
+
+    def loops(self):
+        """The loops that the design is for, each with its gains: pairs of `Loop` and K."""
+        loops, weights = held_loops(
+            build(self.arm.known),
+            self.configurations,
+            self.sampling,
+            self.uncertainty,
+            len(self.sets),
+        )
+        return [
+            (loop, np.tensordot(w, self.sets, 1)) for loop, w in zip(loops, weights, strict=True)
+        ]
 
     @property
     def holds(self):
@@ -150,7 +189,7 @@ class Design:
     def parameters(self):
         """Flat parameters of the three nodes."""
         n = len(self.arm.joints)
-        K = self.K
+        K = self.sets
         finite = np.isfinite(self.sampling.torque_corner)
         corner = numbers([self.sampling.torque_corner])[0] if finite else 0.0
         out = {
@@ -158,15 +197,19 @@ class Design:
             "stability_margin": UNCHECKED,
             "feedforward": self.settings.feedforward,
             "slow.type": "joint_pid",
-            "slow.stiffness": numbers(np.diag(K[:, :n])),
-            "slow.damping": numbers(np.diag(K[:, n : 2 * n])),
-            "slow.integral": numbers(np.diag(K[:, 2 * n : 3 * n])),
+            "slow.stiffness": numbers([np.diag(one[:, :n]) for one in K]),
+            "slow.damping": numbers([np.diag(one[:, n : 2 * n]) for one in K]),
+            "slow.integral": numbers([np.diag(one[:, 2 * n : 3 * n]) for one in K]),
             "slow.bandwidth": corner,
             "fast.type": "none",
         }
-        if K.shape[1] > 3 * n:
+        if self.scheduled:
+            out["slow.schedule"] = numbers(self.configurations)
+        if K.shape[2] > 3 * n:
             out["fast.type"] = "fixed_gain"
-            out["fast.gain"] = numbers(-K[:, 3 * n :])
+            out["fast.gain"] = numbers(-K[:, :, 3 * n :])
+            if self.scheduled:
+                out["fast.schedule"] = numbers(self.configurations)
             out["fast.configuration"] = numbers(self.configurations[0])
             out["fast.bandwidth"] = corner
         return out | {"manifold.type": "reference"} | observer_parameters(self.sampling)
@@ -278,52 +321,148 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         Where the arm rests in no configuration, or has nothing to measure its bending by.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
-    nominal = build(arm.known)
-    at = places(nominal, settings)
-    omega_1 = lowest(nominal)
-    sampling, omega_c = sampling_for(nominal, at, settings)
-    wanted = Wanted(omega_1, omega_c, own_damping(arm, uncertainty))
-    scale = units(nominal, at, omega_1)
-    speed = max(settings.speed, 0.05)
-    searches = []
-    for factor in LOW_PASS:
-        samples = replace(sampling, torque_corner=factor * omega_1)
-        slowest = Slowest(uncertain_loops(nominal, at, samples, uncertainty), wanted, scale)
-        noise = Noise(slowest, nominal, samples, speed * NOISIEST, omega_1)
-        late = sampling.delay + 0.5 * sampling.period
-        late += 1.0 / sampling.joint_corner + POLES / samples.torque_corner
-        corner = samples.torque_corner
-        starts = [start(nominal, at, scale, a, late, corner) for a in STARTS]
-        starts += [] if gains is None else [gains]
-        search = Search(slowest, noise, speed * FASTEST, 1.0 if np.isinf(factor) else SLUGGISH)
-        searches.append((search, [slowest.scaled(K) for K in starts]))
-    chosen, x = race(searches, settings.effort, progress)
-    search = searches[chosen][0]
-    slowest, noise = search.slowest, search.noise
-    sampling = replace(sampling, torque_corner=LOW_PASS[chosen] * omega_1)
-    rows, left, slopes = [], [], []
-    for one in slowest.values(x):
-        v, slope, _, s, unmoved = slowest.worst([one])
-        rows.append((one.loop.name, complex(s), float(v)))
-        slopes.append(float(np.linalg.norm(slope)))
-        left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
-    K = slowest.gains(x)
-    return Design(
-        arm,
-        settings,
-        uncertainty,
-        sampling,
-        K,
-        -max(row[2] for row in rows),
-        omega_1,
-        omega_c,
-        at,
-        tuple(rows),
-        tuple(sorted(set(left))),
-        round(sum(search.evaluations for search, _ in searches)),
-        tuple(noise.shares(K).tolist()),
-        slopes[int(np.argmax([row[2] for row in rows]))],
-    )
+    task = _Task(arm, settings, uncertainty)
+    several = len(task.at) > 1 and matters(task.nominal).any()
+    sets = task.scheduled(progress, gains) if several else None
+    if sets is None or sets.decay < LITTLE:
+        alone = task.alone(progress, gains)
+        sets = alone if sets is None or alone.decay > sets.decay else sets
+    return task.design(sets)
+
+
+class _Sets(NamedTuple):
+    """Gains of each configuration, and what they do."""
+
+    K: np.ndarray  # (k, n, 3n + 2m); one set, or one for each configuration
+    sampling: Sampling
+    rows: tuple  # of `Design.slowest`
+    left: tuple
+    noise: np.ndarray  # (n,)
+    slope: float
+    evaluations: float
+
+    @property
+    def decay(self):
+        """Of the slowest pole, over what is wanted [-]."""
+        return -max(row[2] for row in self.rows)
+
+
+class _Task:
+    """One design: what is searched, in one set of gains or in several."""
+
+    def __init__(self, arm, settings, uncertainty):
+        self.arm, self.settings, self.uncertainty = arm, settings, uncertainty
+        self.nominal = nominal = build(arm.known)
+        self.at = places(nominal, settings)
+        self.omega_1 = lowest(nominal)
+        self.sampling, self.omega_c = sampling_for(nominal, self.at, settings)
+        self.wanted = Wanted(self.omega_1, self.omega_c, own_damping(arm, uncertainty))
+        self.scale = units(nominal, self.at, self.omega_1)
+        self.speed = max(settings.speed, 0.05)
+
+    def alone(self, progress, gains):
+        """One set for all configurations."""
+        searches = self._searches(self.at, gains)
+        chosen, x = race(searches, self.settings.effort, progress)
+        search, used = searches[chosen][0], sum(one.evaluations for one, _ in searches)
+        if len(self.at) == 1:
+            return self._sets(search, x, used)
+        return self._together(search.slowest.gains(x)[None], search.sampling, used)
+
+    def scheduled(self, progress, gains):
+        """A set for each configuration: a race in the first one, the others from the best of those found."""
+        count = len(self.at)
+
+        def say(fraction, decay):
+            if progress is not None:
+                progress(fraction / count, decay)
+
+        searches = self._searches(self.at[:1], gains)
+        chosen, x = race(searches, self.settings.effort, say)
+        found, used = [(searches[chosen][0], x)], sum(one.evaluations for one, _ in searches)
+        for k in range(1, count):
+            search, starts = self._search(LOW_PASS[chosen], self.at[k : k + 1], k + 1)
+            near = min((x for _, x in found), key=search.value)
+            found.append((search, follow(search, [near, starts[0]], self.settings.effort)))
+            used += search.evaluations
+            if progress is not None:
+                progress((k + 1) / count, -max(one.value(x) for one, x in found))
+        K = np.array([search.slowest.gains(x) for search, x in found])
+        return self._together(K, searches[chosen][0].sampling, used)
+
+    def _together(self, K, sampling, used):
+        """`_Sets` that hold between the configurations, too, from gains K (1 or k, n, 3n + 2m) that hold in them."""
+        loops, weights = held_loops(self.nominal, self.at, sampling, self.uncertainty, len(K))
+        search = whole = self._together_search(loops, weights, sampling)
+        x, relaxed = whole.slowest.scaled(K), set()
+        for _ in range(ROUNDS):
+            x = search.refined(x, self.settings.effort * TOGETHER)[1]
+            used += search.evaluations
+            asked, near = search.relaxed(x, relaxed)
+            relaxed |= near
+            if asked is None:
+                break
+            search = self._together_search(asked, weights, sampling)
+        return self._sets(whole, x, used)
+
+    def _together_search(self, loops, weights, sampling):
+        slowest = SlowestScheduled(loops, self.wanted, self.scale, weights)
+        noise = Noise(slowest, self.nominal, sampling, self.speed * NOISIEST, self.omega_1)
+        return Search(slowest, noise, self.speed * FASTEST, sampling=sampling)
+
+    def _searches(self, at, gains):
+        """A search with each low pass, and its starts."""
+        found = [self._search(factor, at) for factor in LOW_PASS]
+        if gains is None:
+            return found
+        return [(search, [*starts, search.slowest.scaled(gains)]) for search, starts in found]
+
+    def _search(self, factor, at, first=1):
+        """The search with a low pass of a corner over omega_1, in configurations from number `first` on; its starts."""
+        corner = factor * self.omega_1
+        samples = replace(self.sampling, torque_corner=corner)
+        several = len(self.at) > 1
+        loops = uncertain_loops(self.nominal, at, samples, self.uncertainty, first, every=several)
+        slowest = Slowest(loops, self.wanted, self.scale)
+        noise = Noise(slowest, self.nominal, samples, self.speed * NOISIEST, self.omega_1)
+        late = samples.delay + 0.5 * samples.period + 1.0 / samples.joint_corner + POLES / corner
+        starts = [start(self.nominal, at, self.scale, a, late, corner) for a in STARTS]
+        handicap = 1.0 if np.isinf(factor) else SLUGGISH
+        search = Search(slowest, noise, self.speed * FASTEST, handicap, samples)
+        return search, [slowest.scaled(K) for K in starts]
+
+    def _sets(self, search, x, used):
+        """`_Sets` of a search's scaled gains x."""
+        slowest, rows, left, slopes = search.slowest, [], [], []
+        for one in slowest.values(x):
+            v, slope, _, s, unmoved = slowest.worst([one])
+            rows.append((one.loop.name, complex(s), float(v)))
+            slopes.append(float(np.linalg.norm(slope)))
+            left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
+        K = slowest.gains(x).reshape(-1, *self.scale.shape)
+        noise = np.max([search.noise.shares(one) for one in K], axis=0)
+        slope = slopes[int(np.argmax([row[2] for row in rows]))]
+        return _Sets(K, search.sampling, tuple(rows), tuple(sorted(set(left))), noise, slope, used)
+
+    def design(self, sets):
+        """The `Design` with these `_Sets`."""
+        return Design(
+            self.arm,
+            self.settings,
+            self.uncertainty,
+            sets.sampling,
+            sets.K[0],
+            sets.decay,
+            self.omega_1,
+            self.omega_c,
+            self.at,
+            sets.rows,
+            sets.left,
+            round(sets.evaluations),
+            tuple(sets.noise.tolist()),
+            sets.slope,
+            sets.K,
+        )
 
 
 def units(model, at, omega_1):

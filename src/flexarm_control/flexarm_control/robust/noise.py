@@ -56,13 +56,17 @@ class Noise:
 
     def __call__(self, x):
         """The penalty of scaled gains, and its gradient."""
-        K = self._slowest.gains(x)
-        shares = self.shares(K)
-        over = np.maximum(np.log(np.maximum(shares, 1e-300) / self._allowed), 0.0)
-        slope = np.zeros_like(K)
-        for i in np.flatnonzero(over > 0.0):
-            slope[i] = 2.0 * over[i] / shares[i] ** 2 * K[i] * self._share[i] ** 2
-        return float(over @ over), (slope * self._slowest.scale)[self._slowest.free]
+        slowest, value, slopes = self._slowest, 0.0, []
+        gains = slowest.gains(x)
+        for K in gains.reshape(-1, *slowest.scale.shape):
+            shares = self.shares(K)
+            over = np.maximum(np.log(np.maximum(shares, 1e-300) / self._allowed), 0.0)
+            slope = np.zeros_like(K)
+            for i in np.flatnonzero(over > 0.0):
+                slope[i] = 2.0 * over[i] / shares[i] ** 2 * K[i] * self._share[i] ** 2
+            value += float(over @ over)
+            slopes.append((slope * slowest.scale)[slowest.free])
+        return value, np.concatenate(slopes)
 
 
 def _passed(sampling, corner):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search for the gains whose slowest pole is the fastest."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import eigh
 
@@ -16,6 +18,9 @@ WIDTHS = (0.3, 0.1, 0.03, 0.01)
 DESCENT = 60
 #: Evaluations of all loops for each start, then for the best start of each search, then for the best of all.
 FIRST, MIDDLE, LAST = 80, 120, 320
+#: The same for gains at and between several configurations together, in each of so many rounds: after each, loops whose
+#: decay is within this factor of the least are asked this part from then on.
+TOGETHER, ROUNDS, NEAR, RELAXED = 120, 3, 1.15, 0.4
 #: Loops with more states get fewer evaluations.
 SIZE = 80
 #: A width goes on for as long as it gains this fraction.
@@ -35,6 +40,8 @@ class Search:
         Decay at which a search ends [-].
     handicap : float
         Its decay counts as divided by this beside that of other searches [-].
+    sampling : Sampling
+        Of its loops.
 
     Attributes
     ----------
@@ -42,13 +49,14 @@ class Search:
         So many times all loops were looked at.
     """
 
-    def __init__(self, slowest, noise, enough, handicap=1.0):
+    def __init__(self, slowest, noise, enough, handicap=1.0, sampling=None):
         self.slowest, self.noise, self.enough = slowest, noise, enough
-        self.handicap = handicap
+        self.handicap, self.sampling = handicap, sampling
         n = slowest.scale.shape[0]
         positive = np.zeros(slowest.scale.shape, bool)
         positive[:, :n] = positive[:, 2 * n : 3 * n] = True  # stiffness and integral
-        self._positive = positive[slowest.free]
+        free = positive[slowest.free]
+        self._positive = np.tile(free, slowest.size // free.size)
         self.evaluations = 0.0
 
     def refined(self, x, budget, widths=WIDTHS):
@@ -77,6 +85,29 @@ class Search:
     def value(self, x):
         """The slowest pole of all loops, with the penalties."""
         return self._with_penalty(self._each(x), x)
+
+    def relaxed(self, x, kept=()):
+        """The loops, of which those that limit the others are asked less, and their numbers; without loops at an end.
+
+        The slowest pole of all decides what a search looks for. Where a mode that torque hardly moves or a joint that
+        sticks is the slowest, all others would be left as slow.
+
+        Parameters
+        ----------
+        x : ndarray
+            Scaled gains that the search has reached.
+        kept : collection of int
+            Numbers of loops that have been relaxed before.
+        """
+        each = self._each(x)
+        worst = max(each)
+        near = {k for k, v in enumerate(each) if v > NEAR * worst and k not in kept}
+        if not -self.enough < worst < 0.0 or not near:
+            return None, near
+        return [
+            replace(loop, fraction=RELAXED * loop.fraction) if k in near else loop
+            for k, loop in enumerate(self.slowest.loops)
+        ], near
 
     def _each(self, x):
         """The slowest pole of each loop that gains move, as a value."""
@@ -157,6 +188,13 @@ def race(searches, effort=1.0, progress=None):
     if progress is not None and done < whole:
         progress(1.0, -tried[0][0])
     return tried[0][1:]
+
+
+def follow(search, starts, effort=1.0):
+    """Scaled gains of a search that goes on from the better one of its `starts`, after a short run of each."""
+    found = [search.refined(x, effort * FIRST, WIDTHS[:2]) for x in starts]
+    value, x = min(found, key=lambda one: one[0])
+    return x if value < -search.enough else search.refined(x, effort * MIDDLE)[1]
 
 
 def start(model, at, scale, a, late, corner=np.inf):

@@ -79,6 +79,15 @@ def resting(model, at):
     return np.array(kept)
 
 
+def rests(model, q):
+    """Whether the arm rests in a configuration."""
+    try:
+        model.static_deflection(q)
+    except ModelError:
+        return False
+    return True
+
+
 def richer(arm):
     """The arm with one mode more in each direction of each link; itself where shapes are measured or given."""
     if arm.model != "chain":
@@ -96,7 +105,7 @@ def richer(arm):
     return replace(arm, links=links)
 
 
-def uncertain_loops(nominal, at, sampling, uncertainty):
+def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, every=False):
     """The set of loops that a design is for.
 
     In each configuration the softest, the stated and the stiffest arm, each one mode richer than the file, and one of
@@ -114,6 +123,12 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
         Configurations [rad].
     sampling : Sampling
     uncertainty : Uncertainty
+    first : int
+        Number of the first configuration, for names.
+    sticking : bool
+        Whether an arm with Coulomb friction also sticks.
+    every : bool
+        Whether loops without delay also have filtered joint speeds, and the file's modes alone.
 
     Returns
     -------
@@ -126,20 +141,18 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
         for p, k in ((1.0, 1.0), (p1, k0), (p0, k1))
     }
     stated = next(iter(plants.values()))
-    out = []
-    for i, q in enumerate(at):
+    out, here = [], "" if first == 1 else f", at configuration {first}"
+    for i, q in enumerate(at, first):
         for name, plant in plants.items():
             try:
                 out.append(
-                    sampled_loop(
-                        nominal, plant, q, sampling, name=f"{name}, at configuration {i + 1}"
-                    )
+                    sampled_loop(nominal, plant, q, sampling, name=f"{name}, at configuration {i}")
                 )
             except ModelError:  # heavier than what rests there
                 continue
     for gain in uncertainty.gain:
         out.append(
-            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}", UNLIKELY)
+            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", UNLIKELY)
         )
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
@@ -148,41 +161,48 @@ def uncertain_loops(nominal, at, sampling, uncertainty):
             stated,
             at[0],
             later,
-            name=f"delay {1e3 * later.delay:.3g} ms",
+            name=f"delay {1e3 * later.delay:.3g} ms{here}",
             fraction=UNLIKELY,
         )
     )
     measured = replace(sampling, joint_corner=np.inf)
-    name = "joint speeds measured"
+    name = f"joint speeds measured{here}"
     out.append(sampled_loop(nominal, stated, at[0], measured, name=name, fraction=UNLIKELY))
     sooner = replace(measured, delay=0.0)
-    for i, q in enumerate(at):
-        name = f"joint speeds measured, no delay, at configuration {i + 1}"
+    for i, q in enumerate(at, first):
+        name = f"joint speeds measured, no delay, at configuration {i}"
         out.append(sampled_loop(nominal, stated, q, sooner, name=name, fraction=UNLIKELY))
+        if every:
+            name = f"no delay, at configuration {i}"
+            out.append(
+                sampled_loop(nominal, stated, q, replace(sampling, delay=0.0), 1.0, name, UNLIKELY)
+            )
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
     if own.n_modes < stated.n_modes:
-        out += _own_modes(nominal, own, at, sampling, measured)
-    if any(joint.friction.coulomb for joint in arm.joints):
-        for i, q in enumerate(at):
-            name = f"sticking, at configuration {i + 1}"
+        kinds = {"": sampling, ", joint speeds measured": measured}
+        if every:
+            kinds[", joint speeds measured, no delay"] = sooner
+        out += _own_modes(nominal, own, at, kinds, first)
+    if sticking and any(joint.friction.coulomb for joint in arm.joints):
+        for i, q in enumerate(at, first):
+            name = f"sticking, at configuration {i}"
             out.append(sampled_loop(nominal, stated, q, sampling, 1.0, name, STICKING, True))
     return out
 
 
-def _own_modes(nominal, plant, at, sampling, measured):
-    """Loops of a plant with the file's modes alone, with filtered and with measured joint speeds."""
-    names = {"": sampling, ", joint speeds measured": measured}
+def _own_modes(nominal, plant, at, kinds, first):
+    """Loops of a plant with the file's modes alone, of these kinds of sampling by their names."""
     return [
         sampled_loop(
             nominal,
             plant,
             q,
             samples,
-            name=f"the file's modes alone{name}, at configuration {i + 1}",
+            name=f"the file's modes alone{name}, at configuration {i}",
             fraction=UNLIKELY,
         )
-        for i, q in enumerate(at)
-        for name, samples in names.items()
+        for i, q in enumerate(at, first)
+        for name, samples in kinds.items()
     ]
 
 

@@ -13,6 +13,9 @@ inertia of the arm file; these do not, so that what is designed for an uncertain
 file says. The integral leaves no error at rest under a payload, friction or weight that the file does not have. On a
 motion that the model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is
 beyond the joint's.
+
+The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
+an angle: a change of K_w does not move it.
 """
 
 import numpy as np
@@ -21,7 +24,11 @@ from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
 from ..low_pass import BANDWIDTH, LowPass
+from ..schedule import SCHEDULE, Schedule
 from .base import SlowLaw
+
+#: Parameters that are scheduled.
+GAINS = ("stiffness", "damping", "integral")
 
 
 class JointPid(SlowLaw):
@@ -29,6 +36,8 @@ class JointPid(SlowLaw):
 
     Attributes
     ----------
+    stiffness, damping, gain : ndarray, shape (n,)
+        K_q, K_qd and K_w of the last sample.
     integral : ndarray, shape (n,)
         w [N m].
     """
@@ -36,30 +45,31 @@ class JointPid(SlowLaw):
     separate = True
 
     PARAMETERS = (
-        parameter("stiffness", [0.0], "N m/rad", 0.0, 1e9, length="joints").described(
-            "K_q of joint_pid: torque per joint error."
+        parameter("stiffness", [0.0], "N m/rad", 0.0, 1e9, length="joints*").described(
+            "K_q of joint_pid: torque per joint error; a set for each configuration of the schedule, or one for all."
         ),
-        parameter("damping", [0.0], "N m s/rad", -1e9, 1e9, length="joints").described(
-            "K_qd of joint_pid: torque per error of the joint's speed."
+        parameter("damping", [0.0], "N m s/rad", -1e9, 1e9, length="joints*").described(
+            "K_qd of joint_pid: torque per error of the joint's speed; sets as of stiffness."
         ),
-        parameter("integral", [0.0], "N m/(rad s)", 0.0, 1e9, length="joints").described(
-            "K_w of joint_pid: torque per integrated joint error; 0.0: none."
+        parameter("integral", [0.0], "N m/(rad s)", 0.0, 1e9, length="joints*").described(
+            "K_w of joint_pid: torque per integrated joint error; 0.0: none; sets as of stiffness."
         ),
         parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
+        SCHEDULE,
         BANDWIDTH,
     )
 
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
-        self.stiffness, self.damping, self.gain, most = (
-            np.array(self.parameters[name])
-            for name in ("stiffness", "damping", "integral", "integral_torque")
-        )
-        self._limit = model.arm.torque_limits
-        self._most = np.where(most > 0.0, most, self._limit)
         n = model.n_joints
+        self._schedule = Schedule(model, self.parameters["schedule"], "slow.schedule")
+        sets = [self._schedule.sets(self.parameters[k], n, f"slow.{k}") for k in GAINS]
+        self._sets = tuple(sets)
+        self.stiffness, self.damping, self.gain = (rows[0].copy() for rows in sets)
+        self._limit, most = model.arm.torque_limits, np.array(self.parameters["integral_torque"])
+        self._most = np.where(most > 0.0, most, self._limit)
         self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
         self._known = b"", np.zeros(n)
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
@@ -86,6 +96,12 @@ class JointPid(SlowLaw):
         return self._on(reference) + self.feedback(q, qd, reference)
 
     def feedback(self, q, qd, motion):
+        if self._schedule.count > 1:
+            weights = self._schedule.weights(q)
+            for rows, now in zip(
+                self._sets, (self.stiffness, self.damping, self.gain), strict=True
+            ):
+                np.dot(weights, rows, out=now)
         np.subtract(motion.position, q, out=self._error)
         u = self.stiffness * self._error
         u += self.damping * (motion.velocity - qd)

@@ -72,11 +72,14 @@ class Setup:
         Makes from the arm's model the law that replaces the composite control.
     motion : callable or None
         Makes from the arm's model the trajectory that is sent in place of the motion.
+    found : dict
+        What its design was found to do, kept with every run: plain data.
     """
 
     controller: dict = field(default_factory=dict)
     law: Callable | None = None
     motion: Callable | None = None
+    found: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

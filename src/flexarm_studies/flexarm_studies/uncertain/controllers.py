@@ -29,7 +29,8 @@ def _designed(feedforward, case):
     start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
     settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
     found = default(case.read(), settings, Uncertainty())
-    return Setup(found.parameters | {"feedforward": feedforward, "rate": RATE})
+    parameters = found.parameters | {"feedforward": feedforward, "rate": RATE}
+    return Setup(parameters, found={"decay": found.reached})
 
 
 CONTROLLERS = {

@@ -32,8 +32,8 @@ def rows(case, label, controller, make, variants, seed=0):
     Returns
     -------
     list of dict
-        Rows, each with ``sample`` (its `key`), ``arm``, ``controller``, ``variant``, ``seconds`` of computing, and
-        what `trial.run` returns.
+        Rows, each with ``sample`` (its `key`), ``arm``, ``controller``, ``variant``, ``seconds`` of computing,
+        what the setup's design was ``found`` to do, and what `trial.run` returns.
     """
     begin, refused, setup = time.monotonic(), None, None
     try:
@@ -43,7 +43,7 @@ def rows(case, label, controller, make, variants, seed=0):
     found = []
     for variant in variants:
         if refused is None:
-            result = trial.run(case, setup, VARIANTS[variant], seed=seed)
+            result = setup.found | trial.run(case, setup, VARIANTS[variant], seed=seed)
         else:
             result = {"refused": refused}
         now = time.monotonic()

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where gains have to hold: in the configurations of a design, and on the way between them.
+
+Gains that hold in a few configurations need not hold between them: the modes that a late torque turns by more than a
+right angle change their phase from place to place. So the loops of an arm in several configurations are those of the
+configurations and of places between the first and each of the others, each with the mean of the sets of gains that the
+control has there (`flexarm_control.schedule`).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..schedule import Schedule
+from .uncertain import rests, uncertain_loops
+
+#: Places on the way from the first configuration to each of the others, in parts of it [-].
+BETWEEN = (0.33, 0.67)
+
+
+def places(nominal, at, count):
+    """Where `count` sets of gains have to hold: the configurations first, then between them, where the arm rests.
+
+    Parameters
+    ----------
+    nominal : ArmModel
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    count : int
+        Of sets of gains, 1 or k.
+
+    Yields
+    ------
+    str, ndarray, ndarray
+        The place in words, q (n,) [rad], and the weights of the sets there, (count,).
+    """
+    schedule = Schedule(nominal, at if count > 1 else ())
+    for k, q in enumerate(at, 1):
+        yield f"at configuration {k}", q, schedule.weights(q).copy()
+    for k, end in enumerate(at[1:], 2):
+        for part in BETWEEN:
+            q = (1.0 - part) * at[0] + part * end
+            if rests(nominal, q):
+                yield f"between configurations 1 and {k}", q, schedule.weights(q).copy()
+
+
+def held_loops(nominal, at, sampling, uncertainty, count=1):
+    """The loops of all `places`, and the weights of the sets of gains in each; see there and `uncertain_loops`.
+
+    Returns
+    -------
+    list of Loop, list of ndarray
+    """
+    if len(at) == 1:
+        found = uncertain_loops(nominal, at, sampling, uncertainty)
+        return found, [np.ones(1)] * len(found)
+    loops, weights = [], []
+    for number, (place, q, w) in enumerate(places(nominal, at, count)):
+        sticking = number < len(at)
+        found = uncertain_loops(nominal, q[None], sampling, uncertainty, 1, sticking, every=True)
+        loops += [replace(one, name=f"{one.name.split(', at conf')[0]}, {place}") for one in found]
+        weights += [w] * len(found)
+    return loops, weights
