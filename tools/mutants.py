@@ -470,8 +470,8 @@ LAWS = [
         (
             "fixed_gain",
             "rows and columns of the gain",
-            ".reshape(model.n_joints, 2 * model.n_modes)",
-            ".reshape(2 * model.n_modes, model.n_joints).T",
+            "out=self._now.reshape(-1))",
+            "out=self._now.T.reshape(-1))",
         ),
         ("scheduled_lqr", "interpolation", "for v in (1.0 - t, t)]", "for v in (t, 1.0 - t)]"),
     ),

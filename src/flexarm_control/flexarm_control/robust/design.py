@@ -192,6 +192,7 @@ class Design:
         K = self.sets
         finite = np.isfinite(self.sampling.torque_corner)
         corner = numbers([self.sampling.torque_corner])[0] if finite else 0.0
+        at = {"schedule": numbers(self.configurations)} if self.scheduled else {}
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -200,16 +201,14 @@ class Design:
             "slow.stiffness": numbers([np.diag(one[:, :n]) for one in K]),
             "slow.damping": numbers([np.diag(one[:, n : 2 * n]) for one in K]),
             "slow.integral": numbers([np.diag(one[:, 2 * n : 3 * n]) for one in K]),
+            **{f"slow.{name}": values for name, values in at.items()},
             "slow.bandwidth": corner,
             "fast.type": "none",
         }
-        if self.scheduled:
-            out["slow.schedule"] = numbers(self.configurations)
         if K.shape[2] > 3 * n:
             out["fast.type"] = "fixed_gain"
             out["fast.gain"] = numbers(-K[:, :, 3 * n :])
-            if self.scheduled:
-                out["fast.schedule"] = numbers(self.configurations)
+            out |= {f"fast.{name}": values for name, values in at.items()}
             out["fast.configuration"] = numbers(self.configurations[0])
             out["fast.bandwidth"] = corner
         return out | {"manifold.type": "reference"} | observer_parameters(self.sampling)

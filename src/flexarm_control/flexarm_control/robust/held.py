@@ -45,7 +45,17 @@ def places(nominal, at, count):
 
 
 def held_loops(nominal, at, sampling, uncertainty, count=1):
-    """The loops of all `places`, and the weights of the sets of gains in each; see there and `uncertain_loops`.
+    """The loops of all `places`, and the weights of the sets of gains in each.
+
+    Parameters
+    ----------
+    nominal : ArmModel
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    sampling : Sampling
+    uncertainty : Uncertainty
+    count : int
+        Of sets of gains, 1 or k.
 
     Returns
     -------
