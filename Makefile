@@ -31,7 +31,7 @@ help:
 	@echo 'make check      build, then style, imports and the quick unit tests: about a minute'
 	@echo 'make mutants    build, then put in errors one at a time: a test must fail for each; MUTANTS_ARGS="-k chain"'
 	@echo 'make wheel      build, then a wheel of what needs no ROS, for pip, in results/wheel'
-	@echo 'make lock       build, then write the hashes of all packages that make build installs'
+	@echo 'make lock       write the hashes of all packages that make build installs, after one is added'
 	@echo 'make docs       build, then make a site of docs/, with the API, in results/docs/html; every link is checked'
 	@echo 'make bench      build, then time flexarm beside MuJoCo, Exudyn, python-control; BENCH_ARGS=--quick'
 	@echo 'make compare    build, then compare with tuned baselines on the same arms; COMPARE_ARGS=--quick'
@@ -72,9 +72,10 @@ check: build
 	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
 
-# After a change of a version in requirements/: the hashes that pip compares with what it downloads. Needs the network.
+# After a change of a version in requirements/: the hashes that pip compares with what it downloads. Needs the network, and
+# an earlier `make build`: one now would refuse the new package, which has no hash yet.
 LOCK_TOOLS := results/lock_tools
-lock: build
+lock:
 	@. tools/env.sh && python -m pip install -q --disable-pip-version-check --target $(LOCK_TOOLS) -r requirements/lock.txt && \
 	PYTHONPATH="$(CURDIR)/$(LOCK_TOOLS):$$PYTHONPATH" python tools/lock.py
 
