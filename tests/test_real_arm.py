@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexarm_studies.identification import one_step
+from flexarm_studies.identification import left_over, one_step
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "real_arm.md").read_text(encoding="utf-8")
 #: The arm file of the observer, and its noise levels.
@@ -70,6 +70,21 @@ def test_the_shipped_arm_explains_the_part_that_was_not_fitted(real_arm, flexarm
     shoulder, elbow = result["currents"]
     assert shoulder["left_of_scored"] < 0.08 and shoulder["explained"]
     assert not elbow["explained"]
+
+
+@pytest.mark.slow
+def test_the_joints_motion_does_not_tell_the_second_mode(real_arm, capsys):
+    """The table of docs/real_arm.md of what is left of eps31, by its command."""
+    left_over.main([
+        str(real_arm / "exp1.csv"), "tudor", "--mapping", "tudor", "--gauge", "eps31", "--fit", "14:60",
+        "--score", "60:80", "--band", "8:21",
+    ])  # fmt: skip
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:7]]
+    for name, *cells in rows:
+        blocks, later = (float(cell) for cell in cells[1:])
+        if "motion" in name or "accelerations" in name:
+            assert blocks < 3.0 and later < 6.0, name
+    assert float(rows[-1][2]) > 60.0 and float(rows[-1][3]) > 60.0
 
 
 #: Begin of the ring-downs after fast motions [s].
