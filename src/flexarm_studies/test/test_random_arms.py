@@ -282,3 +282,14 @@ def test_the_table_counts():
     assert table["default"][9] == "1.5° (2°)"
     assert table["lqr"][8] is None
     assert any("lost in 1 runs: joint is … rad off" in line for line in report.reasons(rows))
+
+
+def test_the_table_of_designs_has_the_decay_of_every_arm_once():
+    rows = [
+        {"controller": "designed", "number": n, "arm": f"planar{links}_0_{n}", "decay": d}
+        for n, (links, d) in enumerate(((1, 0.4), (1, 0.2), (2, 0.04)))
+        for _ in range(2)
+    ]
+    rows.append({"controller": "pid", "number": 0, "arm": "planar1_0_0"})
+    (found,) = report.decays(rows)
+    assert found == ("designed", 3, pytest.approx(0.3), 0.2, 0.04, 1)

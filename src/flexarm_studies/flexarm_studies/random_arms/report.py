@@ -14,6 +14,12 @@ COLUMNS = (
     "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "joints at rest",
     "no later than the best baseline", "peak joint error, median (worst)", "residual, median [1e-3 reach]",
 )  # fmt: skip
+DECAYS = (
+    "designs", "arms", "worst-case decay, median of one link (wanted: 0.3)", "median of all (0.15)", "the least (0.05)",
+    "below 0.05",
+)  # fmt: skip
+#: Least decay that is wanted of every design, over the first locked frequency [-].
+LEAST = 0.05
 #: Settling times closer than this are equal [s].
 EQUAL = 0.01
 #: Settled in time: locked periods after the motion [-].
@@ -93,11 +99,28 @@ def _gist(reason):
     return re.sub(r"\(?-?\d[\d.]*(e[-+]?\d+)?([-+]\d[\d.]*(e[-+]?\d+)?j\))?", "…", short)
 
 
+def decays(rows):
+    """Cells of the table of designs, a row per controller that is one: the worst-case decay of its arms."""
+    found = {}
+    for row in rows:
+        if "decay" in row:
+            found.setdefault(row["controller"], {})[row["number"]] = row
+    for controller, arms in found.items():
+        every = [row["decay"] for row in arms.values()]
+        one = [row["decay"] for row in arms.values() if re.match(r"[a-z]+1(?!\d)", row["arm"])]
+        median = [float(np.median(some)) if some else None for some in (one, every)]
+        slow = sum(decay < LEAST for decay in every)
+        yield controller, len(every), *median, min(every), slow
+
+
 def text(rows, seed):
-    """Table and reasons, Markdown."""
+    """Tables and reasons, Markdown."""
     count = len({row["number"] for row in rows})
-    head = f"{count} arms, seed {seed}."
-    return "\n".join([head, "", *markdown.table(COLUMNS, rows_of(rows)), "", *reasons(rows)])
+    lines = [f"{count} arms, seed {seed}.", "", *markdown.table(COLUMNS, rows_of(rows))]
+    designs = list(decays(rows))
+    if designs:
+        lines += ["", *markdown.table(DECAYS, designs)]
+    return "\n".join([*lines, "", *reasons(rows)])
 
 
 def write(rows, seed, file):
