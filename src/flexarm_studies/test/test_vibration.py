@@ -115,7 +115,21 @@ def test_the_table_counts_what_is_within_what_is_wanted():
     (line,) = report.summary(rows)
     assert line[0] == "retimed"
     assert line[3:7] == (pytest.approx(0.3), 0.1, "1 of 2", "0 of 2")
-    assert report.missed(rows) == ["- retimed: 0.30 of unshaped; x, motion 1; measured 2.00 Hz"]
+    lines = ["- retimed: 0.30 of unshaped; x, motion 1; measured 2.00 Hz"]
+    assert report.missed_lines(rows) == lines
+    ((row, ratio),) = report.missed(rows, ("retimed",))
+    assert row["motion"] == 1 and ratio == pytest.approx(0.3)
+    assert (
+        report.time_table([(row, [0.3, 0.1, 0.05, 0.01])])[2]
+        == "| x, motion 1 | 0.3 | 0.1 | 0.05 | 0.01 |"
+    )
+
+
+@pytest.mark.slow
+def test_in_more_time_less_is_left():
+    case = cases.all_of(0)["payload x1"]()
+    one, three = study.in_more_time(case, 0, (0.3, 1.0))
+    assert three < 0.02 < one
 
 
 def test_a_push_decays_five_times_faster_with_damping_by_strain():

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .. import workers
+from ..markdown import write_between
 from ..progress import Progress
 from ..store import Store, gather
 from . import cases, figure, pushes, report, study
@@ -37,6 +38,11 @@ def add_arguments(parser):
     add("--fresh", action="store_true", help="remove that file first: after a change of the code")
     add("--write", metavar="FILE.md", help="write the tables between the markers of this file")
     add("--pushes", action="store_true", help="push one link, with damping by strain and without")
+    add(
+        "--more-time",
+        action="store_true",
+        help="what retimed leaves in more than a period, of the motions that it misses; --out has the results",
+    )
     add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
 
 
@@ -54,9 +60,24 @@ def vibration(options):
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)
     rows = run(options.seed, options.count, options.out, options.workers, options.scheduler)
+    if options.more_time:
+        lines = report.time_table(_more_time(rows, options.count, options.seed))
+        if options.write:
+            write_between(options.write, *report.TIME, "\n".join(lines))
+        print("\n".join(lines))
+        return
     if options.write:
         report.write(rows, options.write)
     print(report.text(rows))
+
+
+def _more_time(rows, count, seed):
+    """Pairs of a row that `retimed` misses and what it leaves in `report.TIMES`."""
+    missed = [row for row, _ in report.missed(rows, ("retimed",))]
+    known = {case.name: case for case in (make() for make in cases.all_of(count, seed).values())}
+    return [
+        (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
+    ]
 
 
 def run(seed, count, path=None, processes=None, scheduler=None):

@@ -7,6 +7,9 @@ from ..markdown import table, write_between
 from .study import METHODS
 
 BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
+TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
+#: Periods that a motion may get longer by, one as in the tables and more [-].
+TIMES = (1.0, 1.5, 2.0, 3.0)
 #: What is wanted of a method: residual over that of the trapezoid [-].
 WANTED = {
     "robust": 0.1,
@@ -73,16 +76,27 @@ def groups(rows):
     return {name: found for name, found in named.items() if found}
 
 
-def missed(rows):
+def missed(rows, methods=LISTED):
+    """(row, ratio) of each motion that is not within what is wanted, of some methods."""
+    found = ratios(rows)
+    return [pair for m in methods for pair in found[m] if pair[1] > WANTED[m]]
+
+
+def missed_lines(rows):
     """Lines about each motion that is not within what is wanted, of the methods `LISTED`."""
-    lines, found = [], ratios(rows)
-    for method in LISTED:
-        for row, ratio in found[method]:
-            if ratio > WANTED[method]:
-                modes = ", ".join(f"{f:.2f}" for f in row["frequencies"])
-                where = f"{row['arm']}, motion {row['motion']}"
-                lines.append(f"- {method}: {ratio:.2f} of unshaped; {where}; measured {modes} Hz")
+    lines = []
+    for row, ratio in missed(rows):
+        modes = ", ".join(f"{f:.2f}" for f in row["frequencies"])
+        where = f"{row['arm']}, motion {row['motion']}"
+        lines.append(f"- {row['method']}: {ratio:.2f} of unshaped; {where}; measured {modes} Hz")
     return lines
+
+
+def time_table(found):
+    """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
+    columns = ("motion", *(f"{times:g} periods" for times in TIMES))
+    named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
+    return table(columns, named)
 
 
 def text(rows):
@@ -95,7 +109,7 @@ def text(rows):
         lines += [*table(COLUMNS, summary(found)), ""]
         if silent:
             lines += [f"No mode was found in the ringing of {len(silent)} motions.", ""]
-    lines += ["Not within what is wanted, of retimed:", "", *(missed(rows) or ["- none"])]
+    lines += ["Not within what is wanted, of retimed:", "", *(missed_lines(rows) or ["- none"])]
     return "\n".join(lines)
 
 

@@ -179,7 +179,7 @@ def _ascending(found, count):
     return modes[:, np.argsort(modes[0])]
 
 
-def retimed(motion, along, off=1.0):
+def retimed(motion, along, off=1.0, periods=1.0):
     """A motion with a new time law for the modes at its start, middle and end.
 
     Parameters
@@ -189,11 +189,14 @@ def retimed(motion, along, off=1.0):
         As of `rows`.
     off : float
         Factor of the frequencies: how wrong they are taken to be [-].
+    periods : float
+        How much longer the motion may get, in periods of the lowest mode.
     """
     frequencies, dampings = along
     where = motion.start + np.linspace(0.0, 1.0, len(frequencies))[:, None] * motion.angle
     settings = {
         "type": modes_module.RETIMED,
+        "periods": periods,
         "frequencies": (off * frequencies).ravel().tolist(),
         "dampings": dampings.ravel().tolist(),
         "configurations": where.ravel().tolist(),
@@ -295,3 +298,31 @@ def run(case):
                 }
             )
     return out
+
+
+def in_more_time(case, number, times):
+    """What `retimed` leaves of a motion of a case when it may get longer by more than a period.
+
+    Parameters
+    ----------
+    case : cases.Case
+    number : int
+        Of the motion.
+    times : sequence of float
+        Periods of the lowest mode that are added, each at most 3.
+
+    Returns
+    -------
+    list of float
+        Residual over that of the trapezoid for each of `times` [-].
+    """
+    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
+    motion = case.motions[number]
+    end = measured(arm, motion.end, motion.angle, case.period)
+    start = measured(arm, motion.start, -motion.angle, case.period)
+    middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
+    along = rows(end, (middle, start))
+    window = WINDOW * case.period
+    unshaped = arm.follow(motion, window).residual(window)
+    given = (retimed(motion, along, periods=periods) for periods in times)
+    return [arm.follow(each, window).residual(window) / unshaped for each in given]
