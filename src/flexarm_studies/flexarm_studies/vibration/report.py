@@ -94,7 +94,7 @@ def missed_lines(rows):
 
 def time_table(found):
     """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
-    columns = ("motion", *(f"{times:g} periods" for times in TIMES))
+    columns = ("motion", *(f"{times:g} period{'s' * (times != 1.0)}" for times in TIMES))
     named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
     return table(columns, named)
 
