@@ -188,11 +188,12 @@ def streamed(s):
     allowed = "allow_nonzero_velocity_at_trajectory_end"
     assert all(r.successful for r in s.set("controller", **{allowed: True, "speed_scaling": 0.5}))
     lines = s.log("controller").count("accepted")
-    for k in range(1, 9):
-        number, t = s.arm.state.accepted_trajectory_id, 0.1 * k
+    for _ in range(8):
+        number, here = s.arm.state.accepted_trajectory_id, s.arm.state.reference_position[0]
         message = JointTrajectory(joint_names=["joint1"])
-        point = JointTrajectoryPoint(positions=[0.05 * t**3], velocities=[0.15 * t**2])
-        set_stamp(point.time_from_start, 100_000_000)
+        # Slow enough to be possible from rest, too: in lockstep the arm may stop before the next point is there.
+        point = JointTrajectoryPoint(positions=[here + 0.002], velocities=[0.01])
+        set_stamp(point.time_from_start, 200_000_000)
         message.points.append(point)
         s.publish(message)
         s.until("it", lambda number=number: s.arm.state.accepted_trajectory_id > number)
