@@ -22,7 +22,9 @@ def dumped(node):
         for part in path:
             at = at.setdefault(part, {})
         value = node.get_parameter(name).value
-        at[last] = value.tolist() if hasattr(value, "tolist") else value
+        # A list of its own each, as the service's answer has: YAML would write an alias.
+        value = value.tolist() if hasattr(value, "tolist") else value
+        at[last] = list(value) if isinstance(value, list) else value
     return yaml.dump({f"/{node.get_name()}": {"ros__parameters": tree}}, default_flow_style=False)
 
 

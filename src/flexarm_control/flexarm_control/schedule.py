@@ -97,6 +97,8 @@ class Schedule:
         ParameterError
             For another number of sets than of configurations.
         """
+        if not size:  # a rigid arm has no modes to feed back
+            return np.zeros((self.count, 0))
         rows = np.array(values, float).reshape(-1, size)
         if len(rows) == self.count:
             return rows

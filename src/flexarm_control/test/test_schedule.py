@@ -151,3 +151,8 @@ def test_a_design_of_two_links_holds_at_every_place_that_it_names():
         assert np.abs(eigenvalues(loop, K)[1]).max() < 1.0
     values = found.parameters()
     assert len(values["slow.stiffness"]) == 4 and values["fast.schedule"] == [0.0, 0.4, 0.0, 0.9]
+
+
+def test_a_rigid_arm_has_sets_without_gains_for_modes():
+    rigid = build(arm_file.load("rigid"))
+    assert Schedule(rigid, ()).sets([1.0], 0, "gain").shape == (1, 0)

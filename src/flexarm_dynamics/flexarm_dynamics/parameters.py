@@ -267,6 +267,8 @@ def check_all(declared, values, sizes=None, prefix=""):
 def merge(*groups):
     """Declarations of several components under one prefix; a name means one thing.
 
+    Where one takes sets and another a single set, the name takes sets; each component checks its own.
+
     `groups` are sequences of `Parameter`.
 
     Raises
@@ -278,14 +280,22 @@ def merge(*groups):
     for group in groups:
         for parameter in group:
             other = merged.setdefault(parameter.name, parameter)
-            if (other.kind, other.length, other.unit) != (
-                parameter.kind,
-                parameter.length,
-                parameter.unit,
-            ):
+            if parameter.length == f"{other.length}{SETS}":
+                merged[parameter.name] = parameter
+            if _meaning(other) != _meaning(parameter):
                 raise ParameterError(
                     f"is declared twice, as {other.kind} [{other.unit}] and as {parameter.kind} [{parameter.unit}]",
                     field=parameter.name,
                     hint="rename it in one of the components",
                 )
     return tuple(merged.values())
+
+
+def _meaning(parameter):
+    """What two declarations of one name must have in common."""
+    length = parameter.length
+    return (
+        parameter.kind,
+        length.rstrip(SETS) if isinstance(length, str) else length,
+        parameter.unit,
+    )

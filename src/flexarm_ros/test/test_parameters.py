@@ -3,6 +3,7 @@
 
 import math
 import os
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -247,6 +248,8 @@ def test_the_warning_goes_to_the_log_of_the_node(make, capfd):
 
 def test_a_name_that_two_laws_share_is_one_parameter_and_must_mean_one_thing():
     assert merge((KP, GAIN), (KP, ALPHA)) == (KP, GAIN, ALPHA)
+    sets = replace(KP, length="joints*")
+    assert merge((KP, GAIN), (sets,)) == merge((sets, GAIN), (KP,)) == (sets, GAIN)
     other = Parameter("kp", "float_array", [1.0], "Something else.", unit="N m", length="joints")
     with pytest.raises(ParameterError, match=r"kp: is declared twice.*\[1/s\^2\].*\[N m\]"):
         merge((KP,), (other,))
