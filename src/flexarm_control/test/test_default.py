@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The default control: when an arm gets a design, what is kept of designs, and that hand-given values stay."""
 
+import ast
 import json
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import pytest
 
@@ -96,6 +98,18 @@ def test_other_code_is_another_design(monkeypatch):
     before = cache.key(ARM, *TASK)
     monkeypatch.setattr(cache, "version", lambda: "later")
     assert cache.key(ARM, *TASK) != before
+
+
+def test_the_code_that_names_a_design_has_all_that_gains_follow_from():
+    """A module of another package that the design imports is in `TAKEN`, but for verdicts and declarations."""
+    imported = {
+        node.module
+        for path in Path(cache.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.level == 2
+    }
+    other = {"kernels", "composite.design", "loop.samples", "trajectory"}
+    assert {f"{name}.py" for name in imported - other} == set(cache.TAKEN)
 
 
 def _cut(text):

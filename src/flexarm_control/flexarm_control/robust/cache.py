@@ -18,15 +18,19 @@ from flexarm_dynamics.kernels.load import cache_directory
 
 #: Fields of an arm that change no design.
 WORDS = ("name", "description", "source")
+#: Modules beside this package that a design's gains follow from.
+TAKEN = ("fading.py", "low_pass.py", "schedule.py")
 
 
 @once
 def version():
-    """Hash of the source code that designs: this package, and the models of `flexarm_dynamics`."""
-    code = hashlib.sha256()
-    for folder in (Path(__file__).parent, Path(flexarm_dynamics.__file__).parent):
-        for path in sorted(folder.rglob("*.py")):
-            code.update(path.read_bytes())
+    """Hash of the source code that designs: this package, what it takes of others, and `flexarm_dynamics`."""
+    code, here = hashlib.sha256(), Path(__file__).parent
+    paths = [here.parent / name for name in TAKEN]
+    for folder in (here, here.parent / "kernels", Path(flexarm_dynamics.__file__).parent):
+        paths += sorted(folder.rglob("*.py"))
+    for path in paths:
+        code.update(path.read_bytes())
     return code.hexdigest()
 
 
