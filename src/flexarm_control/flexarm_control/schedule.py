@@ -89,6 +89,13 @@ class Schedule:
             kernels.compiled().weights_between(q, self.at, self._matters, self._weights)
         return self._weights
 
+    def blend(self, q, sets, out):
+        """Fill `out`, (size,), with the mean of `sets`, (count, size), at q (n,). The control path."""
+        if self.count > 1:
+            np.dot(self.weights(q), sets, out=out)
+        else:
+            out[:] = sets[0]
+
     def sets(self, values, size, field):
         """Values of a parameter as sets, (count, size); one set stands for all.
 

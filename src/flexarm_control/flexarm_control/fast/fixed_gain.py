@@ -51,7 +51,7 @@ class FixedGain(FastLaw):
         return self._low_pass(self.gain(q) @ z_f)
 
     def gain(self, q):
-        np.dot(self._schedule.weights(q), self._sets, out=self._now.reshape(-1))
+        self._schedule.blend(q, self._sets, self._now.reshape(-1))
         return self._now
 
     def state_space(self, dt):

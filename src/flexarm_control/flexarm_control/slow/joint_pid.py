@@ -36,8 +36,6 @@ class JointPid(SlowLaw):
 
     Attributes
     ----------
-    stiffness, damping, gain : ndarray, shape (n,)
-        K_q, K_qd and K_w of the last sample.
     integral : ndarray, shape (n,)
         w [N m].
     """
@@ -66,13 +64,27 @@ class JointPid(SlowLaw):
         n = model.n_joints
         self._schedule = Schedule(model, self.parameters["schedule"], "slow.schedule")
         sets = [self._schedule.sets(self.parameters[k], n, f"slow.{k}") for k in GAINS]
-        self._sets = tuple(sets)
-        self.stiffness, self.damping, self.gain = (rows[0].copy() for rows in sets)
+        self._sets, self._gains = np.hstack(sets), np.array([rows[0] for rows in sets])
         self._limit, most = model.arm.torque_limits, np.array(self.parameters["integral_torque"])
         self._most = np.where(most > 0.0, most, self._limit)
         self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
         self._known = b"", np.zeros(n)
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
+
+    @property
+    def stiffness(self):
+        """K_q of the last sample, (n,) [N m/rad]."""
+        return self._gains[0]
+
+    @property
+    def damping(self):
+        """K_qd of the last sample, (n,) [N m s/rad]."""
+        return self._gains[1]
+
+    @property
+    def gain(self):
+        """K_w of the last sample, (n,) [N m/(rad s)]."""
+        return self._gains[2]
 
     def reset(self):
         self._low_pass.reset()
@@ -96,15 +108,11 @@ class JointPid(SlowLaw):
         return self._on(reference) + self.feedback(q, qd, reference)
 
     def feedback(self, q, qd, motion):
-        if self._schedule.count > 1:
-            weights = self._schedule.weights(q)
-            for rows, now in zip(
-                self._sets, (self.stiffness, self.damping, self.gain), strict=True
-            ):
-                np.dot(weights, rows, out=now)
+        self._schedule.blend(q, self._sets, self._gains.reshape(-1))
+        stiffness, damping, _ = self._gains
         np.subtract(motion.position, q, out=self._error)
-        u = self.stiffness * self._error
-        u += self.damping * (motion.velocity - qd)
+        u = stiffness * self._error
+        u += damping * (motion.velocity - qd)
         u += self.integral
         return self._low_pass(u)
 
