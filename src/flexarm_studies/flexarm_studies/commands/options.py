@@ -100,6 +100,19 @@ def numbers(option, text, separator=","):
     return values
 
 
+def span(text, option):
+    """Beginning and end of ``FROM:TO``; None of nothing."""
+    if not text:
+        return None
+    try:
+        start, end = (float(word) for word in text.split(":"))
+    except ValueError:
+        start, end = 1.0, 0.0
+    if not start < end < np.inf:
+        raise FlexarmError("is no part", field=option, value=text, limit="FROM:TO, as 14:60")
+    return start, end
+
+
 def angles(text, arm, option):
     """Joint angles written as ``q1,q2,...``; zero if none are given [rad]."""
     n = len(arm.joints)

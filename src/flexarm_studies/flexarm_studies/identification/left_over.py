@@ -16,6 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 
+from ..commands.options import span
 from ..recordings import mapping as mappings
 from ..recordings.motion import CORNER
 from . import recording as recordings
@@ -134,11 +135,6 @@ def lines(arm, whole, gauge, fit, score, band):
     )
 
 
-def _pair(words):
-    first, last = (float(word) for word in words.split(":"))
-    return first, last
-
-
 def main(words=None):
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -147,13 +143,14 @@ def main(words=None):
     mappings.add_option(parser)
     parser.add_argument("--gauge", required=True)
     for option in ("--fit", "--score"):
-        parser.add_argument(option, type=_pair, required=True, metavar="FROM:TO", help="[s]")
-    parser.add_argument("--band", type=_pair, required=True, metavar="FROM:TO", help="[Hz]")
+        parser.add_argument(option, required=True, metavar="FROM:TO", help="[s]")
+    parser.add_argument("--band", required=True, metavar="FROM:TO", help="[Hz]")
     options = parser.parse_args(words)
     try:
         arm = arm_file.load(options.arm)
         whole = recordings.read_csv(options.recording, arm, mappings.of_options(options))
-        for line in lines(arm, whole, options.gauge, options.fit, options.score, options.band):
+        spans = [span(getattr(options, k), f"--{k}") for k in ("fit", "score", "band")]
+        for line in lines(arm, whole, options.gauge, *spans):
             print(line, flush=True)
     except FlexarmError as error:
         sys.exit(f"left_over: {error}")

@@ -19,6 +19,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
+from ..commands import options as options_of
 from ..loop import parameter_files
 from ..recordings import mapping as mappings
 from . import recording as recordings
@@ -115,11 +116,6 @@ def text(table, names):
         yield f"| {name} | {' | '.join(f'{MICRO * v:.2f}' for v in rms)} |"
 
 
-def _span(words):
-    start, end = (float(word) for word in words.split(":"))
-    return start, end
-
-
 def main(words=None):
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -129,10 +125,9 @@ def main(words=None):
     parser.add_argument(
         "--observer", required=True, metavar="FILE", help="its parameters, as of a controller file"
     )
-    parser.add_argument("--fit", type=_span, required=True, metavar="FROM:TO", help="[s]")
+    parser.add_argument("--fit", required=True, metavar="FROM:TO", help="[s]")
     parser.add_argument(
         "--score",
-        type=_span,
         required=True,
         metavar="FROM:TO",
         help="[s], from the end of --fit on",
@@ -151,14 +146,13 @@ def main(words=None):
 
 
 def _compared(options):
-    if options.fit[1] != options.score[0]:
-        raise FlexarmError(
-            "does not follow --fit", field="--score", value=options.score[0], limit=options.fit[1]
-        )
+    fit, score = (options_of.span(getattr(options, k), f"--{k}") for k in ("fit", "score"))
+    if fit[1] != score[0]:
+        raise FlexarmError("does not follow --fit", field="--score", value=score[0], limit=fit[1])
     arm = arm_file.load(options.arm)
     whole = recordings.read_csv(options.recording, arm, mappings.of_options(options))
-    run = whole.between(options.fit[0], options.score[1])
-    fitted = round((options.fit[1] - options.fit[0]) / run.period)
+    run = whole.between(fit[0], score[1])
+    fitted = round((fit[1] - fit[0]) / run.period)
     table = compare(arm, observer_parameters(options.observer), run, fitted, options.order)
     return table, arm.gauge_names
 

@@ -10,6 +10,7 @@ import numpy as np
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies import workers
+from flexarm_studies.commands.options import span
 from flexarm_studies.identification.fit_state import FitState, key_of
 from flexarm_studies.identification.strain_fit import STARTS, Options
 from flexarm_studies.identification.strain_study import Study, study
@@ -151,21 +152,6 @@ def identify(options, arm, measured, progress):
     )
     result |= {"score_file": options.score_file}
     return found, result | summary(found, measured, options.recording), more
-
-
-def span(text, option):
-    """Beginning and end [s] of ``FROM:TO``; None of nothing."""
-    if not text:
-        return None
-    try:
-        start, end = (float(word) for word in text.split(":"))
-    except ValueError:
-        start, end = 1.0, 0.0
-    if not start < end < np.inf:
-        raise FlexarmError(
-            "is no part", field=option, value=text, limit="FROM:TO in seconds, as 14:60"
-        )
-    return start, end
 
 
 def summary(found, measured, source):
