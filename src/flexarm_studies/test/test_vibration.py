@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose
 
 from flexarm_dynamics.models import model
 from flexarm_sim.plant import Plant
-from flexarm_studies.vibration import cases, pushes, report, study
-from flexarm_studies.vibration.position_arm import MAX_SUBSTEPS, PositionArm
+from flexarm_studies.vibration import cases, figure, pushes, report, study
+from flexarm_studies.vibration.position_arm import MAX_SUBSTEPS, PositionArm, Swing
 from flexarm_studies.vibration.time_laws import jerk_limited, resampled, trapezoid
 
 
@@ -153,3 +153,13 @@ def test_the_table_of_pushes_has_times_and_factors():
     assert row["phase, degrees"] == pytest.approx(90.0)
     assert row["largest correction, mrad"] == pytest.approx(4.0)
     assert (row["IMU: faster"], row["IMU: after a motion"]) == (4.0, 0.3)
+
+
+def test_the_figures_zero_is_where_the_tip_comes_to_rest_not_where_it_is_last():
+    """A tip that comes along -x and still swings by 10 mm when the record ends."""
+    time = np.arange(0.0, 6.0, 0.008)
+    after = np.clip(time - 1.0, 0.0, None)
+    x = np.where(time < 1.0, 1.0 - time, -0.01 * np.sin(2.0 * np.pi * after / 0.8))
+    along = figure.way(Swing(time, 0.3 + np.outer(x, [1.0, 0.0, 0.0]), 1.0, False), 0.8)
+    assert along[0] == pytest.approx(-1.0, abs=1e-3)
+    assert along == pytest.approx(-x, abs=1e-3)

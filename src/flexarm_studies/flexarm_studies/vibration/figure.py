@@ -26,7 +26,7 @@ def draw(path, seed=0):
         figure, axes = plt.subplots()
         for method, colour in SHOWN.items():
             swing = arm.follow(given[method], AFTER * case.period)
-            _tip(axes, swing, method, colour)
+            _tip(axes, swing, 1.0 / found.frequencies.min(), method, colour)
         axes.set_xlabel("time from the start of the motion [s]")
         axes.set_ylabel("tip, from where it comes to rest [mm]")
         frequency = found.frequencies.min()
@@ -35,13 +35,28 @@ def draw(path, seed=0):
         return plotting.save(figure, path)
 
 
-def _tip(axes, swing, method, colour):
-    """The tip along the direction in which it swings."""
-    away = swing.tip - swing.tip[-1]
-    after = away[swing.time >= swing.end]
-    direction = np.linalg.svd(after, full_matrices=False)[2][0]
-    axes.plot(swing.time, 1e3 * away @ direction, color=colour, label=method)
+def way(swing, period):
+    """How far the tip still is from where it comes to rest, along the direction in which it swings, (k,) [m].
+
+    Parameters
+    ----------
+    swing : Swing
+        Of several periods after the motion.
+    period : float
+        That it swings with, about whose mean it does [s].
+    """
+    rest = swing.tip[swing.time > swing.time[-1] - period].mean(axis=0)
+    away = swing.tip - rest
+    direction = np.linalg.svd(away[swing.time >= swing.end], full_matrices=False)[2][0]
+    along = away @ direction
+    return along if along[0] < 0.0 else -along
+
+
+def _tip(axes, swing, period, method, colour):
+    """The tip on the last part of its way, and as it swings."""
+    along = 1e3 * way(swing, period)
+    axes.plot(swing.time, along, color=colour, label=method)
     axes.axvline(swing.end, color=colour, linestyle=":", linewidth=0.8)
-    span = 3e3 * np.abs(after @ direction).max()
     if method == "trapezoid":
+        span = 3.0 * np.abs(along[swing.time >= swing.end]).max()
         axes.set_ylim(-span, span)
