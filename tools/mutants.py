@@ -470,8 +470,8 @@ LAWS = [
         (
             "fixed_gain",
             "rows and columns of the gain",
-            "out=self._now.reshape(-1))",
-            "out=self._now.T.reshape(-1))",
+            "self._sets, self._now.reshape(-1))",
+            "self._sets, self._now.T.reshape(-1))",
         ),
         ("scheduled_lqr", "interpolation", "for v in (1.0 - t, t)]", "for v in (t, 1.0 - t)]"),
     ),

@@ -183,8 +183,8 @@ def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--fit", "8"), "FROM:TO in seconds"),
-        (("--fit", "9:8"), "FROM:TO in seconds"),
+        (("--fit", "8"), "FROM:TO, as 14:60"),
+        (("--fit", "9:8"), "FROM:TO, as 14:60"),
         (("--fit", "90:95"), "samples"),
         (("--above", "60"), "half of the rate"),
         (("--starts", "0"), "--starts"),
