@@ -79,7 +79,7 @@ class Session60:
         return values.get("last parameters set", "")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def session(tmp_path_factory):
     with Bench(tmp_path_factory.mktemp("log")) as bench:
         bench.diagnostics("controller")
@@ -191,11 +191,13 @@ def streamed(s):
     allowed = "allow_nonzero_velocity_at_trajectory_end"
     assert all(r.successful for r in s.set("controller", **{allowed: True, "speed_scaling": 0.5}))
     lines = s.log("controller").count("accepted")
-    for _ in range(8):
+    for k in range(8):
         number, here = s.arm.state.accepted_trajectory_id, s.arm.state.reference_position[0]
         message = JointTrajectory(joint_names=["joint1"])
-        # Slow enough to be possible from rest, too: in lockstep the arm may stop before the next point is there.
-        point = JointTrajectoryPoint(positions=[here + 0.002], velocities=[0.01])
+        # Slow enough to be possible from rest, too: in lockstep the arm may stop before the next point is there. And
+        # different each time, wherever the reference is: the same message again would be a repeat.
+        there = here + 0.002 + 1e-6 * k
+        point = JointTrajectoryPoint(positions=[there], velocities=[0.01])
         set_stamp(point.time_from_start, 200_000_000)
         message.points.append(point)
         s.publish(message)

@@ -47,12 +47,22 @@ class Unserved(CallbackGroup):
         """Nothing to do."""
 
 
+#: Longest that `taken` goes on [s]. Without an end, messages that arrive as fast as they are read would hold it for ever.
+LONGEST_TAKE = 0.1
+
+
 def taken(subscription, raw=False):
-    """Yield the messages that wait in a subscription's queue; serialised ones if `raw`."""
+    """Yield the messages that wait in a subscription's queue; serialised ones if `raw`.
+
+    It ends after `LONGEST_TAKE`, and the next call goes on with what is left.
+    """
     handle, kind = subscription.handle, subscription.msg_type
+    end = time.monotonic() + LONGEST_TAKE
     with handle:
         while (found := handle.take_message(kind, raw)) is not None:
             yield found[0]
+            if time.monotonic() > end:
+                return
 
 
 class Tap:

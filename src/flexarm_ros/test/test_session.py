@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session beside nodes: what it collects and calls, and that no wait outlives a process it needs."""
 
+import contextlib
 import os
 import time
 
@@ -10,6 +11,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_ros import session as session_of
 from flexarm_ros.session import Latest, Session, WaitError, parameter_messages, plain
 
 DOMAIN = 101
@@ -60,6 +62,27 @@ def test_a_death_that_is_waited_for_ends_the_wait(session):
         return calls[-1]
 
     assert session.wait_for("its end", ends_between_two_looks) == "done"
+
+
+class Flood(contextlib.nullcontext):
+    """A subscription, and its handle, with a message whenever one is taken."""
+
+    count, msg_type = 0, String
+
+    @property
+    def handle(self):
+        return self
+
+    def take_message(self, kind, raw):
+        self.count += 1
+        assert self.count < 10**6, "never ends"
+        return kind(), {}
+
+
+def test_messages_that_arrive_as_fast_as_they_are_read_do_not_hold_the_session(monkeypatch):
+    monkeypatch.setattr(session_of, "LONGEST_TAKE", 0.01)
+    flood = Flood()
+    assert len(list(session_of.taken(flood))) == flood.count > 0
 
 
 def test_taps_collect_in_order_and_latest_keeps_the_newest(session):
