@@ -47,17 +47,17 @@ class Unserved(CallbackGroup):
         """Nothing to do."""
 
 
-#: Longest that `taken` goes on [s]. Without an end, messages that arrive as fast as they are read would hold it for ever.
-LONGEST_TAKE = 0.1
+#: Longest that `taken` goes on [s]: messages that arrive as fast as they are read would hold it for ever.
+MAX_TAKE = 0.1
 
 
 def taken(subscription, raw=False):
     """Yield the messages that wait in a subscription's queue; serialised ones if `raw`.
 
-    It ends after `LONGEST_TAKE`, and the next call goes on with what is left.
+    It ends after `MAX_TAKE`, and the next call goes on with what is left.
     """
     handle, kind = subscription.handle, subscription.msg_type
-    end = time.monotonic() + LONGEST_TAKE
+    end = time.monotonic() + MAX_TAKE
     with handle:
         while (found := handle.take_message(kind, raw)) is not None:
             yield found[0]

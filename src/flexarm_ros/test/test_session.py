@@ -80,7 +80,7 @@ class Flood(contextlib.nullcontext):
 
 
 def test_messages_that_arrive_as_fast_as_they_are_read_do_not_hold_the_session(monkeypatch):
-    monkeypatch.setattr(session_of, "LONGEST_TAKE", 0.01)
+    monkeypatch.setattr(session_of, "MAX_TAKE", 0.01)
     flood = Flood()
     assert len(list(session_of.taken(flood))) == flood.count > 0
 

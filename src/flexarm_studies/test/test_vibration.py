@@ -123,6 +123,8 @@ def test_the_table_counts_what_is_within_what_is_wanted():
         report.time_table([(row, [0.3, 0.1, 0.05, 0.01])])[2]
         == "| x, motion 1 | 0.3 | 0.1 | 0.05 | 0.01 |"
     )
+    (line,) = report.trials_table([(row, [0.3, 0.1, 0.05, 0.01, 0.01, 0.01])])[2:]
+    assert line.startswith("| x, motion 1 | retimed | 0.1 | 0.3 | 0.1 | 0.05 |")
 
 
 @pytest.mark.slow
@@ -130,6 +132,12 @@ def test_in_more_time_less_is_left():
     case = cases.all_of(0)["payload x1"]()
     one, three = study.in_more_time(case, 0, (0.3, 1.0))
     assert three < 0.02 < one
+
+
+def test_corrections_in_trials_take_out_what_the_measured_modes_have_missed():
+    case = cases.random_arm(7)  # two modes of it come close half-way
+    before, *_, after = study.in_trials(case, 0, 3)
+    assert after < 0.05 < 0.1 < before
 
 
 def test_a_push_decays_five_times_faster_with_damping_by_strain():

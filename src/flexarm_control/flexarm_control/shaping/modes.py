@@ -9,6 +9,7 @@ joints (Shepard 1968),
 The result is smooth, equals f_c at q_c, and lies between the smallest and the largest everywhere.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,6 +163,13 @@ class Modes:
             Stage(train.times * f, train.amplitudes, mode)
             for mode, (train, f) in enumerate(zip(trains, frequencies, strict=True))
         )
+
+    def scaled(self, factors):
+        """The same with frequencies times `factors` (modes,), everywhere."""
+        other = copy.copy(self)
+        other.frequencies = self.frequencies * factors
+        other.stages = other._designed()
+        return other
 
     @property
     def varies(self):

@@ -97,10 +97,26 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
     PiecewiseMotion or None
         None where the motion is not straight, or there is no such time law within the limits.
     """
+    found = solved(motion, modes, velocity, acceleration)
+    return None if found is None else found[0].motion(found[2])
+
+
+def solved(motion, modes, velocity=np.inf, acceleration=np.inf):
+    """What `retimed` finds: the programme, what the given motion leaves (as of `Line.norms`), and the accelerations.
+
+    Parameters
+    ----------
+    motion, modes, velocity, acceleration
+        As of `retimed`.
+
+    Returns
+    -------
+    tuple of Law, list of (factors,) ndarrays, and (N - 1,) ndarray; or None
+    """
     progress = along(motion)
     if progress is None:
         return None
-    line = _Line(motion, modes, progress)
+    line = Line(motion, modes, progress)
     norms = line.norms()
     if not min(norm.min() for norm in norms) > 0.0:
         return None
@@ -108,19 +124,10 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
         min(own, float((np.asarray(limit) / np.maximum(np.abs(motion.angle), 1e-300)).min()))
         for own, limit in zip(line.own, (velocity, acceleration), strict=True)
     ]
-    duration = motion.duration + modes.periods / line.lowest
-    law = _Law(line, duration, limits)
+    law = Law(line, motion.duration + modes.periods / line.lowest, limits)
     times = np.linspace(*motion.knots[[0, -1]], law.middles.size)
     x = law.solution(norms, progress(0, times))
-    if x is None:
-        return None
-    states = law.states(x)
-    # Between two nodes the speed is a parabola, whose top may be above both.
-    slower = max(law.top(x) / limits[0], 1.0)
-    times = motion.knots[0] + slower * law.nodes
-    made = [values / slower**order for order, values in enumerate(states)]
-    made[0][-1], made[1][-1] = motion.end, 0.0
-    return PiecewiseMotion.through(times, made[: motion.fields])
+    return None if x is None else (law, norms, x)
 
 
 def stopped(motion, modes, time):
@@ -141,12 +148,12 @@ def stopped(motion, modes, time):
     progress = along(motion)
     if progress is None or time >= motion.knots[-1]:
         return motion
-    line = _Line(motion, modes, progress)
+    line = Line(motion, modes, progress)
     state = [float(progress(order, np.array([time]))[0]) for order in range(3)]
     norms = [np.full(FACTORS, line.own[1] / (2.0 * np.pi * line.lowest))] * line.modes_count
     duration = STOP * state[1] / line.own[1] + modes.periods / line.lowest
     while time + duration < motion.knots[-1]:
-        law = _Law(line, duration, line.own, state, time)
+        law = Law(line, duration, line.own, state, time)
         x = law.solution(norms, np.full(law.middles.size, state[0]))
         if x is not None:
             states = law.states(x)
@@ -157,7 +164,7 @@ def stopped(motion, modes, time):
     return motion
 
 
-class _Line:
+class Line:
     """The line of a motion, what the motion does on it, and the modes along it."""
 
     def __init__(self, motion, modes, progress):
@@ -207,12 +214,12 @@ class _Line:
         return found
 
 
-class _Law:
+class Law:
     """The linear programme of one time law, in the accelerations x (N - 1,) at the inner nodes.
 
     Parameters
     ----------
-    line : _Line
+    line : Line
     duration : float
         [s]
     limits : sequence of 2 floats
@@ -224,7 +231,7 @@ class _Law:
     """
 
     def __init__(self, line, duration, limits, state=None, time=None):
-        self._line, self._limits, self._stops = line, limits, state is not None
+        self._line, self.limits, self._stops = line, limits, state is not None
         self._state = np.zeros(3) if state is None else np.array(state)
         self._past = line.history(time) if self._stops else (np.zeros(0),) * 3
         self.count = int(np.clip(np.ceil(PER_PERIOD * duration * line.lowest), FEWEST, MOST))
@@ -244,6 +251,9 @@ class _Law:
         across = np.eye(self.count + 1)
         middle = self._speed[:-1] + self._step / 8.0 * (3.0 * across[:-1] + across[1:])
         self._speeds = np.vstack([self._speed[1:], middle])
+        #: What x adds to the speeds at and between the nodes, and to speed and progress at the end.
+        self.inner = self._speeds[:, 1:-1]
+        self.ends = np.stack([self._speed[-1, 1:-1], self._way[-1, 1:-1]])
 
     def states(self, x):
         """Positions, velocities and accelerations of the joints at the nodes, three (N + 1, n) arrays."""
@@ -254,6 +264,25 @@ class _Law:
         states = [values[:, None] * motion.angle for values in along]
         states[0] += motion.start
         return states
+
+    def motion(self, x):
+        """The motion from rest to rest by accelerations x, slowed down where its speed is too high between nodes."""
+        given = self._line.motion
+        # Between two nodes the speed is a parabola, whose top may be above both.
+        slower = max(self.top(x) / self.limits[0], 1.0)
+        made = [values / slower**order for order, values in enumerate(self.states(x))]
+        made[0][-1], made[1][-1] = given.end, 0.0
+        return PiecewiseMotion.through(given.knots[0] + slower * self.nodes, made[: given.fields])
+
+    def left(self, x, line):
+        """What each acceleration of x leaves of each mode of a `line`, along the motion by x, (m, N - 1) complex."""
+        found = line.left(self._middle_progress(x), self._steps, self._parts)
+        return np.array([values[FACTORS // 2, 1:] for values in found])
+
+    def _middle_progress(self, x):
+        bend = self._all(x)
+        sigma = self._state[0] + self._state[1] * self.nodes + self._way @ bend
+        return np.interp(self.middles, self.nodes, sigma)
 
     def _all(self, x):
         return np.concatenate([[self._state[2]], x, [0.0]])
@@ -283,9 +312,7 @@ class _Law:
             x = self._programme(left, norms)
             if x is None:
                 return None
-            bend = self._all(x)
-            sigma = self._state[0] + self._state[1] * self.nodes + self._way @ bend
-            sigma = np.interp(self.middles, self.nodes, sigma)
+            sigma = self._middle_progress(x)
         return x
 
     def _programme(self, left, norms):
@@ -299,8 +326,8 @@ class _Law:
         wanted[FACTORS // 2] = AT_DESIGN
         wanted = np.tile(wanted, DIRECTIONS * len(left))
         _, speed, bend = self._state
-        velocity, acceleration = self._limits
-        inner, own = self._speeds[:, 1:-1], speed + self._speeds[:, 0] * bend
+        velocity, acceleration = self.limits
+        inner, own = self.inner, speed + self._speeds[:, 0] * bend
         none = np.zeros((len(inner), 1))
         upper = [
             np.column_stack([rows[:, 1:], -wanted]),
@@ -310,12 +337,12 @@ class _Law:
         bounds = [-rows[:, 0], velocity * (1.0 + SLACK) - own, own + SLACK * velocity]
         way = self._way[-1]
         ahead = 1.0 - self._state[0] - speed * self.nodes[-1] - way[0] * bend
-        ends, values = [np.append(self._speed[-1, 1:-1], 0.0)], [-speed - self._speed[-1, 0] * bend]
+        ends, values = [np.append(self.ends[0], 0.0)], [-speed - self._speed[-1, 0] * bend]
         if self._stops:
-            upper.append(np.append(way[1:-1], 0.0)[None])
+            upper.append(np.append(self.ends[1], 0.0)[None])
             bounds.append([ahead])
         else:
-            ends.append(np.append(way[1:-1], 0.0))
+            ends.append(np.append(self.ends[1], 0.0))
             values.append(ahead)
         cost = np.zeros(self.count)
         cost[-1] = 1.0

@@ -43,6 +43,11 @@ def add_arguments(parser):
         action="store_true",
         help="what retimed leaves in more than a period, of the motions that it misses; --out has the results",
     )
+    add(
+        "--trials",
+        action="store_true",
+        help="what retimed leaves of the motions that it misses, corrected in trials; --out has the results",
+    )
     add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
 
 
@@ -60,10 +65,11 @@ def vibration(options):
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)
     rows = run(options.seed, options.count, options.out, options.workers, options.scheduler)
-    if options.more_time:
-        lines = report.time_table(_more_time(rows, options.count, options.seed))
+    if options.more_time or options.trials:
+        made = _more_time if options.more_time else _in_trials
+        lines, where = made(rows, options.count, options.seed)
         if options.write:
-            write_between(options.write, *report.TIME, "\n".join(lines))
+            write_between(options.write, *where, "\n".join(lines))
         print("\n".join(lines))
         return
     if options.write:
@@ -72,12 +78,28 @@ def vibration(options):
 
 
 def _more_time(rows, count, seed):
-    """Pairs of a row that `retimed` misses and what it leaves in `report.TIMES`."""
-    missed = [row for row, _ in report.missed(rows, ("retimed",))]
-    known = {case.name: case for case in (make() for make in cases.all_of(count, seed).values())}
-    return [
+    """The table of what `retimed` leaves in `report.TIMES` of what it misses, and the markers around it."""
+    known, missed = _missed(rows, count, seed, ("retimed",))
+    found = [
         (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
     ]
+    return report.time_table(found), report.TIME
+
+
+def _in_trials(rows, count, seed):
+    """The table of what `retimed` leaves after corrections of what it misses, and the markers around it."""
+    known, missed = _missed(rows, count, seed, report.LISTED)
+    found = [
+        (row, study.in_trials(known[row["arm"]], row["motion"], report.CORRECTIONS, off))
+        for row, off in ((row, study.OFFS[row["method"]]) for row in missed)
+    ]
+    return report.trials_table(found), report.TRIALS
+
+
+def _missed(rows, count, seed, methods):
+    """Cases by name, and the rows of some methods that are not within what is wanted."""
+    known = {case.name: case for case in (make() for make in cases.all_of(count, seed).values())}
+    return known, [row for row, _ in report.missed(rows, methods)]
 
 
 def run(seed, count, path=None, processes=None, scheduler=None):

@@ -10,6 +10,9 @@ BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
 #: Periods that a motion may get longer by, one as in the tables and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
+TRIALS = "<!-- trials: begin -->", "<!-- trials: end -->"
+#: Corrections of a motion that is made again and again.
+CORRECTIONS = 5
 #: What is wanted of a method: residual over that of the trapezoid [-].
 WANTED = {
     "robust": 0.1,
@@ -96,6 +99,16 @@ def time_table(found):
     """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
     columns = ("motion", *(f"{times:g} period{'s' * (times != 1.0)}" for times in TIMES))
     named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
+    return table(columns, named)
+
+
+def trials_table(found):
+    """Lines of the table of what `retimed` leaves after corrections: of pairs of a row and its residuals."""
+    columns = ("motion", "method", "wanted", *(f"{n} corrections" for n in range(CORRECTIONS + 1)))
+    named = (
+        (f"{row['arm']}, motion {row['motion']}", row["method"], WANTED[row["method"]], *least)
+        for row, least in found
+    )
     return table(columns, named)
 
 

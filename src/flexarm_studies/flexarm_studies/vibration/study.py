@@ -15,6 +15,7 @@ from flexarm_control.shaping import limited, time_law
 from flexarm_control.shaping import modes as modes_module
 from flexarm_control.shaping.modes import Modes
 from flexarm_control.shaping.shaped_motion import ShapedMotion
+from flexarm_control.shaping.trials import Ringing, Trials
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 
@@ -34,8 +35,12 @@ SAME = 0.12
 ALIKE = 0.02
 #: A mode changes at most by this factor from one configuration on the way to the next.
 CHANGE = 2.0
+#: The tip is recorded for so much longer than it is looked at [s].
+LATE = 0.02
 #: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
+#: Factors of the frequencies for the methods by a new time law [-].
+OFFS = {"retimed": 1.0, "retimed -15 %": 1.0 - OFF, "retimed +15 %": 1.0 + OFF}
 METHODS = (
     "trapezoid",
     "TOTG 0.1 s",
@@ -192,6 +197,12 @@ def retimed(motion, along, off=1.0, periods=1.0):
     periods : float
         How much longer the motion may get, in periods of the lowest mode.
     """
+    modes = _modes(motion, along, off, periods)
+    return time_law.retimed(motion, modes) or Shaped(ShapedMotion(motion, modes))
+
+
+def _modes(motion, along, off, periods=1.0):
+    """The `Modes` of `retimed`."""
     frequencies, dampings = along
     where = motion.start + np.linspace(0.0, 1.0, len(frequencies))[:, None] * motion.angle
     settings = {
@@ -201,8 +212,7 @@ def retimed(motion, along, off=1.0, periods=1.0):
         "dampings": dampings.ravel().tolist(),
         "configurations": where.ravel().tolist(),
     }
-    modes = Modes(check_all(modes_module.PARAMETERS, settings), motion.start.size)
-    return time_law.retimed(motion, modes) or Shaped(ShapedMotion(motion, modes))
+    return Modes(check_all(modes_module.PARAMETERS, settings), motion.start.size)
 
 
 def quickest(motion, rise):
@@ -251,9 +261,7 @@ def candidates(motion, found, middle, other):
         "robust, both ends": shaped(motion, "robust", both),
         "robust, both ends -15 %": shaped(motion, "robust", both, 1.0 - OFF),
         "robust, both ends +15 %": shaped(motion, "robust", both, 1.0 + OFF),
-        "retimed": retimed(motion, along),
-        "retimed -15 %": retimed(motion, along, 1.0 - OFF),
-        "retimed +15 %": retimed(motion, along, 1.0 + OFF),
+        **{method: retimed(motion, along, off) for method, off in OFFS.items()},
     }
 
 
@@ -316,13 +324,57 @@ def in_more_time(case, number, times):
     list of float
         Residual over that of the trapezoid for each of `times` [-].
     """
+    arm, motion, _, along, unshaped = _prepared(case, number)
+    window = WINDOW * case.period
+    given = (retimed(motion, along, periods=periods) for periods in times)
+    return [arm.follow(each, window).residual(window) / unshaped for each in given]
+
+
+def _prepared(case, number):
+    """The arm of a case, a motion by its number, the modes at its end and along it, and what it leaves [m]."""
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion = case.motions[number]
     end = measured(arm, motion.end, motion.angle, case.period)
     start = measured(arm, motion.start, -motion.angle, case.period)
     middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
-    along = rows(end, (middle, start))
-    window = WINDOW * case.period
-    unshaped = arm.follow(motion, window).residual(window)
-    given = (retimed(motion, along, periods=periods) for periods in times)
-    return [arm.follow(each, window).residual(window) / unshaped for each in given]
+    unshaped = arm.follow(motion, WINDOW * case.period).residual(WINDOW * case.period)
+    return arm, motion, end, rows(end, (middle, start)), unshaped
+
+
+def in_trials(case, number, count, off=1.0):
+    """What `retimed` leaves of a motion of a case that is made again and again, corrected by its own ringing.
+
+    Parameters
+    ----------
+    case : cases.Case
+    number : int
+        Of the motion.
+    count : int
+        Trials with a correction.
+    off : float
+        Factor of the frequencies: how wrong they are taken to be [-].
+
+    Returns
+    -------
+    list of float
+        The least residual over that of the trapezoid, before the first correction and after each [-].
+    """
+    arm, motion, end, along, unshaped = _prepared(case, number)
+    order = np.argsort(end.frequencies)
+    ringing = Ringing(end.frequencies[order], end.dampings[order])
+    look = max(WINDOW * case.period, ringing.window) + LATE
+    kick = trapezoid(motion.end - KICK * motion.angle, motion.end, KICK_PERIODS * case.period)
+    answer = ringing.answer(kick, motion, *_after(arm.follow(kick, look)))
+    trials = Trials(motion, _modes(motion, along, off), ringing, answer)
+    least = []
+    for _ in range(count + 1):
+        swing = arm.follow(trials.motion, look)
+        trials.took(*_after(swing), swing.residual(WINDOW * case.period) / unshaped)
+        least.append(trials.least)
+    return least
+
+
+def _after(swing):
+    """Times from the end of a motion [s], and the tip then [m]."""
+    after = swing.time >= swing.end
+    return swing.time[after] - swing.end, swing.tip[after]
