@@ -29,6 +29,7 @@ from ..shaping.stream import StreamShaper
 from ..shaping.trajectory_shaper import TrajectoryShaper
 from . import stream_damping
 from .shaper_goals import ShaperGoals
+from .shaping_job import AHEAD, Job, ShapingJob, attempt
 from .stream_damping import StreamDamping
 from .trajectory_inbox import rows
 
@@ -94,6 +95,8 @@ class ShaperNode(ArmNode):
         self._bypass = self._wanted = self._changed = False
         own = self._make_shapers()
         self.core = self._shapers[False]
+        self.job = self._keep(lambda job: job.close(), ShapingJob(self))
+        self._workers = (self.job,)
         self.parameters.judged_by(self._refuse_unfit)
         self.parameters.on_change(self._on_change)
         self._measured, self._measured_at = None, -math.inf
@@ -150,6 +153,7 @@ class ShaperNode(ArmNode):
         self._publish_state()
 
     def stop(self):
+        self.job.drop("the shaper was stopped")
         self._goals.close()
 
     def now_ns(self):
@@ -159,33 +163,39 @@ class ShaperNode(ArmNode):
     # Trajectories ----------------------------------------------------------------------------
 
     def _on_trajectory(self, msg):
-        if not self.active:
-            return
-        try:
-            self._send(self.shape(msg))
-        except TrajectoryError as error:
-            self.get_logger().warning(f"trajectory refused: {error}")
-            return
+        if self.active:
+            self.shape(msg, self._passed_on, self._refused)
+
+    def _passed_on(self, message):
+        self._send(message)
         self._goals.replaced()
+
+    def _refused(self, error):
+        self.get_logger().warning(f"trajectory refused: {error}")
 
     def _send(self, message):
         """Pass a shaped trajectory on, unless it is played."""
         if not self.plays:
             self._trajectories.publish(message)
 
-    def shape(self, msg):
-        """The shaped trajectory that takes the place of one; without points: a stop, as the controller has it.
+    def shape(self, msg, done, refused):
+        """Shape a trajectory that takes the place of one; without points: a stop, as the controller has it.
 
-        Raises
-        ------
-        TrajectoryError
-            Where it can't be used; nothing changes then, but the state says it.
+        Where a new time law is to be made, that is done in a thread, and what moves goes on meanwhile.
+
+        Parameters
+        ----------
+        msg : JointTrajectory
+        done, refused : callable
+            Called with the shaped message once it begins, or with a `TrajectoryError`; nothing changes then, but the
+            state has the reason.
         """
         now = self.now_ns()
         self._settle(now)
         if not msg.points:
-            stopped = self.stopping("asked for by a trajectory without points")
-            return msg if stopped is None else stopped
+            if not self.stopping("asked for by a trajectory without points", done):
+                done(msg)
+            return
         try:
             data = trajectory.validate(
                 msg.joint_names,
@@ -193,11 +203,37 @@ class ShaperNode(ArmNode):
                 msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec,
                 self._rows(msg),
             )
-            shaped = self.core.offer(data, now, self._where())
+            where = self._where()
         except TrajectoryError as error:
-            self._state.rejected_reason = str(error)
-            self._publish_state()
-            raise
+            self._reject(error, refused)
+            return
+        core = self.core.snapshot()
+        self._work_on(
+            lambda begin, quick: core.prepared(data, begin, where, quick),
+            lambda plan: self._accept(plan, data.stamp_ns, done),
+            lambda error: self._reject(error, refused),
+        )
+
+    def _work_on(self, prepare, done, refused):
+        """Have ``prepare(begin_ns, quick)`` make a plan, in a thread if it may take long."""
+        now, core = self.now_ns(), self.core
+        due = now + AHEAD if core.takes_long and core.moving(now + AHEAD) else None
+        begin = now if due is None else due
+        job = Job(lambda: prepare(begin, False), lambda: prepare(begin, True), due, done, refused)
+        if core.takes_long:
+            self.job.begin(job)
+        else:
+            job.put(attempt(job.prepare))
+            job.answer()
+
+    def _reject(self, error, refused):
+        self._state.rejected_reason = str(error)
+        self._publish_state()
+        refused(error)
+
+    def _accept(self, plan, stamp_ns, done):
+        """Take a plan of a trajectory with a stamp [ns], and pass it on by `done`."""
+        shaped = self.core.take(plan, self.now_ns() if self.core.takes_long else 0)
         state = self._state
         state.trajectory_id += 1
         state.rejected_reason = state.stopped = ""
@@ -207,7 +243,7 @@ class ShaperNode(ArmNode):
         if shaped.stretch > 1.0:
             text = f"slowed down {shaped.stretch:.4g} times to keep its limits"
             self.report(f"trajectory {state.trajectory_id} {text}", info=True)
-        return self._message(shaped, data.stamp_ns)
+        done(self._message(shaped, stamp_ns))
 
     def _rows(self, msg):
         """Points of a trajectory; where the node makes the time law, without speeds, and also without times."""
@@ -220,14 +256,41 @@ class ShaperNode(ArmNode):
             for i, row in enumerate(given)
         ]
 
-    def stopping(self, reason):
-        """The trajectory that stops the motion under way, None where nothing moves; the state gives the `reason`."""
-        shaped = self.core.stop(self.now_ns())
-        if shaped is None:
-            return None
-        self._state.stopped = reason
-        self._moves_until(shaped)
-        return self._message(shaped, 0)
+    def stopping(self, reason, done):
+        """Stop what moves, and what is being worked on; whether there is anything.
+
+        Parameters
+        ----------
+        reason : str
+            For the state.
+        done : callable
+            Called with the trajectory that stops the motion under way, where there is one.
+        """
+        dropped, now = self.job.drop(f"stopped before it began: {reason}"), self.now_ns()
+        if not self.core.moving(now):
+            return dropped
+
+        def stops(plan):
+            if plan is None:  # the motion has ended meanwhile
+                return
+            shaped = self.core.take(plan)
+            self._state.stopped = reason
+            self._moves_until(shaped)
+            done(self._message(shaped, 0))
+
+        core = self.core.snapshot()
+        self._work_on(
+            lambda begin, quick: core.prepared_stop(begin, quick), stops, self._not_stopped
+        )
+        return True
+
+    def _not_stopped(self, error):
+        self.get_logger().warning(f"the motion does not stop: {error}")
+
+    def lost(self):
+        """The controller does not follow what was sent: the joints are elsewhere."""
+        self.job.drop("the motion before it was not followed to its end")
+        self.core.forget()
 
     def _moves_until(self, shaped):
         set_stamp(self._state.end, shaped.end_ns)
@@ -305,7 +368,7 @@ class ShaperNode(ArmNode):
         stream = self._streams[self._bypass]
         if self._bypass == self._wanted and not self._changed:
             return
-        if self.core.moving(now_ns) or not stream.settled():
+        if self.job.busy or self.core.moving(now_ns) or not stream.settled():
             return
         if self._changed:
             self._state.shaper = self._make_shapers().kind
@@ -318,17 +381,20 @@ class ShaperNode(ArmNode):
         self._publish_state()
 
     def _on_stop(self, request, response):
-        message = self.stopping("asked for by the service stop")
+        stops = self.stopping("asked for by the service stop", self._send_stop)
         response.success = True
-        response.message = "nothing moves" if message is None else "stops"
-        if message is not None and not self._goals.replace(message):
-            self._send(message)
+        response.message = "stops" if stops else "nothing moves"
         return response
+
+    def _send_stop(self, message):
+        if not self._goals.replace(message):
+            self._send(message)
 
     def _look(self):
         if not self.active:
             return
         now = self.now_ns()
+        self.job.look(now)
         if self._state.moving and not self.core.moving(now):
             self._state.moving = False
             self._publish_state()

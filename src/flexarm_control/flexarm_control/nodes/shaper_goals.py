@@ -45,7 +45,10 @@ class ShaperGoals:
     """
 
     def __init__(self, node, output):
-        self._node, self._current, self._clients = node, None, {}
+        self._node, self._clients = node, {}
+        self._current = self._preparing = (
+            None  # the goal under way; the one whose trajectory is being shaped
+        )
         for kind, name in kinds():
             client = ActionClient(node, kind, f"{output}/{name}")
             self._clients[kind] = node._keep(lambda c: c.destroy(), client)
@@ -73,28 +76,47 @@ class ShaperGoals:
             text = f"no action server {goal.client._action_name}: is parameter output right?"
             self._end(goal, Code.INVALID_GOAL, text)
             return
-        try:
-            shaped = self._node.shape(request.trajectory)
-        except TrajectoryError as error:
-            code = Code.INVALID_JOINTS if "joint_names" in error.field else Code.INVALID_GOAL
-            self._end(goal, code, str(error))
-            return
+        self._node.shape(
+            request.trajectory,
+            lambda shaped: self._begin(goal, shaped),
+            lambda error: self._refuse(goal, error),
+        )
+        if not goal.over and self._current is not goal:
+            self._preparing = goal
+
+    def _refuse(self, goal, error):
+        """The trajectory of a goal can't be shaped."""
+        if self._preparing is goal:
+            self._preparing = None
+        code = Code.INVALID_JOINTS if "joint_names" in error.field else Code.INVALID_GOAL
+        self._end(goal, code, str(error))
+
+    def _begin(self, goal, shaped):
+        """The trajectory of a goal is shaped: it takes the place of the one before."""
+        if self._preparing is goal:
+            self._preparing = None
         before, self._current = self._current, goal
         if before is not None:
             self._end(before, Code.INVALID_GOAL, "replaced by a newer goal")
-        request.trajectory = shaped
+        goal.handle.request.trajectory = shaped
         if not self._node.plays:
-            self._send(goal, request)
+            self._send(goal, goal.handle.request)
 
     def may_cancel(self, handle):
         """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
+        goal = self._preparing
+        if goal is not None and goal.handle == handle:
+            # Its state changes once this is accepted, and then it can end; what moves before it goes on.
+            self._preparing = None
+            self._node.job.forget()
+            error = TrajectoryError("cancelled before it began", field="trajectory")
+            self._node.hand_over(self._refuse, goal, error)
+            return CancelResponse.ACCEPT
         goal = self._current
         if goal is None or goal.handle != handle:
             return CancelResponse.REJECT
         goal.reason = "cancelled: the arm was stopped"
-        message = self._node.stopping("the goal was cancelled")
-        if message is not None:
-            self.replace(message)
+        self._node.stopping("the goal was cancelled", self.replace)
         return CancelResponse.ACCEPT
 
     def replace(self, message):
@@ -146,7 +168,7 @@ class ShaperGoals:
             if number != goal.sent or goal.over:
                 return
             if not handle.accepted:
-                self._node.core.forget()
+                self._node.lost()
                 self._end(goal, Code.INVALID_GOAL, "the controller has rejected the shaped goal")
                 return
             handle.get_result_async().add_done_callback(finished)
@@ -166,7 +188,7 @@ class ShaperGoals:
         """The controller's result is that of the goal."""
         result = answer.result
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
-            self._node.core.forget()
+            self._node.lost()
         if goal.reason and answer.status == GoalStatus.STATUS_SUCCEEDED:
             result.error_string = goal.reason
         self._finish(goal, answer.status, result)

@@ -8,7 +8,8 @@ the result is shaped. A motion with a new time law (`time_law`) needs no shaper;
 trajectory that replaces it, the change is shaped.
 """
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,6 +93,28 @@ class Shaped:
     stretch: float
 
 
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A shaped trajectory that has been made and not yet been taken.
+
+    Attributes
+    ----------
+    motion, quiet : PiecewiseMotion
+        The unshaped motion, and the one that leaves no vibration, where there is one.
+    shaped : ShapedMotion
+    epoch_ns : int
+        Time from which their times count [ns].
+    result : Shaped
+        What is to be sent on.
+    """
+
+    motion: PiecewiseMotion
+    quiet: PiecewiseMotion
+    shaped: ShapedMotion
+    epoch_ns: int
+    result: Shaped
+
+
 class TrajectoryShaper:
     """Shapes trajectories, one after the other or one into the other.
 
@@ -125,6 +148,15 @@ class TrajectoryShaper:
         self._epoch_ns = 0
         self._motion = self._shaped = self._quiet = None
 
+    @property
+    def takes_long(self):
+        """Whether a trajectory or a stop may take seconds to be made: better in a thread, of a `snapshot`."""
+        return self.modes.kind == RETIMED or self._law == TIME_OPTIMAL
+
+    def snapshot(self):
+        """This shaper as it is now: what is taken here later does not change it."""
+        return copy.copy(self)
+
     # Where it is -----------------------------------------------------------------------------
 
     def _seconds(self, time_ns):
@@ -147,7 +179,38 @@ class TrajectoryShaper:
     # Trajectories ----------------------------------------------------------------------------
 
     def offer(self, trajectory, now_ns, measured=None) -> Shaped:
-        """Shape a trajectory, from now on or from its own start.
+        """Shape a trajectory, and take it at once: see `prepared`.
+
+        Parameters
+        ----------
+        trajectory, now_ns, measured
+            As of `prepared`.
+        """
+        return self.take(self.prepared(trajectory, now_ns, measured))
+
+    def take(self, plan, now_ns=0) -> Shaped:
+        """From now on move as planned.
+
+        Parameters
+        ----------
+        plan : Plan
+            Of this shaper, and of the motion that is under way.
+        now_ns : int
+            A fresh motion that was to begin before this begins then [ns].
+        """
+        result = plan.result
+        late = max(now_ns - result.start_ns, 0) if result.fresh else 0
+        self._motion, self._quiet, self._shaped = plan.motion, plan.quiet, plan.shaped
+        self._epoch_ns = plan.epoch_ns + late
+        return replace(
+            result,
+            start_ns=result.start_ns + late,
+            end_ns=result.end_ns + late,
+            added=result.added + late / SECOND,
+        )
+
+    def prepared(self, trajectory, now_ns, measured=None, quick=False) -> Plan:
+        """Shape a trajectory, from now on or from its own start; nothing changes before it is taken.
 
         Parameters
         ----------
@@ -157,6 +220,8 @@ class TrajectoryShaper:
             [ns]
         measured : (n,) array_like, optional
             Where the joints are [rad].
+        quick : bool
+            Without a new time law: shaped, which takes milliseconds.
 
         Raises
         ------
@@ -183,20 +248,20 @@ class TrajectoryShaper:
         begin = self._begin(before, start, times, fields, measured)
         if self._law != GIVEN:
             times, fields = self._quickest(begin, fields[0])
-        quiet = self._replaced(start) if moving else None
+        quiet = self._replaced(start, quick) if moving else None
         motion, stretch = self._within_limits(before, quiet, begin, start, times, fields)
         now, last = (now_ns - epoch_ns) / SECOND, start + times[-1]
         motion = motion.since(now - self.modes.max_duration - 2.0 * self.modes.delay)
         fresh = before is None
-        if fresh and self.modes.kind == RETIMED:
+        if fresh and self.modes.kind == RETIMED and not quick:
             quiet = time_laws.retimed(motion, self.modes, self._velocity, self._acceleration)
             motion = motion if quiet is None else quiet
         begin = start if fresh else now
-        return self._take(motion, quiet, epoch_ns, begin, last, stretch, fresh)
+        return self._planned(motion, quiet, epoch_ns, begin, last, stretch, fresh)
 
-    def _replaced(self, start):
+    def _replaced(self, start, quick):
         """The motion that leaves no vibration, where another one takes over at `start` [s]; None: there is none."""
-        if self._quiet is None or self._quiet is not self._motion:
+        if quick or self._quiet is None or self._quiet is not self._motion:
             return self._quiet
         return time_laws.stopped(self._quiet, self.modes, start)
 
@@ -324,7 +389,7 @@ class TrajectoryShaper:
         return float(max(by_speed, by_acceleration))
 
     def stop(self, now_ns):
-        """Stop on the unshaped motion's own way, and shape it; None where nothing moves.
+        """Stop at once: see `prepared_stop`.
 
         Parameters
         ----------
@@ -335,17 +400,34 @@ class TrajectoryShaper:
         -------
         Shaped or None
         """
+        plan = self.prepared_stop(now_ns)
+        return None if plan is None else self.take(plan)
+
+    def prepared_stop(self, now_ns, quick=False):
+        """Stop on the unshaped motion's own way, and shape it; None where nothing moves.
+
+        Parameters
+        ----------
+        now_ns : int
+            [ns]
+        quick : bool
+            Without a new time law, which takes longer to be made and less to stop.
+
+        Returns
+        -------
+        Plan or None
+        """
         if not self.moving(now_ns):
             return None
         start, motion, quiet = self._seconds(now_ns), self._motion, self._quiet
-        if quiet is motion and quiet is not None:
+        if quiet is motion and quiet is not None and not quick:
             quiet = stopped = time_laws.stopped(quiet, self.modes, start)
         elif start >= motion.knots[-1]:  # only the shaper's own delay is left
             stopped = motion
         else:
             stopped = self._slowed(motion, start)
         last = stopped.knots[-1]
-        return self._take(stopped, quiet, self._epoch_ns, start, last, 1.0, fresh=False)
+        return self._planned(stopped, quiet, self._epoch_ns, start, last, 1.0, fresh=False)
 
     def _slowed(self, motion, start):
         """The motion up to `start` [s], then along its own way to rest, no harder than allowed."""
@@ -361,7 +443,7 @@ class TrajectoryShaper:
             duration *= LONGER
         return motion.then(PiecewiseMotion.through(start + elapsed, states[: motion.fields]))
 
-    def _take(self, motion, quiet, epoch_ns, begin, last, stretch, fresh):
+    def _planned(self, motion, quiet, epoch_ns, begin, last, stretch, fresh):
         """Shape a whole motion, and write what is left of it from a time on."""
         shaped = ShapedMotion(motion, self.modes, quiet)
         knots = shaped.knots()
@@ -380,11 +462,11 @@ class TrajectoryShaper:
             )
         states = shaped.states(knots)[: motion.fields]
         states[0][-1], states[1:, -1] = motion.end, 0.0
-        self._motion, self._quiet, self._shaped, self._epoch_ns = motion, quiet, shaped, epoch_ns
         times_ns = np.rint((knots - begin) * SECOND).astype(np.int64)
         begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
         added = float(shaped.end - last)
-        return Shaped(begin_ns, fresh, times_ns, list(states), end_ns, added, stretch)
+        result = Shaped(begin_ns, fresh, times_ns, list(states), end_ns, added, stretch)
+        return Plan(motion, quiet, shaped, epoch_ns, result)
 
 
 def _refuse_without(time_law, limits):

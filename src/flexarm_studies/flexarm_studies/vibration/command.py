@@ -35,6 +35,14 @@ def add_arguments(parser):
         metavar="FILE.jsonl",
         help="write every result; those that are in it are not computed again",
     )
+    add(
+        "--methods",
+        nargs="+",
+        choices=list(report.WANTED),
+        metavar="METHOD",
+        help="only these, beside the motion as it is: "
+        + ", ".join(f"'{name}'" for name in report.WANTED).replace("%", "%%"),
+    )
     add("--fresh", action="store_true", help="remove that file first: after a change of the code")
     add("--write", metavar="FILE.md", help="write the tables between the markers of this file")
     add("--pushes", action="store_true", help="push one link, with damping by strain and without")
@@ -64,7 +72,10 @@ def vibration(options):
         return
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)
-    rows = run(options.seed, options.count, options.out, options.workers, options.scheduler)
+    methods = (study.METHODS[0], *options.methods) if options.methods else study.METHODS
+    rows = run(
+        options.seed, options.count, options.out, options.workers, options.scheduler, methods
+    )
     if options.more_time or options.trials:
         made = _more_time if options.more_time else _in_trials
         lines, where = made(rows, options.count, options.seed)
@@ -102,7 +113,7 @@ def _missed(rows, count, seed, methods):
     return known, [row for row, _ in report.missed(rows, methods)]
 
 
-def run(seed, count, path=None, processes=None, scheduler=None):
+def run(seed, count, path=None, processes=None, scheduler=None, methods=study.METHODS):
     """Results of all cases.
 
     Parameters
@@ -113,23 +124,25 @@ def run(seed, count, path=None, processes=None, scheduler=None):
         File of the results, see `Store`.
     processes, scheduler
         As of `workers.results`.
+    methods : sequence of str
+        As of `study.run`.
 
     Returns
     -------
     list of dict
         Rows as of `study.run`.
     """
-    keep, progress = Store(path, Specification(seed)), Progress()
+    keep, progress = Store(path, Specification(seed, methods)), Progress()
     progress.step("arms behind a position loop")
     names = list(cases.all_of(count, seed))
     missing = [name for name in names if name not in keep.results]
-    calls = [(name, count, seed) for name in missing]
+    calls = [(name, count, seed, methods) for name in missing]
     for done, _ in enumerate(gather(keep, _rows_of, calls, processes, scheduler), 1):
         progress.fraction(done / len(missing))
     progress.done()
     return [row for name in names for row in keep.results[name]["rows"]]
 
 
-def _rows_of(name, count, seed):
+def _rows_of(name, count, seed, methods):
     """In a worker: the result of one case."""
-    return [{"sample": name, "rows": study.run(cases.all_of(count, seed)[name]())}]
+    return [{"sample": name, "rows": study.run(cases.all_of(count, seed)[name](), methods)}]

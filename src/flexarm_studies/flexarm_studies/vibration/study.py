@@ -6,6 +6,7 @@ the same simulated arm, behind the same drives. The arms' files are not looked a
 """
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -39,6 +40,8 @@ CHANGE = 2.0
 LATE = 0.02
 #: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
+#: Methods by TOPP-RA and by Ruckig.
+QUICKEST = ("toppra", "ruckig, one period")
 #: Factors of the frequencies for the methods by a new time law [-].
 OFFS = {"retimed": 1.0, "retimed -15 %": 1.0 - OFF, "retimed +15 %": 1.0 + OFF}
 METHODS = (
@@ -231,46 +234,55 @@ def quickest(motion, rise):
     # A joint that stands may move a little.
     speed, bend = (np.maximum(values, 1e-6 * values.max()) for values in (speed, bend))
     begin = np.stack([motion.start, 0.0 * motion.start, 0.0 * motion.start])
-    return {
-        "toppra": limited.time_optimal([motion.start, motion.end], speed, bend),
-        "ruckig, one period": limited.jerk_limited(begin, motion.end, speed, bend, bend / rise),
-    }
+    found = (
+        limited.time_optimal([motion.start, motion.end], speed, bend),
+        limited.jerk_limited(begin, motion.end, speed, bend, bend / rise),
+    )
+    return dict(zip(QUICKEST, found, strict=True))
 
 
-def candidates(motion, found, middle, other):
-    """The motion by each of `METHODS`, a dict.
+def candidates(motion, found, middle, other, methods=METHODS):
+    """The motion by each of some `METHODS`, a dict.
 
     Parameters
     ----------
     motion : PiecewiseMotion
     found, middle, other : Measured
         At its end; half-way; at its start.
+    methods : sequence of str
     """
     lowest, both = 1.0 / found.frequencies.min(), together(found, other)
     along = rows(found, (middle, other))
-    return {
-        "trapezoid": motion,
-        "TOTG 0.1 s": resampled(motion, RESAMPLE),
-        "jerk limit": jerk_limited(motion, RISE),
-        "jerk limit, one period": jerk_limited(motion, lowest),
-        **quickest(motion, lowest),
-        "zvd": shaped(motion, "zvd", found),
-        "robust": shaped(motion, "robust", found),
-        "robust -15 %": shaped(motion, "robust", found, 1.0 - OFF),
-        "robust +15 %": shaped(motion, "robust", found, 1.0 + OFF),
-        "robust, both ends": shaped(motion, "robust", both),
-        "robust, both ends -15 %": shaped(motion, "robust", both, 1.0 - OFF),
-        "robust, both ends +15 %": shaped(motion, "robust", both, 1.0 + OFF),
-        **{method: retimed(motion, along, off) for method, off in OFFS.items()},
+    makers = {
+        "trapezoid": lambda: motion,
+        "TOTG 0.1 s": lambda: resampled(motion, RESAMPLE),
+        "jerk limit": lambda: jerk_limited(motion, RISE),
+        "jerk limit, one period": lambda: jerk_limited(motion, lowest),
+        **{name: partial(_quickest, motion, lowest, name) for name in QUICKEST},
+        "zvd": lambda: shaped(motion, "zvd", found),
+        "robust": lambda: shaped(motion, "robust", found),
+        "robust -15 %": lambda: shaped(motion, "robust", found, 1.0 - OFF),
+        "robust +15 %": lambda: shaped(motion, "robust", found, 1.0 + OFF),
+        "robust, both ends": lambda: shaped(motion, "robust", both),
+        "robust, both ends -15 %": lambda: shaped(motion, "robust", both, 1.0 - OFF),
+        "robust, both ends +15 %": lambda: shaped(motion, "robust", both, 1.0 + OFF),
+        **{name: partial(retimed, motion, along, off) for name, off in OFFS.items()},
     }
+    return {name: makers[name]() for name in METHODS if name in methods}
 
 
-def run(case):
-    """Residuals of all motions of a case by all methods.
+def _quickest(motion, rise, name):
+    return quickest(motion, rise)[name]
+
+
+def run(case, methods=METHODS):
+    """Residuals of all motions of a case.
 
     Parameters
     ----------
     case : cases.Case
+    methods : sequence of str
+        Some of `METHODS`, the first among them.
 
     Returns
     -------
@@ -294,7 +306,7 @@ def run(case):
         lowest = 1.0 / found.frequencies.min()
         other = measured(arm, motion.start, -motion.angle, case.period)
         middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
-        for method, given in candidates(motion, found, middle, other).items():
+        for method, given in candidates(motion, found, middle, other, methods).items():
             swing = arm.follow(given, WINDOW * case.period)
             out.append(
                 {
