@@ -14,6 +14,7 @@ from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.verdict import FRAGILE, UNSTABLE, WITH_MARGIN, Judge
 from flexarm_control.robust.whole import Source, WholeLoop, linear_controller
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.models.model import build
 
 T = 1e-3
 TRUE = {"velocity": True, "rate": True}
@@ -85,6 +86,27 @@ def test_an_observer_that_jumps_at_a_tenth_of_a_radian_is_asked_beside_it(arm_r)
     smooth, jumps = made(0.0), made(1e-4)
     assert smooth.q == q and 0.0 < abs(jumps.q[0] - q[0]) < 0.01
     assert_allclose(WholeLoop(jumps).poles()[:4], WholeLoop(smooth).poles()[:4], rtol=0.01)
+
+
+@pytest.mark.parametrize("torque", [50.0, np.inf])
+def test_a_limit_that_the_arm_file_leaves_open_is_no_state_and_hides_no_jump(arm_r, torque):
+    limits = replace(arm_r.arm.joints[0].limits, torque=torque)
+    joint = replace(arm_r.arm.joints[0], limits=limits)
+    model = build(replace(arm_r.arm, joints=(joint,)))
+    slow = {"type": "joint_pid", "stiffness": [20.0], "damping": [6.0], "integral": [8.0]}
+    law = design(model, slow, {"type": "lqr"}, {"type": "reference"}, NO_CHECK)
+    observer = observe(model, "filtered_derivative", {})
+    plain = observer.observer.update
+
+    def jumping(sample, dt):
+        plain(sample, dt)
+        observer.observer.rate += 1e-4 * np.round(10.0 * sample.position[0])
+
+    with np.errstate(all="raise"):
+        made = linear_controller(law, observer, np.array([0.25]), T)
+        assert np.isfinite(WholeLoop(made).poles()).all() and made.q == 0.25
+        observer.observer.update = jumping
+        assert 0.0 < abs(linear_controller(law, observer, np.array([0.25]), T).q[0] - 0.25) < 0.01
 
 
 def test_a_good_loop_is_stable_with_margin_and_bears_more_than_was_tried(arm_r):

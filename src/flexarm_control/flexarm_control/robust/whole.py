@@ -145,26 +145,29 @@ class _Asked:
                 np.copyto(getattr(part, name), values)
         self.observer._order, self.count = copy.copy(self.order), self.begun
 
+    def _vectors(self):
+        """Vectors that were finite at rest; one that was not is a limit that the arm file leaves open, and no state."""
+        for part, arrays, _ in self.kept:
+            for name, values in arrays.items():
+                if values.ndim == 1 and np.isfinite(values).all():
+                    yield getattr(part, name)
+
     def states(self):
         """Every vector of observer and law, one after another, (N,)."""
-        found = [np.zeros(0)]
-        for part, arrays, _ in self.kept:
-            found += [getattr(part, k).ravel() for k, v in arrays.items() if v.ndim == 1]
-        return np.concatenate(found)
+        return np.concatenate([np.zeros(0), *self._vectors()])
 
     def move(self, i, by):
         """Move one entry of `states`."""
-        for part, arrays, _ in self.kept:
-            for name, values in arrays.items():
-                if values.ndim != 1:
-                    continue
-                if i < values.size:
-                    getattr(part, name)[i] += by
-                    return
-                i -= values.size
+        for vector in self._vectors():
+            if i < vector.size:
+                vector[i] += by
+                return
+            i -= vector.size
 
 
 def _same(values, others):
+    if not np.isfinite(others).all():
+        return np.array_equal(values, others, equal_nan=True)
     scale = np.abs(values).max(initial=1e-6)
     return bool((np.abs(values - others) <= SETTLED * scale).all())
 
