@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from flexarm_studies.identification import recording
 from flexarm_studies.recordings import mapping as mappings
@@ -118,6 +119,21 @@ def test_a_decay_is_fitted_to_its_numbers(damping):
     assert ring.damping == pytest.approx(damping, rel=1e-5)
     assert ring.frequency == pytest.approx(4.3 * np.sqrt(1 - damping**2), rel=1e-6)
     assert ring.amplitude == pytest.approx(3e-4, rel=1e-5) and ring.explained > 0.999999
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9])
+def test_intervals_of_a_decay_hold_where_what_is_left_is_coloured(memory):
+    """Of 60 decays of a second and a half nearly all are within; with intervals of white residuals, half would be."""
+    random, time, omega = np.random.default_rng(3), 0.01 * np.arange(150), 2.0 * np.pi * 3.1
+    inside = 0
+    for _ in range(60):
+        new = random.standard_normal(400)
+        noise = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], new)[-time.size :]
+        values = 25.0 * np.exp(-0.01 * omega * time) * np.cos(omega * time + 1.0) + noise
+        ring = ring_down.fit(values, 0.01)
+        inside += abs(ring.frequency - 3.1) < ring.frequency_width
+        inside += abs(ring.damping - 0.01) < ring.damping_width
+    assert 0.88 * 120 < inside < 120
 
 
 def test_noise_alone_rings_nowhere(made):

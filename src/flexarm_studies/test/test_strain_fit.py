@@ -209,3 +209,39 @@ def test_what_cannot_be_fitted_is_refused(arm):
     with pytest.raises(FlexarmError, match="has no gauges"):
         StrainProblem(replace(arm, gauges=()), recording, Options())
     assert value_of(Setup.of(arm), StrainProblem(arm, recording, Options()).found[0]) == 0.03
+
+
+def test_derivatives_do_not_depend_on_the_number_of_threads(arm):
+    recording = measured(arm).part(200)
+    one, two = (StrainProblem(arm, recording, Options(), threads=k) for k in (1, 2))
+    which = np.flatnonzero(one.free)
+    np.testing.assert_array_equal(one.jacobian(one.file, which), two.jacobian(one.file, which))
+    moved = one.file.copy()
+    moved[which[0]] += 1e-3 * one.scale[which[0]]
+    change = one.residuals(moved) - one.residuals(one.file)
+    slope = one.jacobian(one.file, which[:1])[:, :, 0]
+    np.testing.assert_allclose(change, 1e-3 * slope, atol=2e-2 * np.abs(change).max())
+
+
+def test_secants_are_exact_for_a_linear_function_and_are_renewed():
+    """Broyden's update turns wrong derivatives into right ones along the steps that were made."""
+    A = np.array([[2.0, 1.0], [0.5, 3.0]])
+    asked = []
+
+    def derivatives(x):
+        asked.append(x)
+        return (A if len(asked) > 1 else A + 0.3)[:, None, :]
+
+    secant = strain_fit.Secant(lambda x: (A @ x)[:, None], derivatives)
+    x = np.zeros(2)
+    assert np.abs(secant.derivative(x)[:, 0] - A).max() > 0.2 and secant.fresh
+    for step in ([1.0, 0.0], [0.0, 1.0]):
+        x = x + step
+        found = secant.derivative(x)[:, 0]
+        np.testing.assert_allclose(found @ step, A @ step)
+    np.testing.assert_allclose(found, A)
+    assert len(asked) == 1 and not secant.fresh
+    for k in range(strain_fit.BETWEEN):
+        secant.value(x + k + 1.0)
+    secant.derivative(x + 0.5)
+    assert len(asked) == 2 and secant.fresh

@@ -45,7 +45,7 @@ def filter_errors(arm, parameters, run, learnt):
     learnt : int
         Samples after which the memory's coefficients are kept.
     """
-    built = model.build(arm)
+    built = model.build(arm.known)  # as the observer node: its links fixed to the motors
     core = observe(built, OBSERVER, parameters)
     sample = ArmSample(built.n_joints, built.n_modes, len(arm.gauges))
     sample.velocity_known, sample.amplitude = False, None

@@ -71,8 +71,13 @@ class MotionPredictor:
         motion = (np.ascontiguousarray(spline(recording.time, k)) for k in range(3))
         self.position, self.velocity, self.acceleration = motion
         self.middle = 0.5 * float(recording.time[-1])
-        phase = MARGIN * float(np.max(driven_frequencies(built, self.position[0]), initial=0.0))
-        stiff = MARGIN * fastest_rate(built, self.position[0])
+        self.adapt(arm)
+
+    def adapt(self, arm):
+        """Take the `substeps` that the motion needs of this `arm`, and of others that are `MARGIN` faster."""
+        built, position = _chain(arm), self.position[0]
+        phase = MARGIN * float(np.max(driven_frequencies(built, position), initial=0.0))
+        stiff = MARGIN * fastest_rate(built, position)
         flanks = FLANK_SPEED / min(
             (
                 ENGAGEMENT * 0.5 * t.play + t.rounding
@@ -81,9 +86,8 @@ class MotionPredictor:
             ),
             default=np.inf,
         )
-        self.substeps = max(
-            1, int(np.ceil(max(phase / PHASE, stiff / STABLE, flanks) * self.period))
-        )
+        rate = max(phase / PHASE, stiff / STABLE, flanks)
+        self.substeps = max(1, int(np.ceil(rate * self.period)))
 
     def states(self, arm, offset=None, samples=None):
         """Amplitudes and rates of the modes at so many `samples`, or all.

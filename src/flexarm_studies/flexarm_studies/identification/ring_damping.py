@@ -64,13 +64,13 @@ def fit(problem, report):
         )
         return []
     report(f"damping from {len(rings)} ring-downs")
-    base, first = problem.values.copy(), _strains(problem, problem.values)
+    base, first = problem.values.copy(), problem.made(problem.values)
     before = _squares(problem, first)
 
     def residuals(factor):
         values = base.copy()
         values[which] *= factor
-        made = _strains(problem, values)
+        made = problem.made(values)
         if not np.isfinite(made).all():
             return np.full(len(rings) + before.size, 1.0 / SPREAD)
         logs = [np.log(_damping(problem, made, r) / r.damping) for r in rings]
@@ -81,11 +81,6 @@ def fit(problem, report):
     )
     problem.values[which] = base[which] * made.x
     return which
-
-
-def _strains(problem, values):
-    setup = problem.at(values)
-    return problem.strains(setup, problem.states(setup))
 
 
 def _squares(problem, made):

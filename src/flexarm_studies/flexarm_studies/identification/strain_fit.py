@@ -19,6 +19,7 @@ named, and one of it keeps the file's value. A parameter whose interval is too w
 value, for the others belong to it.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,7 +58,9 @@ LATER = ("offset", "delay", "drift", "hub_inertia")
 #: Each start is fitted to the first samples, this fraction of all, at least so many seconds of them.
 START_PART, START_SECONDS = 0.35, 10.0
 #: Evaluations of a start, and of each pass with new weights; largest number of passes.
-START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
+START_STEPS, PASS_STEPS, PASSES = 18, 30, 10
+#: Evaluations after which derivatives are computed anew, and not by secants: they cost as much as 25 evaluations.
+BETWEEN = 6
 #: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
 FIRST_TOLERANCE = 1e-4
 #: The weights belong to the values once a pass leaves at least this fraction of the sum of squares, and the
@@ -151,7 +154,7 @@ class StrainFit:
     warnings: tuple = ()
 
 
-def identify_strains(arm, recording, options=None, run=None, state=None, report=None):
+def identify_strains(arm, recording, options=None, run=None, state=None, report=None, threads=1):
     """Fit an arm's parameters to the strains of a recording, its joint motion prescribed.
 
     Parameters
@@ -167,6 +170,8 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
         Where the fit goes on if it was interrupted, and what it has found so far.
     report : callable, optional
         ``report(label)`` at each step.
+    threads : int
+        That compute derivatives; the numbers do not depend on it.
 
     Returns
     -------
@@ -180,10 +185,10 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     """
     options = options or Options()
     report = report or (lambda label: None)
-    problem = StrainProblem(arm, recording, options)
+    problem = StrainProblem(arm, recording, options, threads=threads)
     kept = {} if state is None else dict(state.starts)
     missing = [k for k in range(options.starts) if k not in kept]
-    calls = [(arm, recording, options, k) for k in missing]
+    calls = [(arm, recording, options, k, threads if len(missing) == 1 else 1) for k in missing]
     run = run or (lambda f, c: ((i, f(*call)) for i, call in enumerate(c)))
     if missing:
         report(f"{len(missing)} starts")
@@ -208,13 +213,15 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     return problem.result(tuple(kept[k][0] for k in sorted(kept)))
 
 
-def fit_start(arm, recording, options, number):
+def fit_start(arm, recording, options, number, threads=1):
     """Fit from one start: sum of squares, which compares between starts, and values (p,)."""
     part = max(
         START_PART * (len(recording.position) - options.lead), START_SECONDS / recording.period
     )
     found = strain_quantities(arm, recording)
-    problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found)
+    problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found, threads)
+    problem.begin(0)
+    problem.weigh()  # all starts alike, so that their sums compare
     problem.begin(number)
     problem.solve(START_STEPS, 1e-3, LATER)
     return problem.cost, problem.values
@@ -230,9 +237,11 @@ class StrainProblem:
     options : Options
     found : list of Quantity, optional
         Those of `strain_quantities` if not given.
+    threads : int
+        That compute derivatives.
     """
 
-    def __init__(self, arm, recording, options, found=None):
+    def __init__(self, arm, recording, options, found=None, threads=1):
         if not arm.gauges:
             raise FlexarmError("has no gauges", field=arm.name, hint="strains are fitted: add them")
         if not np.ptp(recording.position, axis=0).max() > 0.0:
@@ -240,7 +249,7 @@ class StrainProblem:
                 "does not change", field="joint_position",
                 hint="without torque, strains are fitted to the joints' motion: record one",
             )  # fmt: skip
-        self.options, self.recording = options, recording
+        self.options, self.recording, self.threads = options, recording, threads
         self.predictor = MotionPredictor(arm, recording, options.corner)
         self.setup = Setup.of(arm)
         self.found = strain_quantities(arm, recording) if found is None else found
@@ -261,6 +270,7 @@ class StrainProblem:
         spread = np.array([column[k].std() if k.any() else 1.0 for column, k in self._columns()])
         self.memory = np.full(g, FIRST_MEMORY)
         self.whiten = np.diag(1.0 / np.maximum(FIRST_NOISE * spread, MIN_NOISE))
+        self.covariance_of_new = np.diag(np.maximum(FIRST_NOISE * spread, MIN_NOISE) ** 2)
         self.duration = max(float(recording.time[-1]), recording.period)
         self.cost = np.inf
 
@@ -295,26 +305,48 @@ class StrainProblem:
         """Residuals (s, g) as the sum of squares has them."""
         return self.new_part(np.where(self.known, e, 0.0)) @ self.whiten
 
+    def made(self, values):
+        """Strains that the model makes with these values, shape (s, g); NaN where it diverges."""
+        setup = self.at(values)
+        return self.strains(setup, self.states(setup))
+
     def residuals(self, values):
         """Weighted residuals, shape (s, g)."""
-        setup = self.at(values)
-        r = self.weighted(self.measured - self.strains(setup, self.states(setup)))
+        return self.of_made(self.made(values))
+
+    def of_made(self, made):
+        """Weighted residuals of strains (s, g)."""
+        r = self.weighted(self.measured - made)
         return np.clip(np.nan_to_num(r, nan=LOST), -LOST, LOST)
 
     def jacobian(self, values, which):
         """Derivative of `residuals` by the quantities with the indices `which`, scaled, shape (s, g, len(which))."""
+        return self.of_derivatives(self.derivatives(values, which))
+
+    def of_derivatives(self, D):
+        """Derivative of the weighted residuals, from that of the strains, shape (s, g, p) both."""
+        J = np.stack([self.weighted(-column) for column in np.moveaxis(D, 2, 0)], axis=2)
+        return np.nan_to_num(J, nan=0.0, posinf=0.0, neginf=0.0)
+
+    def derivatives(self, values, which):
+        """Derivative of the strains by the quantities with the indices `which`, scaled, shape (s, g, len(which))."""
         setup = self.at(values)
         states = self.states(setup)
         base = self.strains(setup, states)
         out = np.zeros((*base.shape, len(which)))
-        for column, j in enumerate(which):
-            other = values.copy()
+
+        def fill(column):
+            j, other = which[column], values.copy()
             other[j] += STEP * self.scale[j]
             moved = self.at(other)
             same = self.found[j].kind in OF_GAUGES
             made = self.strains(moved, states if same else self.states(moved))
-            out[:, :, column] = self.weighted((base - made) / STEP)
-        return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
+            out[:, :, column] = (made - base) / STEP
+
+        # The compiled integrators release the interpreter's lock.
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(fill, range(len(which))))
+        return out
 
     # The fit ---------------------------------------------------------------------------------
 
@@ -330,8 +362,7 @@ class StrainProblem:
 
     def regress(self):
         """Set the free gains and biases to those of a linear regression on the predicted strains."""
-        setup = self.at(self.values)
-        predicted = self.strains(setup, self.states(setup))
+        setup, predicted = self.at(self.values), self.made(self.values)
         place = {(q.kind, *q.where): j for j, q in enumerate(self.found)}
         for c, gauge in enumerate(setup.arm.gauges):
             known, gain, bias = self.known[:, c], place.get(("gain", c)), place.get(("bias", c))
@@ -350,6 +381,7 @@ class StrainProblem:
 
     def solve(self, steps, tolerance, later=(), keep=None):
         """Least squares from the current values, quantities of the kinds `later` held; ``keep()`` after each step."""
+        self.predictor.adapt(self.at(self.values).arm)
         which = np.array(
             [j for j in np.flatnonzero(self.free) if self.found[j].kind not in later], int
         )
@@ -365,29 +397,39 @@ class StrainProblem:
             return values
 
         middle = self.file[which] / self.scale[which]
+        secant = Secant(lambda x: self.made(full(x)), lambda x: self.derivatives(full(x), which))
 
         def residuals(x):
-            r = np.concatenate([self.residuals(full(x)).ravel(), (x - middle) / PRIOR])
-            self.best = min(getattr(self, "best", (np.inf, None)), (float(r @ r), full(x)), key=_of)
+            r = self.of_made(secant.value(x)).ravel()
+            r = np.concatenate([r, (x - middle) / PRIOR])
+            self.best = min(self.best, (float(r @ r), full(x)), key=_of)
             return r
 
         def jacobian(x):
             if keep is not None:  # once a step
                 keep(*self.best)
-            J = self.jacobian(full(x), which).reshape(-1, which.size)
+            J = self.of_derivatives(secant.derivative(x)).reshape(-1, which.size)
             return np.vstack([J, np.eye(which.size) / PRIOR])
 
         self.best = (np.inf, None)
-        least_squares(
-            residuals, start, jacobian, (low, np.full(start.size, np.inf)), x_scale="jac",
-            max_nfev=steps, ftol=tolerance, xtol=1e-8, gtol=1e-12,
-        )  # fmt: skip
+        while steps > 0:
+            before = self.best[0]
+            secant.forget()
+            done = least_squares(
+                residuals, start, jacobian, (low, np.full(start.size, np.inf)), x_scale="jac",
+                max_nfev=steps, ftol=tolerance, xtol=1e-8, gtol=1e-12,
+            )  # fmt: skip
+            steps -= done.nfev
+            start = self.best[1][which] / self.scale[which]
+            if secant.fresh or not self.best[0] < (1.0 - tolerance) * before:
+                break  # not by the secants' fault
         self.cost, self.values = self.best
 
     def weigh(self):
         """Memory and covariance of the residuals, and the weights that follow from them."""
-        setup = self.at(self.values)
-        e = np.where(self.known, self.measured - self.strains(setup, self.states(setup)), 0.0)
+        e = np.where(self.known, self.measured - self.made(self.values), 0.0)
+        if not np.isfinite(e).all():  # no model yet that follows the motion
+            return
         both = self.known[1:] & self.known[:-1]
         power = np.maximum(np.sum(np.where(both, e[:-1] ** 2, 0.0), axis=0), 1e-300)
         product = np.sum(np.where(both, e[1:] * e[:-1], 0.0), axis=0)
@@ -499,7 +541,7 @@ class StrainProblem:
         noise = np.sqrt(np.diag(self.covariance_of_new))
         return StrainFit(
             with_offset(setup.arm, setup.offset), setup, self.found, self.values, widths, covariance,
-            self.strains(setup, self.states(setup)), self.measured, noise, self.memory,
+            self.made(self.values), self.measured, noise, self.memory,
             self.covariance_of_new / np.outer(noise, noise), self.held,
             tuple(self.found[i].name for i, _ in self.left_out) + wide, self.alike, starts,
             tuple(self.warnings),
@@ -516,6 +558,52 @@ class StrainProblem:
                 " hold it (--hold) where you know it"
             )
         return tuple(self.found[j].name for j in wide)
+
+
+class Secant:
+    r"""Values and derivatives of a function whose derivatives cost much: after the first ones, by Broyden's secants.
+
+    .. math:: D \leftarrow D + (y_1 - y_0 - D\,\Delta x)\,\Delta x^T / |\Delta x|^2
+
+    Parameters
+    ----------
+    function, derivatives : callable
+        ``function(x)`` of shape (s, g), ``derivatives(x)`` (s, g, p), for x (p,).
+    """
+
+    def __init__(self, function, derivatives):
+        self._function, self._derivatives = function, derivatives
+        self._last = self._at = None
+        self._count = 0
+
+    @property
+    def fresh(self):
+        """Whether the last derivatives are no secants."""
+        return self._count == 0
+
+    def forget(self):
+        """Compute the next derivatives anew."""
+        self._at = None
+
+    def value(self, x):
+        """The function at x; that of the last x is kept."""
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self._last = x.copy(), self._function(x)
+            self._count += 1
+        return self._last[1]
+
+    def derivative(self, x):
+        """Derivatives at x, anew after `BETWEEN` values."""
+        y = self.value(x)
+        usable = self._at is not None and self._count <= BETWEEN
+        if not (usable and np.isfinite(y).all() and np.isfinite(self._at[1]).all()):
+            D, self._count = self._derivatives(x), 0
+        else:
+            x0, y0, D = self._at
+            step = x - x0
+            D = D + (y - y0 - D @ step)[:, :, None] * (step / (step @ step))
+        self._at = x.copy(), y, D
+        return D
 
 
 def _of(pair):

@@ -5,20 +5,26 @@ r"""Free vibration while the joints stand: frequency and damping of what a gauge
     \varepsilon(t) = e^{-\sigma t}(a\cos\omega t + b\sin\omega t) + c + dt,
     \qquad \zeta = \sigma/\sqrt{\sigma^2 + \omega^2}
 
-fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals are those of
-white residuals.
+fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals take into
+account that residuals follow from sample to sample, :math:`e_k = \rho e_{k-1} + u_k`: with V their covariance and J the
+derivatives by all six numbers, that of the numbers is :math:`(J^TJ)^{-1}J^TVJ(J^TJ)^{-1}`. The residuals of few samples
+seem whiter than what they are left of, because six numbers were fitted to it: :math:`\rho` is that of the restricted
+likelihood (Patterson and Thompson, Biometrika 58, 1971), which allows for that.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.signal import lfilter
 
 #: What counts as a ring-down: this fraction of the variance is explained, amplitude over noise, damping ratio, periods.
 EXPLAINED, OVER_NOISE, MAX_DAMPING, MIN_PERIODS = 0.9, 5.0, 0.3, 1.5
 #: Start of the fit: damping rate over frequency [-].
 START = 0.01
 NORMAL = 1.959964
+#: Largest autoregression of the residuals.
+MAX_MEMORY = 0.99
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ def fit(values, period, part=None, gauge=0):
     omega, sigma = abs(made.x[0]), made.x[1]
     linear = np.linalg.lstsq(basis(made.x), values, rcond=None)[0]
     left = float(np.mean(made.fun**2))
-    width = NORMAL * np.sqrt(left * np.diag(np.linalg.pinv(made.jac.T @ made.jac)))
+    width = NORMAL * np.sqrt(np.diag(covariance(np.hstack([made.jac, basis(made.x)]), made.fun)))
     total = float(np.var(values - line @ linear[2:]))
     size = np.hypot(omega, sigma)
     numbers = (
@@ -121,6 +127,36 @@ def fit(values, period, part=None, gauge=0):
         1.0 - left / max(total, 1e-300),
     )
     return RingDown(part, gauge, *map(float, numbers))
+
+
+def covariance(J, error):
+    """Covariance (p, p) of a fit with derivatives J (s, p), whose residuals (s,) follow from sample to sample."""
+    count, unknowns = J.shape
+    J, size = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), np.linalg.norm(J, axis=0)
+    if count <= unknowns or not np.any(error):
+        return np.zeros((unknowns, unknowns))
+
+    def new(values, memory):  # what does not follow from the sample before
+        out = values.copy()
+        out[0] *= np.sqrt(1.0 - memory**2)
+        out[1:] -= memory * values[:-1]
+        return out
+
+    def left(memory):
+        X, e = new(J, memory), new(error, memory)
+        return X, np.sum((e - X @ np.linalg.lstsq(X, e, rcond=None)[0]) ** 2)
+
+    def likelihood(memory):
+        X, squares = left(memory)
+        informed = np.linalg.slogdet(X.T @ X)[1]
+        return informed - np.log(1.0 - memory**2) + (count - unknowns) * np.log(squares)
+
+    memory = minimize_scalar(likelihood, bounds=(0.0, MAX_MEMORY), method="bounded").x
+    variance = left(memory)[1] / (count - unknowns)
+    root = lfilter([1.0], [1.0, -memory], J[::-1], axis=0)[::-1].copy()
+    root[0] /= np.sqrt(1.0 - memory**2)
+    inverse = np.linalg.pinv(J.T @ J)
+    return variance * (inverse @ root.T @ root @ inverse) / np.outer(size, size)
 
 
 def _strongest(values, period):

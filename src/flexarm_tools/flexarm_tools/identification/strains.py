@@ -2,6 +2,7 @@
 """``flexarm identify`` of a recording without torque: options, text and plain data of a fit to the strains alone."""
 
 import functools
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -148,8 +149,9 @@ def identify(options, arm, measured, progress):
         state = FitState(options.state, key_of(arm, part, fitting))
     run = functools.partial(workers.results, workers=options.workers, scheduler=options.scheduler)
     found, result, more = study(
-        arm, measured, wanted, fitting, other, run=run, state=state, report=progress.step
-    )
+        arm, measured, wanted, fitting, other, run=run, state=state, report=progress.step,
+        threads=max(options.workers or os.cpu_count() or 1, 1),
+    )  # fmt: skip
     result |= {"score_file": options.score_file}
     return found, result | summary(found, measured, options.recording), more
 
