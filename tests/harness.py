@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import preloaded
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
@@ -120,7 +121,7 @@ class Bench(Nodes, Session):
     def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
         """Start a node's installed executable; `key` names its log and process."""
         command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
-        return self.processes.start(key or name, command)
+        return self.processes.start(key or name, command, preloaded.start)
 
     def log(self, key):
         """What a process has printed."""

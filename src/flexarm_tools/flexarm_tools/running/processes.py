@@ -109,6 +109,19 @@ def arguments(parameters=None, file=None, remaps=()):
     return words
 
 
+def popen(command, log, env):
+    """Start a command in a session of its own; what it prints is appended to the file `log`."""
+    with open(log, "ab") as stream:
+        return subprocess.Popen(
+            command,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env=env,
+            start_new_session=True,
+        )
+
+
 class Processes:
     """Child processes that end with the context, however that ends, and with this process.
 
@@ -129,18 +142,15 @@ class Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
         self.running, self._ending = {}, set()
 
-    def start(self, name, command):
-        """Start a command; its output goes to ``<log_directory>/<name>.log``."""
+    def start(self, name, command, by=popen):
+        """Start a command; its output goes to ``<log_directory>/<name>.log``.
+
+        ``by(command, log=, env=)`` is what starts it: `popen`, or another that gives as much of a `subprocess.Popen`.
+        """
         self._ending.discard(name)
-        with open(self.logs / f"{name}.log", "wb") as log:
-            process = subprocess.Popen(
-                command,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                env=environment(self.domain),
-                start_new_session=True,
-            )
+        log = self.logs / f"{name}.log"
+        log.write_bytes(b"")
+        process = by(command, log=log, env=environment(self.domain))
         self.running[name] = process
         return process
 
