@@ -3,19 +3,24 @@
 
 rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node
 that costs more than the control law. Here the control path waits on its own subscription alone, and the
-executor serves the rest (parameters, services, timers, trajectories) at least every `HOUSEKEEPING` seconds.
-It takes what ``rclpy.wait_for_message`` takes of rclpy: a wait set with one subscription.
+executor serves the rest (parameters, services, timers, trajectories) every `HOUSEKEEPING` seconds, if there is any to
+serve: `Others` finds that out in a sixth of the executor's time. It takes what ``rclpy.wait_for_message`` takes of rclpy:
+a wait set.
 """
 
 import time
+from collections import deque
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.waitable import NumberOfEntities
 
 #: Services, timers and slow topics are served at least this often [s].
 HOUSEKEEPING = 0.02
 #: How many of them are served in one turn for each node; looking for each costs about 0.2 ms.
 AT_ONCE = 2
+#: Every so many turns the executor looks itself.
+EVERY = 25
 
 
 class ControlPath:
@@ -42,6 +47,85 @@ class ControlPath:
         self.lost = 0
 
 
+class _Executor(SingleThreadedExecutor):
+    """rclpy's executor, which tells whether tasks were given to it that are not done."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self._given = deque()
+
+    def create_task(self, callback, *args, **kwargs):
+        """As rclpy's; from any thread."""
+        task = super().create_task(callback, *args, **kwargs)
+        self._given.append(task)
+        return task
+
+    @property
+    def has_tasks(self):
+        """Whether one of them is not done."""
+        given = self._given
+        while given and (given[0].done() or given[0].cancelled()):
+            given.popleft()
+        return bool(given)
+
+
+class Others:
+    """What the executor serves beside the control path.
+
+    Parameters
+    ----------
+    nodes : sequence of Node
+    executor : _Executor
+    path : ControlPath
+    """
+
+    def __init__(self, nodes, executor, path):
+        self._nodes, self._executor, self._path = nodes, executor, path
+        self._turn = 0
+
+    def waiting(self):
+        """Whether there is something to serve; in doubt, which is every `EVERY` turns, true."""
+        self._turn = (self._turn + 1) % EVERY
+        if self._turn == 0 or self._executor.has_tasks:
+            return True
+        return any(self.waits(node) for node in self._nodes)
+
+    def waits(self, node):
+        if any(timer.is_ready() for timer in node.timers):
+            return True
+        subscriptions = [
+            s
+            for s in node.subscriptions
+            if s is not self._path.subscription and s.callback_group.can_execute(s)
+        ]
+        clients, services, waitables = list(node.clients), list(node.services), list(node.waitables)
+        count = NumberOfEntities(
+            len(subscriptions), len(list(node.guards)), 0, len(clients), len(services)
+        )
+        for waitable in waitables:
+            count += waitable.get_num_entities()
+        found = rclpy_implementation.WaitSet(
+            count.num_subscriptions, count.num_guard_conditions, count.num_timers, count.num_clients,
+            count.num_services, count.num_events, node.context.handle,
+        )  # fmt: skip
+        found.clear_entities()
+        for subscription in subscriptions:
+            found.add_subscription(subscription.handle)
+        for client in clients:
+            found.add_client(client.handle)
+        for service in services:
+            found.add_service(service.handle)
+        for guard in node.guards:
+            found.add_guard_condition(guard.handle)
+        for waitable in waitables:
+            waitable.add_to_wait_set(found)
+        found.wait(0)
+        kinds = ("subscription", "client", "service", "guard_condition")
+        return any(found.get_ready_entities(kind) for kind in kinds) or any(
+            waitable.is_ready(found) for waitable in waitables
+        )
+
+
 def spin(nodes, stopped):
     """Serve nodes until `stopped` holds something.
 
@@ -53,7 +137,7 @@ def spin(nodes, stopped):
         Filled by a signal handler.
     """
     context = nodes[0].context
-    executor = SingleThreadedExecutor(context=context)
+    executor = _Executor(context=context)
     for node in nodes:
         executor.add_node(node)
     try:
@@ -62,23 +146,24 @@ def spin(nodes, stopped):
             if node is None:
                 executor.spin_once(timeout_sec=0.1)
             else:
-                _spin_control_path(node, node.control_path, executor, AT_ONCE * len(nodes), stopped)
+                _spin_control_path(node, node.control_path, executor, nodes, stopped)
     finally:
         executor.shutdown()
 
 
-def _spin_control_path(node, path, executor, at_once, stopped):
+def _spin_control_path(node, path, executor, nodes, stopped):
     handle, kind = path.subscription.handle, path.subscription.msg_type
     callback, raw = path.subscription.callback, path.subscription.raw
     waiting = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
     clock = time.monotonic
-    others = clock()
+    others, rest = clock(), Others(nodes, executor, path)
     due = clock() + path.period if path.period else None
     while node.control_path is path and not stopped:
         now = clock()
         if now >= others:
-            for _ in range(at_once):
-                executor.spin_once(timeout_sec=0.0)
+            if rest.waiting():
+                for _ in range(AT_ONCE * len(nodes)):
+                    executor.spin_once(timeout_sec=0.0)
             if node.control_path is not path or not node.context.ok():
                 return
             now = clock()
@@ -92,10 +177,12 @@ def _spin_control_path(node, path, executor, at_once, stopped):
                 path.lost += missed
                 due += missed * path.period
         until = others if due is None else min(others, due)
-        waiting.clear_entities()
         with handle:
-            waiting.add_subscription(handle)
-            waiting.wait(max(0, int((until - clock()) * 1e9)))
             taken = handle.take_message(kind, raw)
+            if taken is None:
+                waiting.clear_entities()
+                waiting.add_subscription(handle)
+                waiting.wait(max(0, int((until - clock()) * 1e9)))
+                taken = handle.take_message(kind, raw)
         if taken is not None:
             callback(taken[0])
