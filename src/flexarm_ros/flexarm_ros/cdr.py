@@ -3,20 +3,25 @@ r"""Messages whose strings and lengths seldom change, read from their bytes and 
 
 The middleware carries XCDR1 (OMG DDS-XTypes 1.3, section 7.4.1): four bytes of encapsulation, then the fields one after
 the other, each aligned to its own size, with a length before each string and array. On the control path only numbers
-change from one message to the next. So one message tells where they are, and a `struct` reads or writes all of them at
-once. rclpy's conversion goes through each attribute and string instead, which takes several times as long.
+change from one message to the next. So one message tells where they are; whether another one has the same strings and
+lengths is one comparison of all its bytes, as one whole number, without those of numbers and padding. Arrays are views
+of the bytes. rclpy's conversion goes through each attribute and string instead, which takes several times as long.
 """
 
 import struct
-from operator import attrgetter, itemgetter
-from types import SimpleNamespace
+import sys
+from operator import attrgetter
 
+import numpy as np
 from rclpy.serialization import deserialize_message
 
 from flexarm_dynamics.errors import MessageError
 
-#: Little-endian XCDR1.
-ENCAPSULATION = b"\0\1"
+#: XCDR1 in this machine's order of bytes.
+LITTLE = sys.byteorder == "little"
+ENCAPSULATION, ORDER = (b"\0\1", "<") if LITTLE else (b"\0\0", ">")
+#: Bytes before the fields; alignment counts from there.
+HEAD = 4
 #: Numbers: format of `struct`, and size, which is the alignment.
 NUMBERS = {
     "boolean": ("?", 1),
@@ -27,12 +32,12 @@ NUMBERS = {
 }
 
 
-def _several(getter, keys):
-    """An `itemgetter` or `attrgetter` that gives a tuple, however many keys there are."""
-    keys = list(keys)
-    if len(keys) > 1:
-        return getter(*keys)
-    gets = [getter(key) for key in keys]
+def _several(paths):
+    """An `attrgetter` that gives a tuple, however many paths there are."""
+    paths = list(paths)
+    if len(paths) > 1:
+        return attrgetter(*paths)
+    gets = [attrgetter(path) for path in paths]
     return lambda thing: tuple(get(thing) for get in gets)
 
 
@@ -46,35 +51,59 @@ class Layout:
 
     Attributes
     ----------
-    values : list
-        In the order of the bytes: numbers, strings and lengths.
-    places : dict of str to int or slice
-        Where in `values` each number and array is, by its path, such as ``header.stamp.sec``.
+    template : bytearray
+        The bytes of strings and lengths; zeros elsewhere.
+    numbers : dict of str to (str, int)
+        Format and place in the bytes of each number, by its path, such as ``header.stamp.sec``; in the order of places.
+    arrays : dict of str to slice
+        Place of each array in `doubles`, by its path.
     texts : list of str
         Paths of the strings, and of the arrays of strings.
     """
 
     def __init__(self, message):
-        self.values, self.places, self.texts = [], {}, []
-        self._format, self._size, self._fixed = ["<"], 0, []
-        self._bytes(ENCAPSULATION)
-        self._format.append("2x")
-        self._size = 0  # alignment counts from here
+        self.template, self._mask = bytearray(), bytearray()
+        self.numbers, self.arrays, self.texts = {}, {}, []
+        self._fix(ENCAPSULATION)
+        self._leave(HEAD - len(ENCAPSULATION))
         self._walk(message, "")
-        self._struct = struct.Struct("".join(self._format))
-        self._pick = _several(itemgetter, self._fixed)
-        self._known = self._pick(self.values)
+        self._whole = int.from_bytes(self._mask, "little")
+        self._known = int.from_bytes(self.template, "little")
+        self._size, form, at = len(self.template), [ORDER], 0
+        for code, place in self.numbers.values():
+            form.append(f"{place - at}x{code}")
+            at = place + struct.calcsize(code)
+        self._struct = struct.Struct("".join(form))
 
     def unpack(self, raw):
-        """The `values` of a message's bytes; None where its strings or lengths are others."""
-        if len(raw) < self._struct.size:  # what is beyond it is the middleware's padding
+        """The `numbers` of a message's bytes; None where its strings or lengths are others."""
+        if len(raw) < self._size:  # what is beyond it is the middleware's padding
             return None
-        values = self._struct.unpack_from(raw)
-        return values if self._pick(values) == self._known else None
+        if int.from_bytes(raw, "little") & self._whole != self._known:
+            return None
+        return self._struct.unpack_from(raw)
 
-    def pack(self):
-        """The bytes of `values`."""
-        return self._struct.pack(*self.values)
+    @staticmethod
+    def doubles(raw):
+        """All that may be doubles in a message's bytes; not aligned for the processor."""
+        return np.frombuffer(raw, ORDER + "f8", (len(raw) - HEAD) // 8, HEAD)
+
+    def bytes_of(self, path):
+        """The place of an array in a message's bytes: a slice."""
+        place = self.arrays[path]
+        return slice(HEAD + 8 * place.start, HEAD + 8 * place.stop)
+
+    def runs(self):
+        """Numbers that follow each other: of each run its `struct.Struct`, place, and slice of the numbers."""
+        found, items = [], list(self.numbers.values())
+        begin = 0
+        for i in range(1, len(items) + 1):
+            code, place = items[i - 1]
+            if i == len(items) or items[i][1] != place + struct.calcsize(code):
+                form = ORDER + "".join(code for code, _ in items[begin:i])
+                found.append((struct.Struct(form), items[begin][1], slice(begin, i)))
+                begin = i
+        return found
 
     def _walk(self, message, prefix):
         for name, kind in message.get_fields_and_field_types().items():
@@ -82,8 +111,8 @@ class Layout:
             if kind in NUMBERS:
                 code, size = NUMBERS[kind]
                 self._align(size)
-                self.places[path] = len(self.values)
-                self._add(code, size, value)
+                self.numbers[path] = code, len(self.template)
+                self._leave(size)
             elif kind == "string":
                 self.texts.append(path)
                 self._text(value)
@@ -93,41 +122,67 @@ class Layout:
                 for text in value:
                     self._text(text)
             elif kind == "sequence<double>":
-                self._doubles(path, value)
+                self._doubles(path, len(value))
             else:
                 self._walk(value, f"{path}.")
 
-    def _doubles(self, path, values):
-        count = len(values)
+    def _doubles(self, path, count):
         self._length(count)
-        self.places[path] = slice(len(self.values), len(self.values) + count)
         if count:  # there is no padding before an empty one
             self._align(8)
-            self._add(f"{count}d", 8 * count, *values)
+        first = (len(self.template) - HEAD) // 8
+        self.arrays[path] = slice(first, first + count)
+        self._leave(8 * count)
 
     def _text(self, text):
         data = text.encode() + b"\0"
         self._length(len(data))
-        self._bytes(data)
+        self._fix(data)
 
     def _length(self, count):
         self._align(4)
-        self._fixed.append(len(self.values))
-        self._add("I", 4, count)
-
-    def _bytes(self, data):
-        self._fixed.append(len(self.values))
-        self._add(f"{len(data)}s", len(data), data)
+        self._fix(struct.pack(ORDER + "I", count))
 
     def _align(self, size):
-        padding = -self._size % size
-        self._format.append(f"{padding}x")
-        self._size += padding
+        self._leave(-(len(self.template) - HEAD) % size)
 
-    def _add(self, code, size, *values):
-        self._format.append(code)
-        self._size += size
-        self.values += values
+    def _fix(self, data):
+        self.template += data
+        self._mask += b"\xff" * len(data)
+
+    def _leave(self, count):
+        self.template += bytes(count)
+        self._mask += bytes(count)
+
+
+class Fields:
+    """The fields of a message, and of the messages in it, without checks at assignment; arrays are read-only.
+
+    Attributes
+    ----------
+    layout : Layout
+        Where they are from: while it is the same object, so are all strings and lengths.
+    doubles : ndarray
+        As `Layout.doubles`.
+    """
+
+    def __init__(self, message, layout, prefix="", root=None):
+        # Arrays are not among the attributes: `__getattr__` finds them in the present message's bytes.
+        self._arrays, self._root = {}, self if root is None else root
+        self.layout, self.doubles = layout, None
+        for name in message.get_fields_and_field_types():
+            value = getattr(message, name)
+            if prefix + name in layout.arrays:
+                self._arrays[name] = layout.arrays[prefix + name]
+            elif hasattr(value, "get_fields_and_field_types"):
+                setattr(self, name, Fields(value, layout, f"{prefix}{name}.", self._root))
+            else:
+                setattr(self, name, value)
+
+    def __getattr__(self, name):
+        if name in self.__dict__.get("_arrays", ()):
+            return self._root.doubles[self._arrays[name]]
+        raise AttributeError(name)
 
 
 class Reader:
@@ -143,7 +198,7 @@ class Reader:
         self._kind, self._layout = kind, None
 
     def __call__(self, raw):
-        """An object with the message's fields, valid until the next call.
+        """The message's `Fields`, valid until the next call.
 
         Parameters
         ----------
@@ -157,27 +212,37 @@ class Reader:
         """
         if not isinstance(raw, bytes):
             return raw
-        values = None if self._layout is None else self._layout.unpack(raw)
-        if values is None:
+        layout = self._layout
+        numbers = None if layout is None else layout.unpack(raw)
+        if numbers is None:
             return self._learn(raw)
-        for fields, names, pick in self._groups:
-            fields.update(zip(names, pick(values), strict=True))
-        return self._fields
+        fields = self._fields
+        fields.doubles = layout.doubles(raw)
+        for attributes, names, part in self._groups:
+            attributes.update(zip(names, numbers[part], strict=True))
+        return fields
 
     def _learn(self, raw):
         """As a call, for bytes with other strings or lengths than the last ones."""
         message = self.message(raw)
-        self._layout, self._fields, groups = Layout(message), _plain(message), {}
-        for path, place in self._layout.places.items():
-            owner, _, name = path.rpartition(".")
-            groups.setdefault(owner, {})[name] = place
-        self._groups = []
-        for owner, places in groups.items():
-            holder = attrgetter(owner)(self._fields) if owner else self._fields
-            self._groups.append(
-                (vars(holder), tuple(places), _several(itemgetter, places.values()))
-            )
-        return self._fields
+        layout = self._layout = Layout(message)
+        fields = self._fields = Fields(message, layout)
+        # As numbers follow each other: in most messages those of the header first.
+        self._groups, owners = [], [path.rpartition(".")[::2] for path in layout.numbers]
+        for i, (owner, name) in enumerate(owners):
+            if i == 0 or owner != owners[i - 1][0]:
+                holder = attrgetter(owner)(fields) if owner else fields
+                self._groups.append((vars(holder), [], slice(i, i)))
+            attributes, names, part = self._groups[-1]
+            names.append(name)
+            self._groups[-1] = attributes, names, slice(part.start, i + 1)
+        if layout.unpack(raw) is not None:
+            fields.doubles = layout.doubles(raw)
+        else:  # the other order of bytes, or strings without their end: only rclpy reads that
+            fields.doubles = np.zeros(max((a.stop for a in layout.arrays.values()), default=0))
+            for path, place in layout.arrays.items():
+                fields.doubles[place] = attrgetter(path)(message)
+        return fields
 
     def message(self, raw):
         """The message itself, with all checks that rclpy makes; arguments and errors as of a call."""
@@ -190,14 +255,6 @@ class Reader:
             raise MessageError(
                 problem, field=f"{len(raw)} bytes of {self._kind.__name__}"
             ) from None
-
-
-def _plain(message):
-    """The fields of a message, and of the messages in it, without checks at assignment."""
-    names = message.get_fields_and_field_types()
-    values = {name: getattr(message, name) for name in names}
-    nested = {n: _plain(v) for n, v in values.items() if hasattr(v, "get_fields_and_field_types")}
-    return SimpleNamespace(**(values | nested))
 
 
 class Writer:
@@ -215,23 +272,40 @@ class Writer:
 
     def __call__(self):
         """The bytes of the message as it is now."""
-        numbers = self._numbers(self.message)
-        texts = self._texts(self.message)
-        if texts != self._known or [len(numbers[i]) for i in self._arrays] != self._lengths:
+        message = self.message
+        numbers, arrays = self._numbers(message), self._arrays(message)
+        if self._texts(message) != self._known or list(map(len, arrays)) != self._lengths:
             self._learn()
-            return self._layout.pack()
-        values = self._layout.values
-        for place, number in zip(self._places, numbers, strict=True):
-            values[place] = number
-        return self._layout.pack()
+        out = self._bytes
+        for runs, at, part in self._runs:
+            runs.pack_into(out, at, *numbers[part])
+        for place, values in zip(self._places, arrays, strict=True):
+            out[place] = values
+        return bytes(out)
 
     def _learn(self):
-        layout = self._layout = Layout(self.message)
-        self._places = list(layout.places.values())
-        self._numbers = _several(attrgetter, layout.places)
-        self._texts = _several(attrgetter, layout.texts)
-        self._arrays = [i for i, place in enumerate(self._places) if isinstance(place, slice)]
-        self._lengths = [len(self._numbers(self.message)[i]) for i in self._arrays]
-        known = self._texts(self.message)
+        message = self.message
+        layout, inside = Layout(message), _slots(message)
+        self._bytes, self._runs = layout.template, layout.runs()
+        self._places = [layout.bytes_of(path) for path in layout.arrays]
+        self._numbers, self._arrays, self._texts = (
+            _several(map(inside, paths)) for paths in (layout.numbers, layout.arrays, layout.texts)
+        )
+        self._lengths = [len(values) for values in self._arrays(message)]
+        known = self._texts(message)
         # The lists may be changed in place.
         self._known = tuple(list(t) if isinstance(t, list) else t for t in known)
+
+
+def _slots(message):
+    """From a path of fields to that of the slots behind rclpy's properties, each of which is a call of Python."""
+
+    def inside(path):
+        slots = ".".join(f"_{name}" for name in path.split("."))
+        try:
+            attrgetter(slots)(message)
+        except AttributeError:
+            return path
+        return slots
+
+    return inside

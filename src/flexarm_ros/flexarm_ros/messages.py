@@ -14,6 +14,8 @@ from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.shown import listed
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque, ObserverState
 
+from .cdr import Fields
+
 SECOND = 1_000_000_000
 
 
@@ -56,6 +58,11 @@ class _Columns:
         )
         return self._order
 
+    @property
+    def present(self):
+        """Index array of the last names, None where they are in the arm's order."""
+        return self._order
+
     def read(self, field, values, order, out):
         """Copy one array into `out`; an empty one gives False."""
         size = len(values)
@@ -86,6 +93,8 @@ class StateReader:
         self._strain = np.zeros(len(arm.gauges))
         self._amplitude = np.zeros(len(arm.observed_modes))
         self._rate = np.zeros(len(arm.observed_modes))
+        # Of the last message that was read name by name: its layout, and where its numbers go.
+        self._layout, self._copies = None, ()
 
     def read(self, msg, sample):
         """Fill `sample`; stamp, session and sequence even when the rest is refused.
@@ -112,6 +121,17 @@ class StateReader:
                 value=stamp.nanosec,
                 limit=f"below {SECOND}",
             )
+        layout = msg.layout if type(msg) is Fields else None
+        if layout is not None and layout is self._layout:
+            self._copy(msg.doubles, sample)
+            return
+        self._layout = None
+        self._read_arrays(msg, sample)
+        if layout is not None:
+            self._layout, self._copies = layout, self._planned(layout)
+
+    def _read_arrays(self, msg, sample):
+        """Fill the arrays of a sample, by all names and lengths."""
         joints = self._joints
         order = joints.order(msg.joint_names)
         if not joints.read("joint_position", msg.joint_position, order, sample.position):
@@ -127,6 +147,36 @@ class StateReader:
             names, "modal_amplitude", msg.modal_amplitude, self._amplitude
         )
         sample.rate = modes.optional(names, "modal_rate", msg.modal_rate, self._rate)
+
+    def _planned(self, layout):
+        """What `_copy` needs for a message of this layout, the names of which have just been read."""
+        arrays = {
+            "joint_position": self._joints,
+            "joint_velocity": self._joints,
+            "joint_torque": self._joints,
+            "strain": self._gauges,
+            "modal_amplitude": self._modes,
+            "modal_rate": self._modes,
+        }
+        places, ends, at = [], [], 0
+        for name, columns in arrays.items():
+            place = np.arange(layout.arrays[name].start, layout.arrays[name].stop)
+            order = columns.present if place.size else None
+            places.append(place if order is None else place[order])
+            ends.append(slice(at, at := at + place.size) if place.size else None)
+        flat = np.zeros(at)
+        return np.concatenate(places), flat, [None if e is None else flat[e] for e in ends]
+
+    def _copy(self, doubles, sample):
+        """As `_read_arrays`, from the numbers of a message of the last one's layout."""
+        places, flat, (position, velocity, torque, strain, amplitude, rate) = self._copies
+        doubles.take(places, out=flat, mode="clip")
+        sample.position[:] = position
+        sample.velocity_known = velocity is not None
+        if velocity is not None:
+            sample.velocity[:] = velocity
+        sample.torque[:] = np.nan if torque is None else torque
+        sample.strain, sample.amplitude, sample.rate = strain, amplitude, rate
 
 
 def _floats(msg, field, size):

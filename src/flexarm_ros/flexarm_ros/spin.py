@@ -4,8 +4,8 @@
 rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node
 that costs more than the control law. Here the control path waits on its own subscription alone, and the
 executor serves the rest (parameters, services, timers, trajectories) every `HOUSEKEEPING` seconds, if there is any to
-serve: `Others` finds that out in a sixth of the executor's time. It takes what ``rclpy.wait_for_message`` takes of rclpy:
-a wait set.
+serve: `Others` finds that out in a sixth of the executor's time. It takes what ``rclpy.wait_for_message`` takes of
+rclpy: a wait set.
 """
 
 import time

@@ -25,6 +25,7 @@ from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 from flexarm_msgs.msg import ArmState, JointTorque
+from flexarm_ros import cdr
 from flexarm_ros.messages import (
     CompositeStateWriter,
     ObserverStateWriter,
@@ -122,6 +123,54 @@ def test_names_in_another_order_are_put_in_the_arms_and_the_next_message_in_its_
         assert (sample.torque - sample.position).tolist() == [6.0] * 3
         assert sample.strain.tolist() == strain
         assert sample.amplitude.tolist() == amplitude
+
+
+@st.composite
+def shapes(draw):
+    """Names in some order, and which arrays there are; now and then what no `ARM` sends."""
+    orders = {
+        field: draw(st.permutations(known))
+        for field, known in (
+            ("joint_names", ARM.joint_names),
+            ("gauge_names", ARM.gauge_names),
+            ("mode_names", ARM.observed_modes),
+        )
+    }
+    if draw(st.integers(0, 9)) == 0:
+        orders[draw(st.sampled_from(list(orders)))] = ["stranger"]
+    given = {"joint_position": 3, "joint_velocity": 3, "joint_torque": 3, "strain": 4}
+    given |= {"modal_amplitude": 2, "modal_rate": 2}
+    missing = draw(st.sets(st.sampled_from(list(given)), max_size=2))
+    return orders, {field: 0 if field in missing else size for field, size in given.items()}
+
+
+def outcome(reader, message):
+    """What reading a message gives: a sample's fields as text, or the refusal."""
+    sample = ArmSample(3, 2, 4)
+    try:
+        reader.read(message, sample)
+    except MessageError as error:
+        return str(error)
+    return {
+        name: np.array(value).tolist().__repr__() if value is not None else None
+        for name in ArmSample.__slots__
+        for value in [getattr(sample, name)]
+    }
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(shapes(), min_size=1, max_size=3), st.data())
+def test_a_stream_of_bytes_is_read_as_its_messages_one_by_one(stream, data):
+    numbers = st.floats(allow_nan=True, allow_infinity=True, width=64)
+    decode, reader = cdr.Reader(ArmState), StateReader(ARM)
+    for names_, sizes in [shape for shape in stream for _ in range(3)]:
+        arrays = {f: data.draw(st.lists(numbers, min_size=n, max_size=n)) for f, n in sizes.items()}
+        message = ArmState(session=1, sequence=2, trust=data.draw(st.integers(0, 3)))
+        for field, value in {**names_, **arrays}.items():
+            setattr(message, field, list(value))
+        set_stamp(message.header.stamp, data.draw(st.integers(0, 10**18)))
+        fresh = outcome(StateReader(ARM), message)
+        assert outcome(reader, decode(serialize_message(message))) == fresh
 
 
 @pytest.mark.parametrize(
