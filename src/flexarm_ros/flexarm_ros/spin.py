@@ -91,6 +91,7 @@ class Others:
         return any(self.waits(node) for node in self._nodes)
 
     def waits(self, node):
+        """Whether a timer, message, request, answer or event of a `node` waits, those of the control path aside."""
         if any(timer.is_ready() for timer in node.timers):
             return True
         subscriptions = [

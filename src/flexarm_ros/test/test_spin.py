@@ -125,7 +125,7 @@ def test_whatever_comes_is_found_and_served(node, kind):
     executor.shutdown()
 
 
-def test_a_subscription_that_nobody_serves_is_not_looked_at(node):
+def test_a_subscription_that_is_not_to_be_served_is_not_looked_at(node):
     tap = session.Tap(node, String, "tapped")
     publisher = node.create_publisher(String, "tapped", session.DEEP)
     found, executor = others(node)
