@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
 from flexarm_control.low_pass import LowPass
+from flexarm_control.robust import design as design_module
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Gradients, Slowest, Wanted, eigenvalues
@@ -21,6 +22,7 @@ from flexarm_control.robust.nonsmooth import minimise
 from flexarm_control.robust.search import start
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
+    STICKING,
     Uncertainty,
     configurations,
     reach,
@@ -122,6 +124,51 @@ def test_the_delay_is_that_of_the_full_order_loop(two_link, delay):
     theirs = np.linalg.eigvals(closed_loop(law, q, h, delay))
     for z in theirs[np.abs(theirs) > 1e-6]:
         assert np.abs(mine - z).min() < 1e-6
+
+
+def test_friction_that_is_cancelled_damps_no_loop_that_sticks(two_link):
+    """All of it, at once: the loop without friction. Half of it: with half the damper."""
+    friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
+    rough = build(
+        replace(
+            two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+        )
+    )
+    q, h = np.array([0.0, 0.7]), 1e-5
+
+    def poles(friction, sticking):
+        sampling = Sampling(h, 0.0, np.inf, 300.0, friction=friction)
+        F = sampled_loop(rough, rough, q, sampling, sticking=sticking).F
+        z = np.linalg.eigvals(F)
+        s = np.log(z[np.abs(z) > 0.9]) / h
+        return np.sort_complex(s[(np.abs(s) > 1.0) & (np.abs(s) < 100.0)])
+
+    assert_allclose(poles(1.0, 1.0), poles(0.0, 0.0), rtol=3e-3)
+    assert_allclose(poles(0.5, 1.0), poles(0.0, 0.5), rtol=3e-3)
+    assert np.abs(poles(0.0, 1.0)[:2] - poles(0.0, 0.0)[:2]).max() > 0.1
+
+
+def test_an_arm_with_coulomb_friction_sticks_with_every_payload_and_for_movements_of_several_sizes(
+    designed,
+):
+    arm, samples = designed.arm, Sampling(2e-3, 2e-3, 300.0, 300.0)
+    rough = tuple(replace(j, friction=replace(j.friction, coulomb=0.5)) for j in arm.joints)
+    loops = uncertain_loops(
+        build(replace(arm, joints=rough)), np.zeros((1, 1)), samples, Uncertainty()
+    )
+    sticking = [loop for loop in loops if "sticking" in loop.name]
+    assert len(sticking) == 3 * len(STICKING)
+    assert {loop.fraction for loop in sticking} == set(STICKING.values())
+    for words in ("payload x 0.7", "payload x 1.3"):
+        assert sum(words in loop.name for loop in sticking) == len(STICKING)
+
+
+def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designed, monkeypatch):
+    monkeypatch.setattr(design_module, "POOR", 10.0)
+    monkeypatch.setattr(design_module, "WORTH", 0.0)
+    found = design(designed.arm, QUICK)
+    corner = found.sampling.torque_corner
+    assert np.isfinite(corner) and found.omega_c == min(designed.omega_c, corner)
 
 
 def test_gradients_are_those_of_differences(two_link):

@@ -746,6 +746,24 @@ def test_joint_pids_integral_ends_at_its_limit_and_waits_while_the_torque_is_bey
     assert_allclose(law.integral, [0.05, -0.05], rtol=1e-12)
 
 
+def test_joint_pid_cancels_a_part_of_the_friction_that_its_motion_does_not_have(two_link):
+    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
+    rough = replace(
+        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    )
+    law = law_of("joint_pid", model.build(rough), friction=0.8, bandwidth=50.0)
+    still, ref = np.zeros(2), reference([0.0, 0.0], [0.3, -0.01])
+    law.feedback(still, still, at_rest(still))
+    law.advance(1e-3)  # the low pass is not on its way
+    qd = np.array([0.01, -0.01])
+    wanted = 0.8 * 0.5 * (np.tanh(qd / 0.02) - np.tanh(ref.velocity / 0.02))
+    assert_allclose(law.feedback(still, qd, ref), wanted, rtol=1e-12)
+    assert_array_equal(law.feedback(still, ref.velocity, ref), [0.0, 0.0])
+    with law.without_friction():
+        assert_array_equal(law.feedback(still, qd, ref), [0.0, 0.0])
+    assert_allclose(law.feedback(still, qd, ref), wanted, rtol=1e-12)
+
+
 @pytest.mark.parametrize("bandwidth", [0.0, 50.0])
 def test_a_torque_that_the_integral_takes_over_does_not_go_through_the_low_pass(arm_r, bandwidth):
     gains = {"stiffness": [9.0], "damping": [1.0], "integral": [2.0], "bandwidth": bandwidth}

@@ -41,6 +41,13 @@ def test_with_true_rates_it_is_the_full_order_loop(arm_r, fast, delay):
         assert np.abs(found - pole).min() < 1e-3 * max(abs(pole), 1.0)
 
 
+def rubbing(arm):
+    """The arm with Coulomb friction in its joints."""
+    friction = [replace(j.friction, coulomb=0.2) for j in arm.joints]
+    joints = zip(arm.joints, friction, strict=True)
+    return replace(arm, joints=tuple(replace(j, friction=f) for j, f in joints))
+
+
 @pytest.mark.parametrize("velocity", [False, True])
 @pytest.mark.parametrize("bandwidth", [0.0, 60.0])
 def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity, bandwidth):
@@ -66,6 +73,21 @@ def test_with_filters_and_integral_it_is_the_loop_of_a_design(two_link, velocity
     found = np.linalg.eigvals(WholeLoop(made, 0.0015).matrix())
     for pole in z[np.abs(z) > 0.5]:
         assert np.abs(found - pole).min() < 1e-5
+
+
+def test_friction_and_what_cancels_it_are_left_out(two_link):
+    """A joint that slides has a friction that does not change; one that rests would be negatively damped."""
+
+    def made(friction):
+        law = design(
+            build(rubbing(two_link.arm)),
+            {"type": "joint_pid", "stiffness": [20.0, 5.0], "friction": friction},
+            {"type": "none"}, {"type": "reference"}, NO_CHECK,
+        )  # fmt: skip
+        observer = observe(two_link, "filtered_derivative", {"bandwidth": 300.0})
+        return linear_controller(law, observer, np.array([0.3, 0.5]), T)
+
+    assert_allclose(made(0.8).D, made(0.0).D, atol=1e-9)
 
 
 def test_an_observer_that_jumps_at_a_tenth_of_a_radian_is_asked_beside_it(arm_r):

@@ -43,7 +43,8 @@ def linear_law(law, q):
         plain.step(a, ad, delta, delta_d, reference)
         return np.concatenate([plain.slow_torque, plain.deviation])
 
-    both = jacobian(response, state_at_rest(model, q))
+    with law.slow.without_friction():
+        both = jacobian(response, state_at_rest(model, q))
     return both[:n], both[n:]
 
 

@@ -52,6 +52,13 @@ TRANSPORT = 1e-3
 HARDLY, FAST = 1.0, 0.5
 #: Where scheduled gains reach less of the decay than this, one set for all is tried, too [-].
 LITTLE = 0.05
+#: Where that reaches less than this, low passes are tried that end the torque's reach: of faster modes only their own
+#: damping is asked. Taken where the decay is so many times larger [-].
+POOR, WORTH = 0.25, 1.3
+#: Of the progress, the part of the usual search.
+USUAL = 0.6
+#: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth.
+CANCELLED = 0.8
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 
@@ -193,6 +200,8 @@ class Design:
         finite = np.isfinite(self.sampling.torque_corner)
         corner = numbers([self.sampling.torque_corner])[0] if finite else 0.0
         at = {"schedule": numbers(self.configurations)} if self.scheduled else {}
+        cancelled = self.sampling.friction
+        friction = {"slow.friction": cancelled} if cancelled else {}
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -203,6 +212,7 @@ class Design:
             "slow.integral": numbers([np.diag(one[:, 2 * n : 3 * n]) for one in K]),
             **{f"slow.{name}": values for name, values in at.items()},
             "slow.bandwidth": corner,
+            **friction,
             "fast.type": "none",
         }
         if K.shape[2] > 3 * n:
@@ -293,7 +303,9 @@ def sampling_for(nominal, at, settings):
     h = 1.0 / settings.rate
     omega_c = reach(nominal, at, settings.delay + 0.5 * h)
     corner = min(settings.rate, FILTER * omega_c)
-    return Sampling(h, settings.delay, corner, corner), omega_c
+    rubs = any(joint.friction.coulomb for joint in nominal.arm.joints)
+    friction = CANCELLED if rubs else 0.0
+    return Sampling(h, settings.delay, corner, corner, friction=friction), omega_c
 
 
 def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
@@ -320,13 +332,32 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         Where the arm rests in no configuration, or has nothing to measure its bending by.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
-    task = _Task(arm, settings, uncertainty)
-    several = len(task.at) > 1 and matters(task.nominal).any()
-    sets = task.scheduled(progress, gains) if several else None
-    if sets is None or sets.decay < LITTLE:
-        alone = task.alone(progress, gains)
-        sets = alone if sets is None or alone.decay > sets.decay else sets
-    return task.design(sets)
+    task, say = _Task(arm, settings, uncertainty), _Progress(progress)
+    found = task.found(say.part(0.0, USUAL), gains)
+    if found.decay < POOR * task.speed:
+        short = _Task(arm, settings, uncertainty, short=True)
+        other = short.found(say.part(USUAL, 1.0), gains)
+        if other.decay > max(WORTH * found.decay, 0.0):
+            task, found = short, other
+    say.part(0.0, 1.0)(1.0, found.decay)
+    return task.design(found)
+
+
+class _Progress:
+    """Fractions of a whole work from those of its parts: they do not fall."""
+
+    def __init__(self, progress):
+        self._progress, self._most = progress, 0.0
+
+    def part(self, begin, end):
+        """Takes the fraction of a part, and the decay that is reached."""
+
+        def say(fraction, decay):
+            self._most = max(self._most, begin + (end - begin) * fraction)
+            if self._progress is not None:
+                self._progress(self._most, decay)
+
+        return say
 
 
 class _Sets(NamedTuple):
@@ -347,17 +378,29 @@ class _Sets(NamedTuple):
 
 
 class _Task:
-    """One design: what is searched, in one set of gains or in several."""
+    """One design: what is searched, in one set of gains or in several; `short`: with low passes that end the reach."""
 
-    def __init__(self, arm, settings, uncertainty):
+    def __init__(self, arm, settings, uncertainty, short=False):
+        self._short = short
+        self._low_passes = LOW_PASS[1:] if short else LOW_PASS
         self.arm, self.settings, self.uncertainty = arm, settings, uncertainty
         self.nominal = nominal = build(arm.known)
-        self.at = places(nominal, settings)
+        self.at = at = places(nominal, settings)
+        if not matters(nominal).any():
+            self.at = at[:1]  # the same loops everywhere
         self.omega_1 = lowest(nominal)
         self.sampling, self.omega_c = sampling_for(nominal, self.at, settings)
         self.wanted = Wanted(self.omega_1, self.omega_c, own_damping(arm, uncertainty))
         self.scale = units(nominal, self.at, self.omega_1)
         self.speed = max(settings.speed, 0.05)
+
+    def found(self, progress, gains):
+        """The better one of a set for each configuration and, where that reaches little, one for all."""
+        sets = self.scheduled(progress, gains) if len(self.at) > 1 else None
+        if sets is not None and sets.decay >= LITTLE:
+            return sets
+        alone = self.alone(progress, gains)
+        return alone if sets is None or alone.decay > sets.decay else sets
 
     def alone(self, progress, gains):
         """One set for all configurations."""
@@ -380,7 +423,8 @@ class _Task:
         chosen, x = race(searches, self.settings.effort, say)
         found, used = [(searches[chosen][0], x)], sum(one.evaluations for one, _ in searches)
         for k in range(1, count):
-            search, starts = self._search(LOW_PASS[chosen], self.at[k : k + 1], k + 1)
+            low_pass = self._low_passes[chosen]
+            search, starts = self._search(low_pass, self.at[k : k + 1], k + 1)
             near = min((x for _, x in found), key=search.value)
             found.append((search, follow(search, [near, starts[0]], self.settings.effort)))
             used += search.evaluations
@@ -405,13 +449,19 @@ class _Task:
         return self._sets(whole, x, used)
 
     def _together_search(self, loops, weights, sampling):
-        slowest = SlowestScheduled(loops, self.wanted, self.scale, weights)
+        wanted = self._wanted(sampling.torque_corner)
+        slowest = SlowestScheduled(loops, wanted, self.scale, weights)
         noise = Noise(slowest, self.nominal, sampling, self.speed * NOISIEST, self.omega_1)
         return Search(slowest, noise, self.speed * FASTEST, sampling=sampling)
 
+    def _wanted(self, corner):
+        """What is asked of poles when the torque passes a low pass of a `corner`."""
+        reach = min(self.wanted.omega_c, corner) if self._short else self.wanted.omega_c
+        return replace(self.wanted, omega_c=reach)
+
     def _searches(self, at, gains):
         """A search with each low pass, and its starts."""
-        found = [self._search(factor, at) for factor in LOW_PASS]
+        found = [self._search(factor, at) for factor in self._low_passes]
         if gains is None:
             return found
         return [(search, [*starts, search.slowest.scaled(gains)]) for search, starts in found]
@@ -422,7 +472,7 @@ class _Task:
         samples = replace(self.sampling, torque_corner=corner)
         several = len(self.at) > 1
         loops = uncertain_loops(self.nominal, at, samples, self.uncertainty, first, every=several)
-        slowest = Slowest(loops, self.wanted, self.scale)
+        slowest = Slowest(loops, self._wanted(corner), self.scale)
         noise = Noise(slowest, self.nominal, samples, self.speed * NOISIEST, self.omega_1)
         late = samples.delay + 0.5 * samples.period + 1.0 / samples.joint_corner + POLES / corner
         starts = [start(self.nominal, at, self.scale, a, late, corner) for a in STARTS]
@@ -453,7 +503,7 @@ class _Task:
             sets.K[0],
             sets.decay,
             self.omega_1,
-            self.omega_c,
+            self._wanted(sets.sampling.torque_corner).omega_c,
             self.at,
             sets.rows,
             sets.left,

@@ -36,6 +36,9 @@ class Sampling:
     joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
     modal_corner: float  # of that of modal amplitudes [rad/s]
     torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
+    friction: float = (
+        0.0  # part of the file's Coulomb friction that is cancelled, `slow.friction` [-]
+    )
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ def measured_amplitudes(nominal, plant):
     return map_.inverse @ (gains[:, None] * gauge_rows(plant, nominal.arm.gauges))
 
 
-def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, coulomb=False):
+def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, sticking=0.0):
     """The `Loop` of a `plant` at rest in q (n,) [rad] under a control that knows the `nominal` model.
 
     Parameters
@@ -72,11 +75,11 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
         Of the loop.
     fraction : float
         Of the decay that is asked of it [-].
-    coulomb : bool
-        With Coulomb friction as steep as at rest.
+    sticking : float
+        Coulomb friction as a damper: 1.0 as steep as at rest, less as a larger movement meets it, 0.0 none [-].
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
-    A, B = linear_plant(plant, np.asarray(q, float), coulomb)
+    A, B = _plant(plant, np.asarray(q, float), sticking)
     B = gain * B
     h, size, p = sampling.period, A.shape[0], n + m
     C = np.zeros((p, size))
@@ -118,6 +121,10 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
         low_pass = LowPass(n, sampling.torque_corner).state_space(h)
         F[passed, passed], G[passed], out[:, passed], through = low_pass
 
+    if sticking:
+        _, coulomb, smoothing = nominal.friction_table().T
+        out += (sampling.friction * sticking) * (coulomb / smoothing)[:, None] * rate[:n]
+
     def add(matrix, age):
         if age:
             at = total - n * age
@@ -142,3 +149,11 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, c
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
     return Loop(name, F, G, N, h, fraction)
+
+
+def _plant(plant, q, sticking):
+    """A and B of the `plant` at rest with a part of its Coulomb friction's damper at rest, see `sampled_loop`."""
+    A, B = linear_plant(plant, q, coulomb=False)
+    if not sticking:
+        return A, B
+    return (1.0 - sticking) * A + sticking * linear_plant(plant, q, coulomb=True)[0], B

@@ -14,9 +14,11 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops with another gain or delay, and of an arm that sticks: that one creeps,
-#: as slowly as its friction is large beside its stiffness.
-UNLIKELY, STICKING = 0.5, 0.05
+#: Fraction of the decay that is asked of loops with another gain or delay.
+UNLIKELY = 0.5
+#: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
+#: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
+STICKING = {1.0: 0.1, 0.1: 0.3}
 #: Damping ratio that every mode is taken to have at least [-].
 MIN_DAMPING = 1e-4
 
@@ -112,8 +114,9 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, 
     these with measured joint speeds and without delay; then the arm with the file's modes alone, once with filtered and
     once with measured joint speeds: a mode beyond the file's lets a joint give way, and gains may hold with it that do
     not hold without it. In the first configuration a loop with more and one with less gain, one that is later, and one
-    whose joint speeds are measured. An arm with Coulomb friction also sticks: linear at rest, with the friction as
-    steep as its smoothing makes it.
+    whose joint speeds are measured. An arm with Coulomb friction also sticks, each of the three: its friction is a
+    damper, as steep at rest as its smoothing makes it, and less for larger movements, by the first harmonic. What is
+    stable with every part of it does not hunt.
 
     Parameters
     ----------
@@ -184,9 +187,21 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, 
             kinds[", joint speeds measured, no delay"] = sooner
         out += _own_modes(nominal, own, at, kinds, first)
     if sticking and any(joint.friction.coulomb for joint in arm.joints):
-        for i, q in enumerate(at, first):
-            name = f"sticking, at configuration {i}"
-            out.append(sampled_loop(nominal, stated, q, sampling, 1.0, name, STICKING, True))
+        out += _sticking(nominal, plants, at, sampling, first)
+    return out
+
+
+def _sticking(nominal, plants, at, sampling, first):
+    """Loops of `plants`, by their names, with the damper that Coulomb friction is for small movements."""
+    out = []
+    for i, q in enumerate(at, first):
+        for name, plant in plants.items():
+            for part, fraction in STICKING.items():
+                words = f"sticking, {part:g} of its friction, {name}, at configuration {i}"
+                if rests(plant, q):
+                    out.append(
+                        sampled_loop(nominal, plant, q, sampling, 1.0, words, fraction, part)
+                    )
     return out
 
 

@@ -211,11 +211,12 @@ def linear_controller(law, observer, q, period, source=None):
     q, source = np.asarray(q, float), source or Source()
     for beside in BESIDE:
         place = q + beside * np.cos(1.0 + np.arange(q.size))
-        asked = _Asked(law, observer, place, period, source)
-        for step in STEPS:
-            found = _differenced(asked, step)
-            if found is not None:
-                return found
+        with law.slow.without_friction():
+            asked = _Asked(law, observer, place, period, source)
+            for step in STEPS:
+                found = _differenced(asked, step)
+                if found is not None:
+                    return found
     raise DesignError("jumps at rest: there is no linear loop", field="observer or law")
 
 

@@ -2,6 +2,7 @@
 """Base class of slow laws."""
 
 from abc import ABC, abstractmethod
+from contextlib import nullcontext
 
 import numpy as np
 
@@ -59,6 +60,10 @@ class SlowLaw(Law, ABC):
     def feedback(self, q, qd, motion):
         """Torque beyond the `nominal` one on a `motion`, shape (n,) [N m]; of a `separate` law."""
         raise NotImplementedError
+
+    def without_friction(self):
+        """Within this context the law cancels no friction beyond its `nominal` torque, as where a joint slides fast."""
+        return nullcontext()
 
     def saw(self, torque):
         """Take note of the whole torque (n,) [N m] that this sample asks for, before any limit."""

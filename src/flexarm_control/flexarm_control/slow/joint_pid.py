@@ -14,15 +14,27 @@ file says. The integral leaves no error at rest under a payload, friction or wei
 motion that the model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is
 beyond the joint's.
 
+Friction holds a joint where its error is small: the integral moves it on slowly, and a vibration whose torque is less
+than the friction is not damped. So a part :math:`\gamma` of the arm file's Coulomb friction, less that of the motion,
+which :math:`\bar u` has, is added without the low pass:
+
+.. math:: u_f = \gamma\,f_c\,[\tanh(\dot q/v_s) - \tanh(\dot q_{ref}/v_s)] .
+
+With :math:`\gamma` below 1 friction is left over, whatever the delay: by itself it moves no joint. In turn, where the
+friction is less than :math:`\gamma` of the file's, small movements grow. Linear loops are judged without both.
+
 The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
 an angle: a change of K_w does not move it.
 """
+
+from contextlib import contextmanager
 
 import numpy as np
 
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_torque
 
+from ..arrays import some
 from ..low_pass import BANDWIDTH, LowPass
 from ..schedule import SCHEDULE, Schedule
 from .base import SlowLaw
@@ -55,6 +67,10 @@ class JointPid(SlowLaw):
         parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
+        parameter("friction", 0.0, "-", 0.0, 1.0).described(
+            "Part of the arm file's Coulomb friction that joint_pid cancels where a joint moves otherwise than its"
+            " motion; a joint with less friction than that part may hunt."
+        ),
         SCHEDULE,
         BANDWIDTH,
     )
@@ -70,6 +86,17 @@ class JointPid(SlowLaw):
         self.integral, self._error, self._beyond = np.zeros(n), np.zeros(n), np.zeros(n)
         self._known = b"", np.zeros(n)
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
+        _, coulomb, self._smoothing = model.friction_table().T.copy()
+        self._cancelled = self.parameters["friction"] * coulomb
+        self._slides, self._expected = np.zeros(n), np.zeros(n)
+
+    @contextmanager
+    def without_friction(self):
+        cancelled, self._cancelled = self._cancelled, np.zeros_like(self._cancelled)
+        try:
+            yield
+        finally:
+            self._cancelled = cancelled
 
     @property
     def stiffness(self):
@@ -114,7 +141,19 @@ class JointPid(SlowLaw):
         u = stiffness * self._error
         u += damping * (motion.velocity - qd)
         u += self.integral
-        return self._low_pass(u)
+        u = self._low_pass(u)
+        if some(self._cancelled):
+            u += self._friction(qd, motion.velocity)
+        return u
+
+    def _friction(self, qd, expected):
+        """What is cancelled of the friction at joint speeds qd, beyond that of the `expected` ones, (n,) [N m]."""
+        for speed, out in ((qd, self._slides), (expected, self._expected)):
+            np.divide(speed, self._smoothing, out=out)
+            np.tanh(out, out=out)
+        self._slides -= self._expected
+        self._slides *= self._cancelled
+        return self._slides
 
     def absorb(self, torque):
         before = self.integral.copy()
