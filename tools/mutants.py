@@ -372,8 +372,8 @@ LAWS = [
         (
             "uncertain",
             "a joint that sticks: as much decay as of one that turns",
-            "UNLIKELY, STICKING = 0.5, 0.05",
-            "UNLIKELY, STICKING = 0.5, 0.4",
+            "STICKING = {1.0: 0.1, 0.1: 0.3}",
+            "STICKING = {1.0: 0.8, 0.1: 0.9}",
         ),
         (
             "search",
