@@ -102,3 +102,37 @@ def test_what_rings_is_found_window_by_window(real_arm, flexarm):
         assert 3.0 < mode["frequency_hz"] < 3.3 and mode["frequency_half_width_hz"] < 0.02
         width = mode["damping_half_width"]
         assert 0.006 - width < mode["damping"] < 0.03 and width < 0.006
+
+
+RESONANCE = Path(__file__).resolve().parents[1] / "docs" / "resonance.md"
+
+
+def lowest_modes():
+    """The rows of the table of docs/resonance.md that lie between 3.0 and 3.3 Hz: (window, frequency, damping [%])."""
+    rows = []
+    for line in RESONANCE.read_text(encoding="utf-8").splitlines():
+        cells = line.strip("| ").split(" | ")
+        if len(cells) == 5 and cells[0].endswith(" s"):
+            frequency, damping = (float(cell.split(" ± ")[0]) for cell in cells[2:4])
+            rows.append((cells[0].removesuffix(" s").replace(" to ", ":"), frequency, damping))
+    return [row for row in rows if 3.0 < row[1] < 3.3]
+
+
+def test_its_ring_downs_have_the_frequency_and_damping_of_the_page_window_by_window(
+    real_arm, flexarm
+):
+    rows = lowest_modes()
+    assert len(rows) == 10
+    listed = [row for row in rows if int(row[0].split(".")[0]) in (17, 28, 54, 60, 76)]
+    windows = [word for row in listed for word in ("--window", row[0])]
+    code, printed, err = flexarm(
+        "resonance", real_arm / "exp1.csv", "--mapping", "tudor", *windows, "--json"
+    )
+    assert code == 0, err
+    for window, (_, frequency, damping) in zip(json.loads(printed)["windows"], listed, strict=True):
+        mode = min(window["modes"], key=lambda m: abs(m["frequency_hz"] - 3.1))
+        assert 3.0 < mode["frequency_hz"] < 3.3
+        assert 0.005 < mode["damping"] < 0.03
+        # A window whose ends were rounded has a sample more or less.
+        assert mode["frequency_hz"] == pytest.approx(frequency, abs=0.01)
+        assert mode["damping"] == pytest.approx(damping / 100.0, abs=0.002)
