@@ -2,6 +2,7 @@
 """From recordings to shapers: windows, families of modes, recommendations, what a trajectory excites."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from flexarm_control.motions.profiles import quintic, sample
 from flexarm_control.shaping import modes
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import check_all
-from flexarm_studies.resonance import effect, recommendation, time_law, windows
+from flexarm_studies.resonance import effect, recommendation, retiming, time_law, windows
 from flexarm_studies.resonance import study as studies
 from flexarm_studies.resonance.families import dependence, families
 from flexarm_studies.resonance.fit import Fit, Mode
@@ -84,6 +85,8 @@ def test_the_text_a_named_window_a_figure_and_a_trajectory(tmp_path, flexarm):
     ]
     left = {line.split()[0]: float(line.split()[-1]) for line in rows}
     assert left["zv"] < 0.3 * left["none"] and left["ei"] < 0.1 * left["none"]
+    best = out.split("best for this trajectory: ")[1].split(",")[0]
+    assert f"    shaper.type: {best}" in out and left[best] < 0.06 * left["none"]
 
 
 REFUSED = [
@@ -279,9 +282,9 @@ def study_of(rings, n):
     return studies.of_windows(found, rings, studies.Wishes())
 
 
-def node_of(made):
+def node_of(made, motion=None):
     """The modes that the node `shaper` makes of the lines to paste."""
-    given = yaml.safe_load("\n".join(studies.yaml_lines(made)))["shaper"]["ros__parameters"]
+    given = yaml.safe_load("\n".join(studies.yaml_lines(made, motion)))["shaper"]["ros__parameters"]
     names = given.pop("joint_names")
     own = {key.removeprefix("shaper."): value for key, value in given.items()}
     return modes.Modes(check_all(modes.PARAMETERS, own, {"joints": len(names)}), len(names)), own
@@ -315,6 +318,30 @@ def test_what_a_trajectory_leaves_is_what_integration_finds(fields, tmp_path):
     profile = quintic([0.0], [0.5], 0.5)
     wanted = vibration(lambda t: profile.acceleration(t)[0], 0.5, 3.0, 0.01)
     assert effect.left(time, change, [pole])[0, 0] == pytest.approx(wanted, rel=0.02)
+
+
+def test_for_a_move_the_new_time_law_is_recommended_with_its_lines_where_it_is_the_quickest():
+    made = study_of([window([0.0], (3.0, 0.01, 1.0)), window([0.1], (3.3, 0.02, 1.0))], 1)
+    rows = studies.of_trajectory(made, retiming.of_move(Move(1.0, 1.5, 6.0)))
+    best = effect.recommended(rows, 0.05)
+    quickest = min(r["added_s"] for r in rows if r["residual"] <= 0.05 and r["kind"] in effect.NODE)
+    assert best["kind"] == "retimed" and best["added_s"] == quickest
+    # What the time law predicts is what the motion leaves of the modes.
+    ratio = best["amplitude_rad"][0] / rows[0]["amplitude_rad"][0]
+    assert 0.005 < ratio < 0.05 and best["residual"] == pytest.approx(ratio, rel=0.3)
+    node, own = node_of(made, rows)
+    assert own["type"] == "retimed"
+    assert own["periods"] == pytest.approx(best["periods"], abs=1e-3)
+    assert node.spread == pytest.approx(best["spread"], abs=1e-3)
+
+
+def test_what_has_no_new_time_law_is_shaped():
+    made = study_of([window([0.0], (3.0, 0.01, 1.0)), window([0.1], (3.3, 0.02, 1.0))], 1)
+    move = retiming.of_move(Move(0.1, 1.5, 6.0))
+    assert move.times.size == 3  # a triangle of speed
+    rows = studies.of_trajectory(made, replace(move, velocities=None))
+    assert "retimed" not in [row["kind"] for row in rows]
+    assert effect.recommended(rows, 0.05)["kind"] != "retimed"
 
 
 def test_a_trajectory_in_yaml_has_its_own_joints(tmp_path):

@@ -67,11 +67,7 @@ def along(motion):
     size = float(motion.angle @ motion.angle)
     if size == 0.0 or motion.fields == 1:
         return None
-
-    def progress(order, times):
-        values = motion.derivative(order, times)
-        return (values if order else values - motion.start) @ motion.angle / size
-
+    progress = _progress(motion)
     times = np.linspace(motion.knots[0], motion.knots[-1], PLACES)
     sigma = progress(0, times)
     away = motion.position(times) - motion.start - sigma[:, None] * motion.angle
@@ -80,6 +76,16 @@ def along(motion):
     straight = np.abs(away).max() <= STRAIGHT * np.sqrt(size)
     steady = (np.diff(sigma) >= -STRAIGHT).all() and (still <= STRAIGHT).all()
     return progress if straight and steady else None
+
+
+def _progress(motion):
+    size = float(motion.angle @ motion.angle)
+
+    def progress(order, times):
+        values = motion.derivative(order, times)
+        return (values if order else values - motion.start) @ motion.angle / size
+
+    return progress
 
 
 def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
@@ -128,6 +134,23 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf):
     times = np.linspace(*motion.knots[[0, -1]], law.middles.size)
     x = law.solution(norms, progress(0, times))
     return None if x is None else (law, norms, x)
+
+
+def leaves(motion, modes):
+    """What a straight motion leaves of each mode, at factors of the frequencies over the spread.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+        On a straight line, as of `along` or `retimed`.
+    modes : Modes
+
+    Returns
+    -------
+    list of (factors,) ndarrays
+        The amplitudes |z|, with the measured frequencies in the middle [1/s].
+    """
+    return Line(motion, modes, _progress(motion)).remains()
 
 
 def stopped(motion, modes, time):
@@ -195,9 +218,12 @@ class Line:
 
     def norms(self):
         """What the motion leaves of each mode, at least `FLOOR` of its largest, list of (factors,)."""
+        return [np.maximum(values, FLOOR * values.max()) for values in self.remains()]
+
+    def remains(self):
+        """What the motion leaves of each mode, list of (factors,)."""
         progress, steps, bend = self.history(self.motion.knots[-1])
-        left = [np.abs(values[:, 0]) for values in self.left(progress, steps, bend[:, None])]
-        return [np.maximum(values, FLOOR * values.max()) for values in left]
+        return [np.abs(values[:, 0]) for values in self.left(progress, steps, bend[:, None])]
 
     def left(self, progress, steps, parts):
         """What accelerations (k, p) in cells of durations `steps` leave of each mode, list of (factors, p) complex."""

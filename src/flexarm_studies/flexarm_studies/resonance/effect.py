@@ -12,11 +12,14 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import BPoly
 
+from flexarm_control.shaping.modes import KINDS
 from flexarm_control.trajectory import files
 from flexarm_dynamics.errors import TrajectoryError
 
 from .recommendation import BY_PROGRAMME, SMOOTH, box, impulses, train_of
 
+#: Types of the node `shaper`, which can be recommended; ``none`` where no more is wanted.
+NODE = KINDS
 #: Times per period of the fastest mode, and at most so many in all.
 PER_PERIOD, MOST = 40, 200_000
 
@@ -116,7 +119,7 @@ def left(time, change, poles):
     return np.abs(response) / np.abs(poles)[:, None]
 
 
-def of_trajectory(trajectory, spreads, candidates):
+def of_trajectory(trajectory, spreads, candidates, retimed=None):
     """What a motion leaves of each mode, as it is and with each candidate.
 
     Parameters
@@ -124,14 +127,18 @@ def of_trajectory(trajectory, spreads, candidates):
     trajectory : JointTrajectoryData
     spreads : sequence of Spread
     candidates : sequence of Candidate
-        Those with a kernel; ``least_exciting`` is left out.
+        Those with a kernel; ``least_exciting`` is left out. The first is ``none``.
+    retimed : tuple of Candidate and JointTrajectoryData, optional
+        As of `retiming.retimed`.
 
     Returns
     -------
     list of dict
-        Of each candidate: kind, duration_s, amplitude_rad (per mode, the worst joint and pole).
+        Of each candidate: kind, duration_s, added_s, residual (over the motion as it is; predicted), amplitude_rad (per
+        mode, the worst joint and pole), modes, spread and periods (as of `Candidate`).
     """
-    time, change = steps(trajectory, max(s.high for s in spreads))
+    fastest = max(s.high for s in spreads)
+    time, change = steps(trajectory, fastest)
     now = [left(time, change, s.poles()) for s in spreads]
     rows = []
     for candidate in candidates:
@@ -142,9 +149,47 @@ def of_trajectory(trajectory, spreads, candidates):
             float((a * np.abs(response(s.poles()))[:, None]).max())
             for a, s in zip(now, spreads, strict=True)
         ]
-        duration = float(time[-1]) + candidate.delay
-        rows.append({"kind": candidate.kind, "duration_s": duration, "amplitude_rad": after})
+        rows.append(_row(candidate, time, after))
+    part = np.array([s.part for s in spreads])
+    before = np.maximum(rows[0]["amplitude_rad"], np.finfo(float).tiny)
+    for row in rows:
+        ratio = np.array(row["amplitude_rad"]) / before
+        row["residual"] = float(np.sqrt(part @ ratio**2 / part.sum()))
+    if retimed is not None:
+        candidate, law = retimed
+        own, change = steps(law, fastest)
+        after = [float(left(own, change, s.poles()).max()) for s in spreads]
+        rows.append({**_row(candidate, time, after), "residual": candidate.residual})
     return rows
+
+
+def _row(candidate, time, amplitudes):
+    return {
+        "kind": candidate.kind,
+        "duration_s": float(time[-1]) + candidate.delay,
+        "added_s": candidate.delay,
+        "amplitude_rad": amplitudes,
+        "modes": list(candidate.modes),
+        "spread": candidate.spread,
+        "periods": candidate.periods,
+    }
+
+
+def recommended(rows, residual):
+    """The row of the node's shaper that is quickest and leaves what is wanted, or leaves least.
+
+    Parameters
+    ----------
+    rows : list of dict
+        As of `of_trajectory`.
+    residual : float
+        Wanted [-].
+    """
+    own = [row for row in rows if row["kind"] in NODE]
+    enough = [row for row in own if row["residual"] <= residual]
+    if enough:
+        return min(enough, key=lambda row: (row["added_s"], row["residual"]))
+    return min(own, key=lambda row: row["residual"])
 
 
 def _response(candidate, spreads):

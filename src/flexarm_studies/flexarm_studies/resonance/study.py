@@ -7,10 +7,10 @@ import numpy as np
 
 from flexarm_dynamics.errors import FlexarmError
 
-from . import effect, windows
+from . import effect, retiming, windows
 from .families import dependence, families
 from .fit import HIGHEST
-from .recommendation import BY_PROGRAMME, LONGEST, ROBUST, WIDEST, Spread, recommend, widened
+from .recommendation import BY_PROGRAMME, LONGEST, WIDEST, Spread, recommend, widened
 from .time_law import Move
 
 #: A mode that takes part in less than this fraction of the vibration's energy is not shaped for [-].
@@ -135,19 +135,21 @@ def of_windows(found, rings, wishes) -> Study:
     return Study(found, rings, modes, shaped, recommend(shaped, wishes.residual, wishes.move))
 
 
-def by_configuration(made):
+def by_configuration(made, modes=None):
     """The shaped modes of each configuration, for a shaper that goes with the joints.
 
     Parameters
     ----------
     made : Study
+    modes : sequence of int, optional
+        Which; not given: those of the recommended shaper.
 
     Returns
     -------
     list of (ndarray, list of Spread)
         Configuration [rad] and its modes; empty where no mode depends on the joints.
     """
-    modes = made.recommendation.chosen.modes
+    modes = made.recommendation.chosen.modes if modes is None else modes
     shaped = [f for f in made.families if f.part > MIN_PART]
     laws = [dependence(shaped[k], made.windows) for k in modes]
     if not any(law is not None and law.counts for law in laws):
@@ -174,8 +176,8 @@ def _places(rings):
 # As plain data -------------------------------------------------------------------------------
 
 
-def plain(made):
-    """All that was found, ready for JSON: numbers in SI."""
+def plain(made, motion=None):
+    """All that was found, ready for JSON: numbers in SI; `motion` as of `yaml_lines`."""
     names = made.channels.joint_names
     return {
         "channels": list(made.channels.names),
@@ -183,7 +185,7 @@ def plain(made):
         "windows": [_window(w) for w in made.windows],
         "modes": [_family(f, made.windows) for f in made.families],
         "recommendation": _recommendation(made),
-        "yaml": yaml_lines(made),
+        "yaml": yaml_lines(made, motion),
     }
 
 
@@ -255,30 +257,49 @@ def _recommendation(made):
     }
 
 
-def yaml_lines(made):
-    """Parameters of the node `shaper`, a list of lines to paste."""
-    chosen = made.recommendation.chosen
-    shaped = [made.spreads[k] for k in chosen.modes]
-    places = by_configuration(made)
+def yaml_lines(made, motion=None):
+    """Parameters of the node `shaper`, a list of lines to paste.
+
+    Parameters
+    ----------
+    made : Study
+    motion : list of dict, optional
+        As of `of_trajectory`: the lines are those of the shaper recommended for this motion.
+    """
+    kind, modes, spread, periods = _recommended(made, motion)
+    shaped = [made.spreads[k] for k in modes]
+    places = by_configuration(made, modes)
     rows = [here for _, here in places] or [shaped]
     lines = [
         "shaper:",
         "  ros__parameters:",
-        f"    shaper.type: {chosen.kind}",
-        f"    shaper.frequencies: {_floats([s.frequency for row in rows for s in row])}",
-        f"    shaper.dampings: {_floats([s.damping for row in rows for s in row])}",
+        f"    shaper.type: {kind}",
     ]
+    if modes:
+        lines += [
+            f"    shaper.frequencies: {_floats([s.frequency for row in rows for s in row])}",
+            f"    shaper.dampings: {_floats([s.damping for row in rows for s in row])}",
+        ]
     if made.channels.joint_names:
         lines.insert(2, f"    joint_names: [{', '.join(made.channels.joint_names)}]")
-    if chosen.kind == ROBUST:
+    if periods:
         # Upwards: the printed number covers what was found.
         up = lambda value, most: min(float(np.ceil(1e3 * value)) / 1e3, most)  # noqa: E731
-        spread, periods = up(chosen.spread, WIDEST), up(chosen.periods, LONGEST)
+        spread, periods = up(spread, WIDEST), up(periods, LONGEST)
         lines += [f"    shaper.spread: {spread}", f"    shaper.periods: {periods}"]
     if places:
         flat = [float(q) for place, _ in places for q in place]
         lines.append(f"    shaper.configurations: {_floats(flat)}")
     return lines
+
+
+def _recommended(made, motion):
+    """Kind, modes, spread and periods of the shaper that is recommended, for a motion where one is given."""
+    if not motion:
+        chosen = made.recommendation.chosen
+        return chosen.kind, chosen.modes, chosen.spread, chosen.periods
+    row = effect.recommended(motion, made.recommendation.wanted)
+    return row["kind"], row["modes"], row["spread"], row["periods"]
 
 
 def _floats(values):
@@ -295,8 +316,9 @@ def text(made, motion=None):
     yield from _modes_text(made)
     yield from _table(made.recommendation)
     if motion:
-        yield from _motion_text(motion)
-    yield from ("", "to paste into the parameters of the node shaper:", *yaml_lines(made))
+        yield from _motion_text(motion, made.recommendation.wanted)
+    lines = yaml_lines(made, motion)
+    yield from ("", "to paste into the parameters of the node shaper:", *lines)
 
 
 def _windows_text(made):
@@ -349,24 +371,33 @@ def _table(found):
         yield f"{BY_PROGRAMME}: for one motion, against the trapezoidal one within the same limits"
 
 
-def _motion_text(rows):
-    yield "\nthe trajectory: what it leaves of each mode, per unit at the joint [mrad]"
+def _motion_text(rows, wanted):
+    yield "\nthe trajectory: its duration, the residual, and what it leaves of each mode, per unit at the joint [mrad]"
     for row in rows:
         amplitudes = "  ".join(f"{1e3 * a:9.4f}" for a in row["amplitude_rad"])
-        yield f"  {row['kind']:16} {row['duration_s']:8.3f} s {amplitudes}"
+        residual = 100.0 * row["residual"]
+        yield f"  {row['kind']:16} {row['duration_s']:8.3f} s {residual:8.2f} % {amplitudes}"
+    best = effect.recommended(rows, wanted)
+    what = f"longer by {best['added_s']:.3f} s, leaves {100.0 * best['residual']:.2f} %"
+    yield f"best for this trajectory: {best['kind']}, {what}"
 
 
-def of_trajectory(made, path):
-    """What a trajectory's file excites, now and with each candidate; see `effect.of_trajectory`.
+def of_trajectory(made, trajectory):
+    """What a trajectory excites, now, with each candidate, and with a new time law; see `effect.of_trajectory`.
 
     Parameters
     ----------
     made : Study
-    path : str or Path
+    trajectory : JointTrajectoryData
 
     Raises
     ------
     FlexarmError
-        For a file that can't be used.
+        For a trajectory that is no motion.
     """
-    return effect.of_trajectory(effect.read(path), made.spreads, made.recommendation.candidates)
+    wanted, joints = made.recommendation.wanted, trajectory.positions.shape[1]
+    places = by_configuration(made, range(len(made.spreads)))
+    if len(made.channels.joint_names) != joints:
+        places = []  # of other joints
+    law = retiming.retimed(trajectory, made.spreads, places, wanted)
+    return effect.of_trajectory(trajectory, made.spreads, made.recommendation.candidates, law)

@@ -11,8 +11,10 @@ from flexarm_studies.identification.recording import SIGNALS
 from flexarm_studies.recordings import mapping as mappings
 from flexarm_studies.recordings import streams
 from flexarm_studies.resonance import study as studies
+from flexarm_studies.resonance.effect import read as read_trajectory
 from flexarm_studies.resonance.measured import rings, save
 from flexarm_studies.resonance.motion import STEP, SWEEP, Bounds, design, measure
+from flexarm_studies.resonance.retiming import of_move
 from flexarm_studies.resonance.time_law import Move
 
 from ..identification import recording as recordings
@@ -86,10 +88,10 @@ def add_arguments(parser):
     move = DEFAULT.move
     add(
         "--move",
-        default=f"{move.distance:g}:{move.velocity:g}:{move.acceleration:g}",
         metavar="D:V:A",
-        help="motion of the least exciting time law: distance and limits [rad, rad/s, rad/s^2] (default "
-        f"{move.distance:g}:{move.velocity:g}:{move.acceleration:g})",
+        help="say what the motion of one joint over this distance within these limits excites [rad, rad/s, rad/s^2]; "
+        "also that of the least exciting time law, there by default "
+        f"{move.distance:g}:{move.velocity:g}:{move.acceleration:g}",
     )
     add(
         "--figure",
@@ -169,8 +171,8 @@ def resonance(options):
         made = studies.study(given, wishes)
     else:
         made = by_motion(options, wishes)
-    motion = studies.of_trajectory(made, options.trajectory) if options.trajectory else None
-    found = {"recordings": [str(path) for path in options.recordings]} | studies.plain(made)
+    motion = _motion(made, options, wishes)
+    found = {"recordings": [str(path) for path in options.recordings]} | studies.plain(made, motion)
     if motion is not None:
         found["trajectory"] = motion
     if options.figure:
@@ -184,6 +186,13 @@ def resonance(options):
     if "figure" in found:
         print(f"figure: {found['figure']}")
     return found
+
+
+def _motion(made, options, wishes):
+    """What the motion of ``--trajectory`` or ``--move`` excites; None without one."""
+    if options.trajectory:
+        return studies.of_trajectory(made, read_trajectory(options.trajectory))
+    return studies.of_trajectory(made, of_move(wishes.move)) if options.move else None
 
 
 def by_motion(options, wishes):
@@ -296,7 +305,7 @@ def wishes_of(options):
         high=high,
         windows=tuple(tuple(_listed("--window", w, 2)) for w in options.window),
         quantities=quantities,
-        move=Move(*_listed("--move", options.move, 3)),
+        move=Move(*_listed("--move", options.move, 3)) if options.move else DEFAULT.move,
     )
 
 
