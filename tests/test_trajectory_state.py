@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a joint_trajectory_controller shows beside its action: its state, and the reference at a time."""
 
+import re
 import sys
 import types
 
@@ -8,6 +9,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from harness import PATIENT, Arm, trajectory
 from in_process import InProcess
+from std_msgs.msg import Float64
 
 from flexarm_control.motions import profiles
 from flexarm_msgs.msg import CompositeState, JointTrajectoryControllerState
@@ -19,8 +21,12 @@ J, MS = ["joint1"], 1_000_000
 @pytest.fixture
 def control_msgs(monkeypatch):
     """Modules in its place, with our own types: the wheels have no control_msgs."""
+    monkeypatch.setattr(Float64, "factor", property(lambda self: self.data), raising=False)
     kinds = {
-        "msg": {"JointTrajectoryControllerState": JointTrajectoryControllerState},
+        "msg": {
+            "JointTrajectoryControllerState": JointTrajectoryControllerState,
+            "SpeedScalingFactor": Float64,  # a message of one number, too
+        },
         "srv": {"QueryTrajectoryState": QueryTrajectoryState},
     }
     for name, types_ in kinds.items():
@@ -32,10 +38,7 @@ def control_msgs(monkeypatch):
 
 def test_the_state_and_the_reference_at_any_time_are_served_in_both_types(control_msgs):
     with InProcess() as bench:
-        lockstep = {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02}
-        bench.start_loop(lockstep, controller={**PATIENT, "fast.type": "none"}, arm="one_link")
-        arm = Arm(bench, pauses_at=10)
-        arm.wait_standing()
+        arm = standing(bench, "one_link")
         taps = [
             bench.tap(JointTrajectoryControllerState, f"controller/{name}")
             for name in ("trajectory_state", "controller_state")
@@ -65,6 +68,26 @@ def test_the_state_and_the_reference_at_any_time_are_served_in_both_types(contro
             assert not past.success
             assert "5000000 ns is past: the arm's clock shows" in past.message
         assert arm.state.supervisor_state == CompositeState.TRACKING
+
+
+def test_a_factor_on_the_topic_is_as_the_parameter(control_msgs):
+    with InProcess() as bench:
+        arm = standing(bench, "R")
+        factor = bench.publisher(Float64, "controller/speed_scaling_input")
+        for given in (0.5, 2.0, float("nan"), -1.0):
+            factor.publish(Float64(data=given))
+            arm.run(0.01)
+            assert bench.get("controller", "speed_scaling") == 0.5
+        assert re.search("speed_scaling_input: .*speed_scaling .*2.0", bench.log("controller"))
+
+
+def standing(bench, name):
+    """An arm of this name that has torque, in lockstep, at its tenth sample."""
+    lockstep = {"lockstep": True, "pause_at": 0.01, "resend_period": 0.02}
+    bench.start_loop(lockstep, controller={**PATIENT, "fast.type": "none"}, arm=name)
+    arm = Arm(bench, pauses_at=10)
+    arm.wait_standing()
+    return arm
 
 
 def _time(ns):
