@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration
 from in_process import InProcess
 from rclpy.action import CancelResponse
 from sensor_msgs.msg import JointState
@@ -18,6 +19,7 @@ from flexarm_control.nodes.shaping_job import AHEAD
 from flexarm_control.shaping import time_law
 from flexarm_control.shaping.piecewise import PiecewiseMotion
 from flexarm_msgs.action import FollowJointTrajectory as Follow
+from flexarm_msgs.msg import JointTolerance
 from flexarm_ros.messages import set_stamp
 
 RETIMED = {"shaper.type": "retimed", "shaper.frequencies": [4.0], "shaper.dampings": [0.02]}
@@ -194,10 +196,11 @@ def test_a_stop_begins_in_time_whether_its_time_law_is_made_or_not(bench, in_tim
     assert np.abs(np.diff(shaper.positions())).max() < 1.2 * 0.9 / 125.0
 
 
-def goal(node, msg):
-    """Have the node take a goal; its handle and a list of (status, result)."""
+def goal(node, msg, **tolerances):
+    """Have the node take a goal; its handle and a list that gets its status and result."""
     ends = []
-    handle = SimpleNamespace(request=Follow.Goal(trajectory=msg), is_cancel_requested=False)
+    request = Follow.Goal(trajectory=msg, **tolerances)
+    handle = SimpleNamespace(request=request, is_cancel_requested=False)
     for name, status in (
         ("succeed", GoalStatus.STATUS_SUCCEEDED),
         ("abort", GoalStatus.STATUS_ABORTED),
@@ -230,6 +233,89 @@ def test_a_goal_that_is_cancelled_while_it_is_worked_on_ends_and_the_one_before_
     assert ends[0] == GoalStatus.STATUS_SUCCEEDED
     assert shaper.positions()[-1] == pytest.approx(0.1, abs=1e-3)
     assert shaper.node._goals.may_cancel(first) == CancelResponse.REJECT
+
+
+class Judged(Played):
+    """A goal is played to 0.1 rad, without a shaper; the joints are reported `away` from where they should be."""
+
+    def __init__(self, bench, away, speed=0.0, **tolerances):
+        super().__init__(bench, **{"shaper.type": "none"})
+        bench.wait_for("the end", lambda: not self.states.newest.moving)
+        self.away, self.speed = away, speed
+        self.report()
+        self.settle()
+        msg = message((0.0, 0.6, -0.3), (0.5, 0.1, -0.3))
+        _, self.ends = goal(self.node, msg, **tolerances)
+
+    def report(self):
+        """Joint states now."""
+        where = self.node.core.state(self.node.now_ns())[0]
+        msg = JointState(name=["a", "b"], position=[where[0] + self.away, where[1]])
+        msg.velocity = [self.speed, 0.0]
+        self.bench.publisher(JointState, "joint_states").publish(msg)
+
+    def result(self):
+        """Status and result, with joint states all the time."""
+
+        def ended():
+            self.report()
+            return self.ends
+
+        return self.bench.wait_for("the result", ended)
+
+
+def tolerance(position=0.0, velocity=0.0):
+    return [JointTolerance(name="a", position=position, velocity=velocity)]
+
+
+def test_a_played_goal_ends_once_its_joints_are_within_its_tolerances(bench):
+    judged = Judged(bench, 0.02, goal_tolerance=tolerance(0.01, 0.05))
+    bench.wait_for("the motion's end", lambda: judged.report() or not judged.states.newest.moving)
+    judged.go_on(0.1)
+    assert not judged.ends
+    judged.away, judged.speed = 0.005, 0.1
+    judged.report()
+    judged.go_on(0.1)
+    assert not judged.ends
+    judged.speed = 0.01
+    status, found = judged.result()
+    assert (status, found.error_code) == (GoalStatus.STATUS_SUCCEEDED, Follow.Result.SUCCESSFUL)
+
+
+@pytest.mark.parametrize(
+    ("tolerances", "code", "text"),
+    [
+        (
+            {"goal_tolerance": tolerance(0.01), "goal_time_tolerance": Duration(nanosec=10**8)},
+            Follow.Result.GOAL_TOLERANCE_VIOLATED,
+            "a is off by 0.02 rad, 0.01 rad are allowed",
+        ),
+        ({"path_tolerance": tolerance(0.01)}, Follow.Result.PATH_TOLERANCE_VIOLATED, "path tolerance"),
+        ({"tip_tolerance": 0.1}, Follow.Result.INVALID_GOAL, "tip_tolerance"),
+        (
+            {"path_tolerance": [JointTolerance(name="x", position=1.0)]},
+            Follow.Result.INVALID_JOINTS,
+            "path_tolerance[0].name",
+        ),
+    ],
+)  # fmt: skip
+def test_a_played_goal_beyond_its_tolerances_is_aborted_with_the_joint_and_the_limit(
+    bench, tolerances, code, text
+):
+    judged = Judged(bench, 0.02, **tolerances)
+    status, found = judged.result()
+    assert (status, found.error_code) == (GoalStatus.STATUS_ABORTED, code)
+    assert text in found.error_string
+    bench.wait_for("rest", lambda: not judged.states.newest.moving)
+    on_the_way = code == Follow.Result.PATH_TOLERANCE_VIOLATED
+    assert ("path tolerance" in judged.states.newest.stopped) == on_the_way
+
+
+def test_a_played_goal_with_tolerances_and_no_joint_states_is_aborted(bench):
+    judged = Judged(bench, 0.0, goal_tolerance=tolerance(0.01))
+    judged.node._measured_at = -np.inf  # they have not come for long
+    bench.wait_for("the result", lambda: judged.ends)
+    assert "can't be judged" in judged.ends[1].error_string
 
 
 def test_without_new_time_laws_nothing_waits_for_a_thread(bench, monkeypatch):

@@ -155,7 +155,7 @@ class GoalsNode(ArmNode):
         message = request.trajectory
         message.header.frame_id = f"goal {bytes(handle.goal_id.uuid).hex()}"
         try:
-            _refuse_what_is_not_served(request)
+            refuse_what_is_not_served(request)
             tolerances = self._tolerances(request)
         except TrajectoryError as error:
             code = goal.Code.INVALID_JOINTS if "name" in error.field else goal.Code.INVALID_GOAL
@@ -330,8 +330,13 @@ def kinds():
         return
 
 
-def _refuse_what_is_not_served(request):
-    """Refuse fields of control_msgs that no arm of ours has: joints with several degrees of freedom."""
+def refuse_what_is_not_served(request):
+    """Refuse fields of a `request` that no arm of ours has: those of joints with several degrees of freedom.
+
+    Raises
+    ------
+    TrajectoryError
+    """
     for field in ("component_path_tolerance", "component_goal_tolerance"):
         if getattr(request, field, ()):
             raise TrajectoryError("is not served", field=field, hint="leave it empty")

@@ -90,7 +90,7 @@ class ShaperNode(ArmNode):
         super().__init__("shaper", parameter_groups())
 
     def build(self):
-        names = self._names = joint_names(self.parameters["joint_names"])
+        names = self.joint_names = joint_names(self.parameters["joint_names"])
         self.parameters.resolve({"joints": len(names)})
         self._bypass = self._wanted = self._changed = False
         own = self._make_shapers()
@@ -130,7 +130,7 @@ class ShaperNode(ArmNode):
 
     def _make_shapers(self):
         """Make the shapers of the parameters, with and without bypass; their `Modes`."""
-        names, limits = self._names, self.parameters.group("limits.")
+        names, limits = self.joint_names, self.parameters.group("limits.")
         own = Modes(self.parameters.group(GROUP), len(names))
         none = Modes({**self.parameters.group(GROUP), "type": modes.NONE}, len(names))
         law = self.parameters["time_law"]
@@ -142,7 +142,7 @@ class ShaperNode(ArmNode):
     def _refuse_unfit(self, values):
         """Refuse parameters of the shaper that do not fit together, before they are set."""
         wanted = {k.removeprefix(GROUP): v for k, v in values.items() if k.startswith(GROUP)}
-        Modes(wanted, len(self._names))
+        Modes(wanted, len(self.joint_names))
 
     def _on_change(self, names):
         self._changed = self._changed or any(name.startswith(GROUP) for name in names)
@@ -199,7 +199,7 @@ class ShaperNode(ArmNode):
         try:
             data = trajectory.validate(
                 msg.joint_names,
-                self._names,
+                self.joint_names,
                 msg.header.stamp.sec * 1_000_000_000 + msg.header.stamp.nanosec,
                 self._rows(msg),
             )
@@ -299,7 +299,7 @@ class ShaperNode(ArmNode):
 
     def _message(self, shaped, stamp_ns):
         """A `Shaped` as a message; one that was to begin now and finds the joints at rest still does."""
-        message = JointTrajectory(joint_names=self._names)
+        message = JointTrajectory(joint_names=self.joint_names)
         now = shaped.fresh and stamp_ns == 0
         if not now and self.parameters["synchronised_clocks"]:
             set_stamp(message.header.stamp, shaped.start_ns)
@@ -315,17 +315,21 @@ class ShaperNode(ArmNode):
 
     def _on_joint_states(self, msg):
         index = {name: i for i, name in enumerate(msg.name)}
-        if not all(name in index for name in self._names):
+        if not all(name in index for name in self.joint_names):
             return  # of other joints
         if len(msg.position) != len(msg.name):
             text = f"joint_states: {len(msg.position)} positions of {len(msg.name)} names"
             self.report(f"{text} are ignored")
             return
-        found = np.array([msg.position[index[name]] for name in self._names])
+        found = np.array([msg.position[index[name]] for name in self.joint_names])
         if not np.isfinite(found).all():
             self.report("joint_states: a position is not finite: ignored")
             return
         self._measured, self._measured_at = found, self._steady_s()
+        if len(msg.velocity) == len(msg.name):
+            self._speeds = np.array([msg.velocity[index[name]] for name in self.joint_names])
+        else:
+            self._speeds = np.full(found.size, np.nan)
 
     def _where(self):
         """Where the joints are (n,), None where that is unknown; what is played must not step.
@@ -347,6 +351,11 @@ class ShaperNode(ArmNode):
 
     def _measurement(self):
         return self._measured if self._steady_s() - self._measured_at < FRESH else None
+
+    def _measured_state(self):
+        """Positions and speeds of the joints (2, n), None where they do not come; nan where speeds do not."""
+        found = self._measurement()
+        return None if found is None else np.stack([found, self._speeds])
 
     def _steady_s(self):
         return 1e-9 * self._steady.now().nanoseconds
@@ -398,7 +407,8 @@ class ShaperNode(ArmNode):
         if self._state.moving and not self.core.moving(now):
             self._state.moving = False
             self._publish_state()
-            self._goals.ended()
+        if self.plays and not self.core.moving(now) and (state := self.core.state(now)) is not None:
+            self._goals.look(now, state, self._measured_state())
         self._settle(now)
 
     def _publish_state(self):
@@ -415,7 +425,7 @@ class ShaperNode(ArmNode):
         damping = self.parameters.group("damping.")
         if damping["joint"]:
             self._refuse_without_positions(topic, "damping.joint")
-            self._damping = StreamDamping(self, self._names, damping, self._step)
+            self._damping = StreamDamping(self, self.joint_names, damping, self._step)
         if self.plays:
             self._refuse_without_positions(topic, "play_trajectories")
         if not topic:
@@ -440,7 +450,7 @@ class ShaperNode(ArmNode):
         if state is not None:
             self._played = state[0]
             if self.core.moving(now):
-                self._goals.tell(state, self._measurement())
+                self._goals.tell(state, self._measured_state())
         if not self.active or self._played is None:
             return
         value = self._played
@@ -470,7 +480,7 @@ class ShaperNode(ArmNode):
         if abs(wish[joint] - measured[joint]) > trajectory_shaper.START_TOLERANCE:
             raise MessageError(
                 f"rad is not where the joint is: {measured[joint]:g}",
-                field=f"data of joint {self._names[joint]}",
+                field=f"data of joint {self.joint_names[joint]}",
                 value=float(wish[joint]),
                 limit=f"within {trajectory_shaper.START_TOLERANCE:g}",
             )
@@ -484,9 +494,9 @@ class ShaperNode(ArmNode):
             self.parameters["stream_kind"] == VELOCITIES,
         )
         if silent and velocities:
-            self._wish = np.zeros(len(self._names))
+            self._wish = np.zeros(len(self.joint_names))
         if not stream.started:
-            stream.begin(np.zeros(len(self._names)) if velocities else self._wish)
+            stream.begin(np.zeros(len(self.joint_names)) if velocities else self._wish)
         stands = silent and stream.settled() and not stream.steps_to(self._wish)
         if stands and self._damping is None:
             return

@@ -3,17 +3,29 @@
 
 A goal that is cancelled ends in a stop that is shaped: the stop goes to the controller as a goal that replaces the one
 that it follows, and the result is sent once that is done. Where the node plays trajectories itself, there is no
-controller to ask: a goal has succeeded once its motion has ended.
+controller to ask: a goal has succeeded once its motion has ended and the joints are within the goal's tolerances.
 """
 
+from types import MappingProxyType
+
+import numpy as np
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient, CancelResponse, GoalResponse
 
 from flexarm_dynamics.errors import TrajectoryError
 from flexarm_ros.messages import set_stamp
 
-from ..trajectory.goal import Code
-from .goals import Server, kinds
+from ..trajectory.goal import Code, GoalCheck, tolerances
+from .goals import Server, kinds, refuse_what_is_not_served
+
+#: Of a played goal nothing is judged but what it asks for itself.
+NOT_JUDGED = MappingProxyType({
+    "constraints.trajectory": 0.0,
+    "constraints.goal": 0.0,
+    "constraints.stopped_velocity_tolerance": 0.0,
+    "constraints.goal_time": 0.0,
+    "constraints.tip": -1.0,
+})  # fmt: skip
 
 
 class Goal:
@@ -32,6 +44,7 @@ class Goal:
         self.sent = 0  # goals sent on; results of all but the last don't count
         self.over = False
         self.reason = ""
+        self.tolerances = self.check = None  # where the node plays it
 
 
 class ShaperGoals:
@@ -76,6 +89,13 @@ class ShaperGoals:
             text = f"no action server {goal.client._action_name}: is parameter output right?"
             self._end(goal, Code.INVALID_GOAL, text)
             return
+        if self._node.plays:
+            try:
+                _refuse_empty(request.trajectory)
+                goal.tolerances = self._tolerances(request)
+            except TrajectoryError as error:
+                self._refuse(goal, error)
+                return
         self._node.shape(
             request.trajectory,
             lambda shaped: self._begin(goal, shaped),
@@ -84,11 +104,26 @@ class ShaperGoals:
         if not goal.over and self._current is not goal:
             self._preparing = goal
 
+    def _tolerances(self, request):
+        """What a goal that is played asks for."""
+        refuse_what_is_not_served(request)
+        if getattr(request, "tip_tolerance", 0.0) > 0.0:
+            hint = "leave it 0: the shaper has no arm file"
+            value = request.tip_tolerance
+            raise TrajectoryError("can't be judged", field="tip_tolerance", value=value, hint=hint)
+        rows = (
+            [(t.name, t.position, t.velocity) for t in own]
+            for own in (request.path_tolerance, request.goal_tolerance)
+        )
+        wait = request.goal_time_tolerance
+        time = wait.sec + 1e-9 * wait.nanosec
+        return tolerances(self._node.joint_names, 0.0, NOT_JUDGED, *rows, time, -1.0)
+
     def _refuse(self, goal, error):
         """The trajectory of a goal can't be shaped."""
         if self._preparing is goal:
             self._preparing = None
-        code = Code.INVALID_JOINTS if "joint_names" in error.field else Code.INVALID_GOAL
+        code = Code.INVALID_JOINTS if "name" in error.field else Code.INVALID_GOAL
         self._end(goal, code, str(error))
 
     def _begin(self, goal, shaped):
@@ -99,7 +134,9 @@ class ShaperGoals:
         if before is not None:
             self._end(before, Code.INVALID_GOAL, "replaced by a newer goal")
         goal.handle.request.trajectory = shaped
-        if not self._node.plays:
+        if self._node.plays:
+            goal.check = GoalCheck(self._node.joint_names, goal.tolerances, 0, 0.0)
+        else:
             self._send(goal, goal.handle.request)
 
     def may_cancel(self, handle):
@@ -135,29 +172,77 @@ class ShaperGoals:
         if self._node.plays and self._current is not None:
             self._end(self._current, Code.INVALID_GOAL, "replaced by a trajectory")
 
-    def ended(self):
-        """The motion has ended: so has a goal that was played; one that was stopped without being cancelled fails."""
+    def look(self, now_ns, state, measured):
+        """The motion has ended: so has a goal that was played, once the joints are where it wants them.
+
+        Parameters
+        ----------
+        now_ns : int
+            [ns]
+        state : (3, n) ndarray
+            Of the motion [rad], [rad/s], [rad/s^2].
+        measured : (2, n) ndarray or None
+            Positions and speeds of the joints [rad], [rad/s]; nan where unknown.
+        """
         goal = self._current
         if not self._node.plays or goal is None:
             return
         if goal.reason and not goal.handle.is_cancel_requested:
             self._end(goal, Code.PATH_TOLERANCE_VIOLATED, goal.reason)
             return
-        result = goal.server.action_type.Result(error_string=goal.reason)
-        self._finish(goal, GoalStatus.STATUS_SUCCEEDED, result)
+        if goal.reason:
+            result = goal.server.action_type.Result(error_string=goal.reason)
+            self._finish(goal, GoalStatus.STATUS_SUCCEEDED, result)
+            return
+        if self._blind(goal, measured):
+            return
+        error, speed = self._errors(state, measured)
+        outcome = goal.check.at_the_end(now_ns, error, speed, None)
+        if outcome is None:
+            return
+        if outcome.code != Code.SUCCESSFUL:
+            self._end(goal, outcome.code, outcome.text)
+            return
+        self._finish(goal, GoalStatus.STATUS_SUCCEEDED, goal.server.action_type.Result())
 
     def tell(self, state, measured):
-        """Feedback of a goal that is played: its state (3, n) in SI units, and the joints as measured (n,) [rad]."""
-        if self._current is None:
+        """Feedback of a goal that is played, and whether it is within its tolerances; as of `look`."""
+        goal = self._current
+        if goal is None:
             return
-        feedback = self._current.server.action_type.Feedback(joint_names=self._node._names)
+        feedback = goal.server.action_type.Feedback(joint_names=self._node.joint_names)
         set_stamp(feedback.header.stamp, self._node.now_ns())
         point = feedback.desired
         point.positions, point.velocities, point.accelerations = state.tolist()
         if measured is not None:
-            feedback.actual.positions = measured.tolist()
-            feedback.error.positions = (state[0] - measured).tolist()
-        self._current.handle.publish_feedback(feedback)
+            feedback.actual.positions = measured[0].tolist()
+            feedback.error.positions = (state[0] - measured[0]).tolist()
+        goal.handle.publish_feedback(feedback)
+        if goal.reason or self._blind(goal, measured):
+            return
+        outcome = goal.check.on_the_way(*self._errors(state, measured))
+        if outcome is not None:
+            self._abort(goal, outcome.text)
+
+    def _blind(self, goal, measured):
+        """End a goal with tolerances where the joints' positions do not come; whether that is so."""
+        limits = goal.tolerances
+        judged = np.isfinite(limits.path).any() or np.isfinite(limits.goal).any()
+        if measured is not None or not judged:
+            return False
+        self._abort(goal, "joint_states do not come: its tolerances can't be judged")
+        return True
+
+    def _abort(self, goal, text):
+        """End a goal that is played, and stop."""
+        self._end(goal, Code.PATH_TOLERANCE_VIOLATED, text)
+        self._node.stopping(text, lambda _: None)
+
+    @staticmethod
+    def _errors(state, measured):
+        """Errors of positions and speeds, (n,) each [rad], [rad/s]; 0 where nothing is measured."""
+        error = np.zeros_like(state[:2]) if measured is None else state[:2] - measured
+        return tuple(np.nan_to_num(error))
 
     def _send(self, goal, request):
         goal.sent += 1
@@ -215,3 +300,10 @@ class ShaperGoals:
             return result
 
         goal.server.finish(goal.handle, end)
+
+
+def _refuse_empty(trajectory):
+    """Refuse a trajectory without points."""
+    if not trajectory.points:
+        hint = "to stop, cancel the goal"
+        raise TrajectoryError("are missing", field="trajectory.points", hint=hint)
