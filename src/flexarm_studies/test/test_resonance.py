@@ -16,6 +16,7 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import check_all
 from flexarm_studies.resonance import effect, recommendation, retiming, time_law, windows
 from flexarm_studies.resonance import study as studies
+from flexarm_studies.resonance.answer import Answer
 from flexarm_studies.resonance.families import dependence, families
 from flexarm_studies.resonance.fit import Fit, Mode
 from flexarm_studies.resonance.recommendation import Spread, recommend
@@ -303,6 +304,33 @@ def test_where_the_frequency_goes_with_a_joint_the_node_gets_it_by_configuration
     node, own = node_of(study_of(rings, 2))
     assert np.shape(own["configurations"]) == (14,) and len(own["frequencies"]) == 7
     assert node.at(places[2:3])[0, 0] == pytest.approx(3.0 + 0.4 * places[2, 0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("channel", "sensor", "where"),
+    [("root", "strain", {"gauge": 1}), ("tip_y", "imu", {"axis": "y", "full_scale": 40.0})],
+)
+def test_the_answer_of_a_sensor_gives_the_lines_of_the_damping_or_why_there_is_none(
+    channel, sensor, where
+):
+    made = study_of([window([0.0, 0.0], (3.0, 0.01, 1.0)), window([0.1, 0.0], (3.1, 0.02, 1.0))], 2)
+    own = Answer("b", channel, sensor, 1, 3.0, 0.01, 0.3j, 0.02)
+    lines = list(studies.text(replace(made, answers=(own,))))
+    first = next(i for i, line in enumerate(lines) if line.startswith("for damping by a sensor"))
+    given = yaml.safe_load("\n".join(lines[first + 1 :]))
+    shown = {
+        "joint": "b",
+        "sensor": sensor,
+        "frequency": 3.0,
+        "damping": 0.01,
+        "sensitivity": 0.3,
+        "phase": 1.571,
+    }
+    assert given == {f"damping.{name}": value for name, value in {**shown, **where}.items()}
+    damped = replace(own, damping=0.25)  # more than is wanted
+    assert any(
+        "no damping by it: " in line for line in studies.text(replace(made, answers=(damped,)))
+    )
 
 
 # Trajectories ----------------------------------------------------------------------------------

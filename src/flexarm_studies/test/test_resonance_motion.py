@@ -40,7 +40,15 @@ def test_a_simulated_arm_rings_as_its_closed_loop_does(kind, tmp_path, result):
         assert lowest["frequency_hz"] == pytest.approx(first, rel=2e-3)
         assert lowest["damping"] == pytest.approx(damping, rel=0.02)
         assert min(abs(m["frequency_hz"] / second - 1.0) for m in there) < 2e-3
-    if kind == STEP:  # what was kept says the same
+    assert bool(found["damping"]) == (kind == STEP)
+    if kind == STEP:
+        # By a burst of the same command: 0.1043 1/(rad s) and 80 degrees, of which 3 are half a period of the commands.
+        (answer,) = found["damping"]
+        assert (answer["joint"], answer["sensor"], answer["gauge"]) == ("joint1", "strain", 0)
+        assert answer["sensitivity"] == pytest.approx(0.1043, rel=0.01)
+        assert answer["phase"] == pytest.approx(1.389, abs=0.06)
+        assert answer["scatter"] < 0.01 and not answer["refused"]
+        # what was kept says the same
         again = result("resonance", out)
         assert again["windows"][0]["modes"][0]["frequency_hz"] == pytest.approx(first, rel=2e-3)
 

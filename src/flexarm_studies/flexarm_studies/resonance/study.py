@@ -62,6 +62,8 @@ class Study:
     spreads : list of Spread
         Of each family, widened.
     recommendation : Recommendation
+    answers : tuple of Answer
+        Of sensors to steps of the joints, where the arm was moved by these.
     """
 
     channels: windows.Channels
@@ -69,6 +71,7 @@ class Study:
     families: list
     spreads: list
     recommendation: object
+    answers: tuple = ()
 
 
 def study(recordings, wishes=None) -> Study:
@@ -185,6 +188,7 @@ def plain(made, motion=None):
         "windows": [_window(w) for w in made.windows],
         "modes": [_family(f, made.windows) for f in made.families],
         "recommendation": _recommendation(made),
+        "damping": [_answer(found) for found in made.answers],
         "yaml": yaml_lines(made, motion),
     }
 
@@ -227,6 +231,11 @@ def _family(family, rings):
             "counts": law.counts,
         },
     }
+
+
+def _answer(found):
+    refused = found.refusal()
+    return {**found.settings(), "scatter": found.scatter, "refused": refused}
 
 
 def _recommendation(made):
@@ -319,6 +328,26 @@ def text(made, motion=None):
         yield from _motion_text(motion, made.recommendation.wanted)
     lines = yaml_lines(made, motion)
     yield from ("", "to paste into the parameters of the node shaper:", *lines)
+    yield from _answers_text(made.answers)
+
+
+def _answers_text(answers):
+    if not answers:
+        return
+    first = answers[0]
+    yield f"\nanswer of {first.channel} to steps at {first.frequency:.3f} Hz: what damping by it needs"
+    for found in answers:
+        phase = np.degrees(np.angle(found.beta))
+        yield (
+            f"  {found.joint:16} {abs(found.beta):.4g} 1/(rad s), phase {phase:.0f} degrees, "
+            f"{100.0 * found.scatter:.2g} % scatter between steps"
+        )
+    if refused := first.refusal():
+        yield f"no damping by it: {refused}"
+        return
+    yield "for damping by a sensor, to the same parameters (the sensor's own numbers: see docs/vibration.md):"
+    for name, value in first.settings().items():
+        yield f"    damping.{name}: {float(f'{value:.4g}') if isinstance(value, float) else value}"
 
 
 def _windows_text(made):

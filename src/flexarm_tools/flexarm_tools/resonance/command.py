@@ -3,6 +3,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
@@ -11,6 +12,7 @@ from flexarm_studies.identification.recording import SIGNALS
 from flexarm_studies.recordings import mapping as mappings
 from flexarm_studies.recordings import streams
 from flexarm_studies.resonance import study as studies
+from flexarm_studies.resonance.answer import answers
 from flexarm_studies.resonance.effect import read as read_trajectory
 from flexarm_studies.resonance.measured import rings, save
 from flexarm_studies.resonance.motion import STEP, SWEEP, Bounds, design, measure
@@ -247,7 +249,10 @@ def _moved(arm, options, wishes, bounds):
     if options.out:
         save(recording, options.out)
     found, windows = rings(recording, motion, arm.begin, wishes)
-    return studies.of_windows(found, windows, wishes)
+    made = studies.of_windows(found, windows, wishes)
+    if options.kind != STEP:
+        return made
+    return replace(made, answers=tuple(answers(found, windows, made.families, motion, arm.begin)))
 
 
 def read(path, mapping=None, namespace="", quantities=()):

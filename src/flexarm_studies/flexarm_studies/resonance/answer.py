@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""How a sensor answers small motions of each joint, near a mode: what damping by that sensor needs to know.
+
+With the model of `flexarm_control.shaping.strain_damping`, :math:`\dot z = p z + \beta u` and a reading Re z, a command
+that goes from one place to another leaves ringing of the amplitude
+
+.. math:: a(t) = \frac{\beta}{p}\int \dot u(\tau)\,e^{p(t-\tau)}\,d\tau,
+
+since a joint that stands elsewhere does not bend the links. The amplitude after each step of a measurement, less what
+is left of the ringing before it, over this integral is :math:`\beta`: its modulus the sensitivity, its angle the phase,
+with the delay and the drive in it.
+"""
+
+import cmath
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexarm_control.shaping import strain_damping
+from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.parameters import check_all
+
+from .motion import SETTLED
+
+#: Cells in which a step is integrated.
+CELLS = 2000
+#: Sensors that can damp, and their name in the node's parameters.
+SENSORS = {"strain": "strain", "linear_acceleration": "imu"}
+#: Of an IMU, in the lines to paste [m/s^2].
+FULL_SCALE = 40.0
+#: Period of the commands for which the damping is checked [s].
+PERIOD = 0.008
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A reading's answer to corrections of a joint.
+
+    Attributes
+    ----------
+    joint, channel, sensor : str
+        Names; the sensor as in the node's parameters.
+    index : int
+        Of the channel among those of its sensor.
+    frequency, damping : float
+        Of the mode [Hz], [-].
+    beta : complex
+        [1/(rad s)] times the reading's unit.
+    scatter : float
+        Between the steps of the measurement, over the modulus [-].
+    """
+
+    joint: str
+    channel: str
+    sensor: str
+    index: int
+    frequency: float
+    damping: float
+    beta: complex
+    scatter: float
+
+    def settings(self):
+        """Parameters ``damping.*`` of the node `shaper`, without the prefix."""
+        where = {"gauge": self.index}
+        if self.sensor == "imu":
+            where = {"axis": self.channel[-1], "full_scale": FULL_SCALE}
+        return {
+            "joint": self.joint, "sensor": self.sensor, **where,
+            "frequency": self.frequency, "damping": self.damping,
+            "sensitivity": abs(self.beta), "phase": cmath.phase(self.beta),
+        }  # fmt: skip
+
+    def refusal(self):
+        """Why the damping can't be, in words; empty where it can."""
+        known = {parameter.name for parameter in strain_damping.PARAMETERS}
+        given = {name: value for name, value in self.settings().items() if name in known}
+        try:
+            law = check_all(strain_damping.PARAMETERS, given)
+            strain_damping.StrainDamping(law, PERIOD)
+        except FlexarmError as error:
+            return str(error)
+        return ""
+
+
+def answers(found, windows, families, motion, begin):
+    """Answers of every gauge and accelerometer to every joint that has moved, near the mode that rings most.
+
+    Parameters
+    ----------
+    found : Channels
+    windows : list of Window
+        As of `measured.rings`, of a measurement by steps.
+    families : list of Family
+        Of these windows.
+    motion : RingingMotion
+    begin : float
+        When it was sent, as the recording counts the time [s].
+
+    Returns
+    -------
+    list of Answer
+        The one with the least scatter first; of its channel those of the other joints follow, by sensitivity.
+    """
+    main = max(families, key=lambda family: family.part)
+    rung = {i: mode for mode, i in zip(main.modes, main.windows, strict=True)}
+    parts = {}  # of each joint: (what the step makes of beta, what rang) of its windows
+    last, before = 0.0, None
+    for first, end, joint in motion.free:
+        number = _window(windows, begin + first, begin + end)
+        mode = rung.get(number)
+        if mode is not None:
+            at = windows[number].begin
+            z = _step(mode.pole, motion, joint, last, first - SETTLED, at - begin)
+            amplitude = rang = _amplitude(found, windows[number], mode)
+            if before is not None:
+                amplitude = amplitude - before[1] * np.exp(before[2] * (at - before[0]))
+            parts.setdefault(joint, []).append((z, amplitude))
+        before = None if mode is None else (at, rang, mode.pole)
+        last = end
+    made = [
+        answer for joint, pairs in parts.items() for answer in _of_joint(found, main, joint, pairs)
+    ]
+    if not made:
+        return []
+    best = min(made, key=lambda answer: answer.scatter).channel
+    return sorted(
+        (answer for answer in made if answer.channel == best), key=lambda answer: -abs(answer.beta)
+    )
+
+
+def _window(windows, first, end):
+    """The number of the window that begins between two times [s]."""
+    inside = [i for i, w in enumerate(windows) if first - SETTLED <= w.begin < end]
+    return inside[0] if inside else None
+
+
+def _amplitude(found, window, mode):
+    """Of one of the modes of a window in each channel at its begin, (c,) complex: all of its modes by least squares."""
+    part = found.rows(window.begin, window.end)
+    time = found.period * np.arange(part.stop - part.start)
+    turning = np.exp(np.array([m.pole for m in window.fit.modes]) * time[:, None])
+    known = np.hstack([turning.real, -turning.imag, np.ones((time.size, 1))])
+    rang = np.linalg.lstsq(known, found.values[part], rcond=None)[0]
+    count = len(window.fit.modes)
+    k = next(k for k, own in enumerate(window.fit.modes) if own is mode)
+    return rang[k] + 1j * rang[count + k]
+
+
+def _step(pole, motion, joint, first, last, at):
+    """What a motion of a joint from `first` to `last` leaves at a time `at`, for a beta of 1 [rad s]."""
+    step = (last - first) / CELLS
+    time = first + step * (np.arange(CELLS) + 0.5)
+    speed = motion.derivative(1, time)[:, joint]
+    return complex(step * np.exp(pole * (at - time)) @ speed / pole)
+
+
+def _of_joint(found, main, joint, pairs):
+    z = np.array([pair[0] for pair in pairs])
+    rang = np.array([pair[1] for pair in pairs])
+    beta = z.conj() @ rang / (np.abs(z) ** 2).sum()
+    off = np.sqrt(
+        (np.abs(rang - z[:, None] * beta) ** 2).sum(axis=0) / (np.abs(rang) ** 2).sum(axis=0)
+    )
+    count = dict.fromkeys(SENSORS, 0)
+    for k, quantity in enumerate(found.quantities):
+        if quantity not in SENSORS:
+            continue
+        yield Answer(
+            found.joint_names[joint], found.names[k], SENSORS[quantity], count[quantity],
+            float(np.mean(main.values("frequency"))), float(np.mean(main.values("damping"))),
+            complex(beta[k]), float(off[k]),
+        )  # fmt: skip
+        count[quantity] += 1
