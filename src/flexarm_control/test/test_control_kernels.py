@@ -6,7 +6,9 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from flexarm_control import kernels
+from flexarm_control.manifold import expansion
 from flexarm_dynamics.kernels import rigid
+from flexarm_dynamics.models.model import Terms
 
 COMPILED = kernels.compiled()
 RNG = np.random.default_rng(1)
@@ -87,3 +89,46 @@ def test_gauges_are_well_that_move_within_their_range(strain, well):
     low, high, last = np.full(2, -1.0), np.ones(2), np.array([0.0, 0.3])
     assert COMPILED.all_well(np.array(strain), low, high, last) == well
     assert last.tolist() == (strain if well else [0.0, 0.3])
+
+
+def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1):
+    """The manifold's expansion, written as in its module's equations: deflection, derivatives, both torques."""
+    n, r = f1.size, len(M) // 2
+    zero = {
+        i - r: -np.linalg.solve(K2[i], M[i][n:, :n] @ acceleration[i] + f2[i])
+        for i in range(len(M))
+    }
+    level, rate, second = dict(zero), np.zeros(f2[0].size), np.zeros(f2[0].size)
+    for k in range(1, order + 1):
+        if k % 2:
+            rate = (level[1] - level[-1]) / (2.0 * step)
+            continue
+        inner = range(1 - max(level), max(level))
+        bend = {i: (level[i + 1] - 2.0 * level[i] + level[i - 1]) / step**2 for i in inner}
+        speed = {i: (level[i + 1] - level[i - 1]) / (2.0 * step) for i in inner}
+        second = bend[0]
+        level = {
+            i: zero[i]
+            - np.linalg.solve(K2[i + r], M[i + r][n:, n:] @ bend[i] + C2[i + r] @ speed[i])
+            for i in inner
+        }
+    bending = M[r][:n, n:] @ second + C1 @ rate
+    torque = M[r][:n, :n] @ acceleration[r] + f1 + bending + K1 @ level[0]
+    return level[0], rate, second, torque, bending + K1 @ (level[0] - zero[0])
+
+
+@pytest.mark.parametrize("order", range(7))
+@pytest.mark.parametrize(("n", "m"), [(1, 2), (3, 4), (2, 0)])
+def test_a_manifold_is_expanded_as_its_equations_say(order, n, m):
+    points = 2 * expansion.reach(order) + 1
+    sizes = (n + m, n + m), (n,), (m,), (n, m), (m, m), (n, m), (m, m)
+    terms = [Terms(*(RNG.normal(size=size) for size in sizes)) for _ in range(points)]
+    terms = [t._replace(K2=t.K2 + 9.0 * np.eye(m)) for t in terms]
+    acceleration = RNG.normal(size=(points, n))
+    M, _, f2, _, C2, _, K2 = zip(*terms, strict=True)
+    here = terms[points // 2]
+    wanted = expanded(
+        expansion.step(order), order, M, f2, C2, K2, acceleration, here.f1, here.C1, here.K1
+    )
+    for mine, its in zip(expansion.expand(terms, acceleration, order), wanted, strict=True):
+        np.testing.assert_allclose(mine, its, rtol=1e-8, atol=1e-10 * max(1.0, *np.abs(its), 0.0))

@@ -325,7 +325,7 @@ def test_joint_is_light_if_it_is_so_in_one_configuration():
                 M *= 0.01
             else:
                 M[0, 0] = M[0, 1:] @ np.linalg.solve(M[1:, 1:], M[1:, 0]) / 0.9
-            return replace(terms, M=M)
+            return terms._replace(M=M)
 
     model = Changing()
     assert Channels(model.whole, None).heavy

@@ -350,7 +350,7 @@ def test_full_order_matrix_takes_the_couplings_of_many_joints():
     t = random_terms(rng, 2, 3)
     kp, kv, B_inverse = np.array([3.0, 5.0]), np.array([2.0, 1.0]), rng.standard_normal((2, 2))
     K = rng.standard_normal((2, 6))
-    still = replace(t, f1=np.zeros(2), f2=np.zeros(3))
+    still = t._replace(f1=np.zeros(2), f2=np.zeros(3))
 
     def rate(state):
         q, delta, qd, delta_d = np.split(state, [2, 5, 7])

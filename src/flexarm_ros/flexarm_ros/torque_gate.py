@@ -94,13 +94,16 @@ class TorqueLimit:
 
     def __init__(self, arm):
         self._limit = arm.torque_limits
+        self._least = -self._limit
         self._torque = np.zeros(len(arm.joints))
         self.clipped = 0
 
     def clip(self, torque):
         """The torque within the limits, shape (n,) [N m]; valid until the next call."""
-        np.clip(torque, -self._limit, self._limit, out=self._torque)
-        self.clipped += bool((self._torque != torque).any())
+        # `np.clip` takes three times as long for a few values.
+        np.maximum(torque, self._least, out=self._torque)
+        np.minimum(self._torque, self._limit, out=self._torque)
+        self.clipped += np.count_nonzero(self._torque != torque) > 0
         return self._torque
 
 

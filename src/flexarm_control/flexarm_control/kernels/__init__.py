@@ -6,13 +6,15 @@ The equations are in the modules whose arrays these functions work on.
 
 from functools import cache
 
-from flexarm_dynamics.kernels import load
+from flexarm_dynamics.kernels import load, rigid
 
-from . import eigenvectors, law, limits, readings
+from . import eigenvectors, law, limits, manifold, readings
 
 
 @cache
 def compiled():
     """The compiled functions of all modules here."""
-    sources = [load.source(module) for module in (eigenvectors, law, limits, readings)]
-    return load.joined("control", sources, inline=("larger", "unit"))
+    sources = [
+        load.source(module) for module in (rigid, eigenvectors, law, limits, manifold, readings)
+    ]
+    return load.joined("control", sources, inline=("larger", "unit", "solve"))

@@ -8,7 +8,7 @@ import numpy as np
 from flexarm_dynamics.linear import jacobian
 
 from ..component import Component, at_rest
-from .expansion import Point, expand, reach, step
+from .expansion import expand, reach, step
 
 #: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
 SMALL = 1e-5
@@ -69,16 +69,17 @@ class Manifold(Component, ABC):
 
         (m,) [m, rad], (m,) [m/s, rad/s], and of the whole motion, from the joint rows of (2), (n,) [N m].
         """
-        here, delta, rate, second = self._of_reference(reference)
-        return delta, rate, here.torque(delta, rate, second)
+        found = self._of_reference(reference)
+        return found.delta, found.rate, found.torque
 
     def _of_reference(self, reference):
-        """The reference's present `Point`, and deflection, rate and second derivative along it."""
-        points = {}
-        for i in range(-reach(self.order), reach(self.order) + 1):
-            state = reference.near(i * step(self.order))
-            points[i] = Point(self.model.terms(state[0], state[1]), state[2].copy())
-        return points[0], *expand(points, self.order)
+        """The `Expansion` of the reference at present."""
+        far, h = reach(self.order), step(self.order)
+        terms, accelerations = [], np.empty((2 * far + 1, self.model.n_joints))
+        for i in range(2 * far + 1):
+            position, velocity, accelerations[i] = reference.near((i - far) * h)
+            terms.append(self.model.terms(position, velocity))
+        return expand(terms, accelerations, self.order)
 
     def error_response(self, q):
         """How a tracking error moves the manifold and its feed-forward, linearised at rest in q.

@@ -31,7 +31,7 @@ from scipy.linalg import expm
 from flexarm_dynamics.parameters import parameter
 
 from .base import Manifold
-from .expansion import Point, expand, reach, step
+from .expansion import expand, reach, step
 
 
 class CorrectedManifold(Manifold):
@@ -62,16 +62,20 @@ class CorrectedManifold(Manifold):
 
     def update(self, q, qd, reference, terms, slow_torque):
         here = slow_acceleration(terms, slow_torque)
-        points = {0: Point(terms, here)}
         error = np.concatenate([reference.position - q, reference.velocity - qd])
-        extra = here - reference.acceleration
-        for i in range(1, self._reach + 1):
-            for j in (-i, i):
-                motion = self._motion(j, reference, error, extra)
-                points[j] = Point(self.model.terms(motion[0], motion[1]), motion[2])
-        delta, rate, second = expand(points, self.order)
-        self.amplitude[:], self.rate[:] = delta, rate
-        self.feedforward[:] = points[0].feedforward(delta, rate, second)
+        extra, points = here - reference.acceleration, []
+        accelerations = np.empty((2 * self._reach + 1, here.size))
+        for i in range(len(accelerations)):
+            if i == self._reach:
+                points.append(terms)
+                accelerations[i] = here
+                continue
+            motion = self._motion(i - self._reach, reference, error, extra)
+            points.append(self.model.terms(motion[0], motion[1]))
+            accelerations[i] = motion[2]
+        found = expand(points, accelerations, self.order)
+        self.amplitude[:], self.rate[:] = found.delta, found.rate
+        self.feedforward[:] = found.beyond
 
     def _motion(self, j, reference, error, extra):
         """Position, velocity, acceleration of the slow motion at a point of the stencil, (3, n)."""

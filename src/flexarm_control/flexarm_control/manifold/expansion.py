@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Derivatives of the slow motion's deflections by central differences: what every manifold's orders are made of."""
 
+from typing import NamedTuple
+
 import numpy as np
-from scipy.linalg.lapack import dgetrf, dgetrs
+
+from .. import kernels
 
 
 def step(order):
@@ -19,75 +22,42 @@ def reach(order):
     return (order + 1) // 2
 
 
-class Point:
-    """The modal rows of (2) at one point of the slow motion.
-
-    Parameters
-    ----------
-    terms : Terms
-        Without deflections.
-    acceleration : ndarray, shape (n,)
-        Of the joints [rad/s^2].
+class Expansion(NamedTuple):
+    """The manifold at one point of the slow motion.
 
     Attributes
     ----------
-    delta : ndarray, shape (m,)
-        Deflection without the modes' own inertia and damping: order 0.
+    delta, rate, second : ndarray, shape (m,)
+        Deflection, and its derivatives by time.
+    torque : ndarray, shape (n,)
+        Of the whole motion, from the joint rows of (2) [N m].
+    beyond : ndarray, shape (n,)
+        Of the bending beyond order 0 [N m].
     """
 
-    def __init__(self, terms, acceleration):
-        n = terms.n
-        self.terms, self.acceleration = terms, acceleration
-        # LAPACK itself: what scipy.linalg checks around it costs ten times as much as a few modes do.
-        self._factor = dgetrf(terms.K2)[:2] if terms.f2.size else None
-        self.delta = -self._solve(terms.M[n:, :n] @ acceleration + terms.f2)
-
-    def _solve(self, force):
-        return force if self._factor is None else dgetrs(*self._factor, force)[0]
-
-    def corrected(self, rate, second):
-        """Deflection that also carries the modes' own inertia and damping, shape (m,)."""
-        n = self.terms.n
-        return self.delta - self._solve(self.terms.M[n:, n:] @ second + self.terms.C2 @ rate)
-
-    def feedforward(self, delta, rate, second):
-        """Joint torque of the bending beyond order 0, shape (n,) [N m]."""
-        t, n = self.terms, self.terms.n
-        return t.M[:n, n:] @ second + t.C1 @ rate + t.K1 @ (delta - self.delta)
-
-    def torque(self, delta, rate, second):
-        """Joint torque of the whole motion, shape (n,) [N m]: the joint rows of (2)."""
-        t, n = self.terms, self.terms.n
-        u = t.M[:n, :n] @ self.acceleration + t.M[:n, n:] @ second
-        return u + t.f1 + t.C1 @ rate + t.K1 @ delta
+    delta: np.ndarray
+    rate: np.ndarray
+    second: np.ndarray
+    torque: np.ndarray
+    beyond: np.ndarray
 
 
-def expand(points, order):
-    """Deflection, rate and second derivative at the centre of a stencil.
+def expand(terms, accelerations, order):
+    """The `Expansion` at the centre of a stencil.
 
     Parameters
     ----------
-    points : dict
-        `Point` by its place, from -reach to reach.
+    terms : sequence of Terms
+        Of (2) without deflections, at the points of the slow motion, `step` apart; `reach` on either side.
+    accelerations : ndarray, shape (len(terms), n)
+        Of the joints [rad/s^2].
     order : int
         In mu.
-
-    Returns
-    -------
-    delta, rate, second : ndarray, shape (m,)
     """
-    level, h = {i: p.delta for i, p in points.items()}, step(order)
-    rate, second = np.zeros_like(level[0]), np.zeros_like(level[0])
-    for k in range(1, order + 1):
-        if k % 2:  # the rates of the level before
-            rate = (level[1] - level[-1]) / (2.0 * h)
-            continue
-        wide, higher = max(level), {}
-        for i in range(1 - wide, wide):
-            speed = (level[i + 1] - level[i - 1]) / (2.0 * h)
-            bend = (level[i + 1] - 2.0 * level[i] + level[i - 1]) / h**2
-            higher[i] = points[i].corrected(speed, bend)
-            if i == 0:
-                second = bend
-        level = higher
-    return level[0], rate, second
+    here = terms[len(terms) // 2]
+    out, torque = np.empty((3, here.f2.size)), np.empty((2, here.n))
+    M, _, f2, _, C2, _, K2 = zip(*terms, strict=True)
+    kernels.compiled().expanded(
+        step(order), order, M, f2, C2, K2, accelerations, here.f1, here.C1, here.K1, out, torque
+    )
+    return Expansion(*out, *torque)

@@ -18,6 +18,6 @@ class ReferenceManifold(Manifold):
     order = 2
 
     def update(self, q, qd, reference, terms, slow_torque):
-        here, delta, rate, second = self._of_reference(reference)
-        self.amplitude[:], self.rate[:] = delta, rate
-        self.feedforward[:] = here.feedforward(delta, rate, second)
+        found = self._of_reference(reference)
+        self.amplitude[:], self.rate[:] = found.delta, found.rate
+        self.feedforward[:] = found.beyond

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Fixed-step methods for an arm's compiled integrators, and how short their steps must be.
 
-Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 0.5 it loses
-less than 1e-9 of a mode's energy a period, where RK4 loses 1e-4.
+Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 1 it loses 3e-7 of a
+mode's energy a period, and a mode of half the frequency 6e-10; RK4 loses 9e-7 with omega h = 0.1. The structural damping
+of an arm takes a thousandth and more.
 """
 
 import numpy as np
@@ -30,7 +31,7 @@ METHODS = {
 }
 
 #: Highest angular frequency times substep of the explicit methods.
-PHASE_PER_STEP = {"dop853": 0.5, "rk4": 0.1}
+PHASE_PER_STEP = {"dop853": 1.0, "rk4": 0.1}
 #: Where there is play, fastest transmission's angular frequency times substep, of all methods: each time flanks meet
 #: or part, a step loses some 1e-6 of the energy.
 PLAY_PHASE_PER_STEP = 0.05

@@ -12,6 +12,7 @@ r"""What every model of an arm offers, and the terms of the equations of motion 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -21,8 +22,7 @@ from ..errors import ModelError, check_shape
 from ..kernels import chain as kernel
 
 
-@dataclass(frozen=True)
-class Terms:
+class Terms(NamedTuple):
     """Terms of (2) at one state, for n joints and m modal coordinates.
 
     Attributes
