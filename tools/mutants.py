@@ -481,9 +481,10 @@ LAWS = [
         TESTS + "test_manifolds.py",
         (
             "expansion",
-            "inertia of the bending: sign",
-            "self.delta - self._solve(self.terms.M[n:, n:] @ second",
-            "self.delta + self._solve(self.terms.M[n:, n:] @ second",
+            "terms of the centre: of the first point",
+            "here = terms[len(terms) // 2]",
+            "here = terms[0]",
+            TESTS + "test_control_kernels.py",
         ),
         (
             "corrected",
@@ -506,7 +507,7 @@ LAWS = [
         (
             "reference",
             "its feed-forward: gone",
-            "self.feedforward[:] = here.feedforward(delta, rate, second)",
+            "self.feedforward[:] = found.beyond",
             "self.feedforward[:] = 0.0",
         ),
     ),
@@ -792,6 +793,17 @@ LIMITS = [
             "light joints: in the first configuration alone",
             "light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())",
             "light = light or (np.diag(H)[:n] / np.diag(stiff)).max()",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "kernels",
+        TESTS + "test_manifolds.py",
+        (
+            "manifold",
+            "inertia of the bending: sign",
+            "zero[i, a] - higher[i, a]",
+            "zero[i, a] + higher[i, a]",
         ),
     ),
     *of(
