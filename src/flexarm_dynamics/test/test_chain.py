@@ -946,8 +946,17 @@ def test_arms_of_one_structure_share_their_code_and_keep_their_own_constants():
             close(found, expected, 1e-12)
 
 
-def test_long_equations_stay_in_loops():
-    assert Chain(random_arm(78, [FULL] * 5)).straight_line is None
+def test_long_equations_stay_in_loops(monkeypatch):
+    operations = generated.right_hand_side(*_recorded(Chain(SIMPLE)))[2]
+    for limit in (operations - 1, operations):
+        monkeypatch.setattr(generated, "MAX_OPERATIONS", limit)
+        assert (Chain(SIMPLE).straight_line is None) == (limit < operations)
+
+
+def _recorded(chain):
+    """What `generated.right_hand_side` takes of a chain."""
+    data = chain.data
+    return data, work_space(data, object), generated.ways(data)[0]
 
 
 @pytest.mark.parametrize("level", LEVELS[1:])
