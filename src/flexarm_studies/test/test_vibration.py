@@ -67,10 +67,13 @@ def test_modes_along_a_motion_keep_their_order_and_one_that_is_missing_is_close_
     def row(frequencies):
         return study.Measured(np.array(frequencies), 0.01 * np.arange(1.0, 1.0 + len(frequencies)))
 
-    # The loudest comes first; half-way two modes are one; of three at the start the two loudest count.
-    frequencies, dampings = study.rows(row([8.3, 7.1]), (row([7.7]), row([8.6, 13.2, 20.0])))
+    # The loudest comes first; half-way two modes are one.
+    frequencies, dampings = study.rows(row([8.3, 7.1]), (row([7.7]), row([8.6, 13.2])))
     assert_allclose(frequencies, [[8.6, 13.2], [7.7, 7.7], [7.1, 8.3]])
     assert_allclose(dampings, [[0.01, 0.02], [0.01, 0.01], [0.02, 0.01]])
+    # A mode that rings only half-way counts everywhere.
+    frequencies, _ = study.rows(row([0.96]), (row([1.15, 0.94]), row([1.3])))
+    assert_allclose(frequencies, [[1.3, 1.3], [0.94, 1.15], [0.96, 0.96]])
     # Twice a frequency is another mode: what is found at the end alone stays as it is.
     frequencies, _ = study.rows(row([2.5, 5.2]), (row([2.3]), row([])))
     assert_allclose(frequencies, [[2.3, 5.2], [2.3, 5.2], [2.5, 5.2]])

@@ -147,11 +147,12 @@ def together(found, other) -> Measured:
     )
 
 
-def rows(found, others):
-    """Modes at several places of a motion as rows, with as many modes as ring at its end, each mode in its own column.
+def rows(found, others, count=None):
+    """Modes at several places of a motion as rows, as many as ring at any of them, each mode in its own column.
 
-    Modes keep their order of frequency along the way. Where fewer are found, two of them are close to each other, and
-    one counts for both; one that would change by more than `CHANGE` from row to row stays as it is.
+    Modes keep their order of frequency along the way. Where fewer are found, two of them are close to each other, or
+    one is silent there, and one counts for both; one that would change by more than `CHANGE` from row to row stays as
+    it is.
 
     Parameters
     ----------
@@ -159,26 +160,36 @@ def rows(found, others):
         At the end of the motion.
     others : sequence of Measured
         At places before, from the end to the start.
+    count : int, optional
+        As many modes as this, the loudest.
 
     Returns
     -------
     frequencies, dampings : (c, m) ndarrays
         From the start to the end [Hz], [-].
     """
-    count = found.frequencies.size
-    rows = [_ascending(found, count)]
-    for other in others:
-        if not other.frequencies.size:
-            rows.insert(0, rows[0])
-            continue
-        mode, after = _ascending(other, count), rows[0]
-        chosen = min(
-            (list(c) for c in combinations_with_replacement(range(mode.shape[1]), count)),
-            key=lambda c: (-len(set(c)), np.abs(np.log(mode[0, c] / after[0])).sum()),
-        )
-        far = np.abs(np.log(mode[0, chosen] / after[0])) > np.log(CHANGE)
-        rows.insert(0, np.where(far, after, mode[:, chosen]))
-    return tuple(np.stack(rows).transpose(1, 0, 2))
+    places = [*reversed(others), found]
+    counts = [place.frequencies.size for place in places]
+    count = count or max(counts)
+    # Of places with as many the last: the ringing at the end counts.
+    known = max(range(len(places)), key=lambda k: (min(counts[k], count), k))
+    made = {known: _ascending(places[known], count)}
+    for k in (*range(known - 1, -1, -1), *range(known + 1, len(places))):
+        made[k] = _continued(places[k], made[k + 1 if k < known else k - 1], count)
+    return tuple(np.stack([made[k] for k in range(len(places))]).transpose(1, 0, 2))
+
+
+def _continued(place, after, count):
+    """The modes of a place that go on from a row `after` (2, count), (2, count)."""
+    if not place.frequencies.size:
+        return after
+    mode = _ascending(place, count)
+    chosen = min(
+        (list(c) for c in combinations_with_replacement(range(mode.shape[1]), count)),
+        key=lambda c: (-len(set(c)), np.abs(np.log(mode[0, c] / after[0])).sum()),
+    )
+    far = np.abs(np.log(mode[0, chosen] / after[0])) > np.log(CHANGE)
+    return np.where(far, after, mode[:, chosen])
 
 
 def _ascending(found, count):
@@ -342,15 +353,19 @@ def in_more_time(case, number, times):
     return [arm.follow(each, window).residual(window) / unshaped for each in given]
 
 
-def _prepared(case, number):
-    """The arm of a case, a motion by its number, the modes at its end and along it, and what it leaves [m]."""
+def _prepared(case, number, at_end=False):
+    """The arm of a case, a motion by its number, the modes at its end and along it, and what it leaves [m].
+
+    `at_end`: along it only as many modes as ring at the end, which is what the ringing after a trial shows.
+    """
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion = case.motions[number]
     end = measured(arm, motion.end, motion.angle, case.period)
     start = measured(arm, motion.start, -motion.angle, case.period)
     middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
     unshaped = arm.follow(motion, WINDOW * case.period).residual(WINDOW * case.period)
-    return arm, motion, end, rows(end, (middle, start)), unshaped
+    count = end.frequencies.size if at_end else None
+    return arm, motion, end, rows(end, (middle, start), count), unshaped
 
 
 def in_trials(case, number, count, off=1.0):
@@ -371,7 +386,7 @@ def in_trials(case, number, count, off=1.0):
     list of float
         The least residual over that of the trapezoid, before the first correction and after each [-].
     """
-    arm, motion, end, along, unshaped = _prepared(case, number)
+    arm, motion, end, along, unshaped = _prepared(case, number, at_end=True)
     order = np.argsort(end.frequencies)
     ringing = Ringing(end.frequencies[order], end.dampings[order])
     look = max(WINDOW * case.period, ringing.window) + LATE
