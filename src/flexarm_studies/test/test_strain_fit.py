@@ -211,6 +211,27 @@ def test_what_cannot_be_fitted_is_refused(arm):
     assert value_of(Setup.of(arm), StrainProblem(arm, recording, Options()).found[0]) == 0.03
 
 
+@pytest.mark.parametrize(("rate", "named"), [(100.0, True), (2000.0, False)])
+def test_residuals_that_do_not_end_are_named_and_their_memory_is_bounded_in_seconds(
+    arm, rate, named
+):
+    """A random walk of a gauge: with a memory of one its level would not count."""
+    recording = measured(arm).part(400)
+    walk = np.cumsum(1e-6 * np.random.default_rng(8).standard_normal(400))
+    strain = recording.strain + np.column_stack([walk, np.zeros(400)])
+    problem = StrainProblem(arm, replace(recording, strain=strain, period=1.0 / rate), Options())
+    problem.made = lambda values: recording.strain
+    problem.weigh()
+    raw = (walk[1:] @ walk[:-1]) / (walk[:-1] @ walk[:-1])
+    assert 0.98 < raw < 0.999
+    assert problem.memory[0] == pytest.approx(min(raw, np.exp(-1.0 / rate / 0.5)), rel=1e-12)
+    assert problem.memory[1] == 0.0  # nothing is left of the other one
+    level = problem.new_part(np.ones((400, 2)))[-1, 0]
+    assert level == pytest.approx(1.0 - problem.memory[0]) and level > 0.0009
+    problem.warn_of_endless()
+    assert named == any("root changes slower than in 0.5 s" in w for w in problem.warnings)
+
+
 def test_derivatives_do_not_depend_on_the_number_of_threads(arm):
     recording = measured(arm).part(200)
     one, two = (StrainProblem(arm, recording, Options(), threads=k) for k in (1, 2))
@@ -232,7 +253,7 @@ def test_secants_are_exact_for_a_linear_function_and_are_renewed():
         asked.append(x)
         return (A if len(asked) > 1 else A + 0.3)[:, None, :]
 
-    secant = strain_fit.Secant(lambda x: (A @ x)[:, None], derivatives)
+    secant = strain_fit.Secant(lambda x: (A @ x)[:, None], derivatives, 5)
     x = np.zeros(2)
     assert np.abs(secant.derivative(x)[:, 0] - A).max() > 0.2 and secant.fresh
     for step in ([1.0, 0.0], [0.0, 1.0]):
@@ -241,7 +262,7 @@ def test_secants_are_exact_for_a_linear_function_and_are_renewed():
         np.testing.assert_allclose(found @ step, A @ step)
     np.testing.assert_allclose(found, A)
     assert len(asked) == 1 and not secant.fresh
-    for k in range(strain_fit.BETWEEN):
+    for k in range(5):
         secant.value(x + k + 1.0)
     secant.derivative(x + 0.5)
     assert len(asked) == 2 and secant.fresh

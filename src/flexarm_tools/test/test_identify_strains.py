@@ -200,6 +200,7 @@ def test_options_out_of_range_are_refused(identify, words, message, few_steps):
 def test_another_file_is_scored_with_its_own_bias(flexarm, folder, whole, few_steps):
     rows = np.genfromtxt(folder / "run.csv", delimiter=",", skip_header=1)
     rows[:, 2:] += 40.0
+    rows[:, 0] += 100.0  # another clock
     other = folder / "other.csv"
     np.savetxt(other, rows, delimiter=",", header="t,shoulder,root,middle", comments="")
     code, printed, err = flexarm(
@@ -207,8 +208,10 @@ def test_another_file_is_scored_with_its_own_bias(flexarm, folder, whole, few_st
         "--fit", "0:8", "--score-file", other, "--json",
     )  # fmt: skip
     assert code == 0, err
-    for row in json.loads(printed)["parts"]["score"].values():
+    result = json.loads(printed)
+    for row in result["parts"]["score"].values():
         assert row["model"]["vaf"] > 99.5 and row["model"]["rms"] < 2e-6
+    assert result["ring_downs"] and all(ring["from_s"] > 100.0 for ring in result["ring_downs"])
 
 
 def test_what_gauges_pick_up_from_the_currents_is_scored_beside_the_model(

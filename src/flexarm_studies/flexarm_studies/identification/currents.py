@@ -79,7 +79,7 @@ def torques(arm, run, corner, offset=None):
     return found - friction, predictor
 
 
-def motor_fits(found, run, fitted, scored, corner):
+def motor_fits(found, run, fitted, scored, corner, other=None):
     """A `MotorFit` of each joint whose current was recorded.
 
     Parameters
@@ -87,29 +87,46 @@ def motor_fits(found, run, fitted, scored, corner):
     found : StrainFit
     run : Recording
     fitted, scored : slice
-        Samples.
+        Samples; those that are scored are of `other`, if given.
     corner : float
         Of the low pass of the joint angles [Hz].
+    other : Recording, optional
+        It begins at rest.
     """
     if run.current is None:
         return []
+    regressors = _regressors(found, run, corner)
+    later = regressors if other is None else _regressors(found, other, corner)
+    other, made = other or run, []
+    for j, joint in enumerate(found.setup.arm.joints):
+        current, X = run.current[:, j], regressors[j]
+        if not np.isfinite(current).all():
+            continue
+        value, width = _regressed(X[fitted], current[fitted])
+        left = [_left(current[fitted], X[fitted] @ value), np.nan]
+        if other.current is not None:
+            left[1] = _left(other.current[scored, j], later[j][scored] @ value)
+        made.append(_made(joint.name, value, width, left))
+    return made
+
+
+def _regressors(found, run, corner):
+    """Of the current of each joint: torque, acceleration, speed, direction, one; shape (s, 5) each."""
     arm = found.setup.arm
     torque, predictor = torques(arm, run, corner, found.setup.offset)
     made = []
     for j, joint in enumerate(arm.joints):
-        current, speed = run.current[:, j], predictor.velocity[:, j]
-        if not np.isfinite(current).all():
-            continue
-        X = np.column_stack(
-            [
-                torque[:, j], predictor.acceleration[:, j], speed,
-                np.tanh(speed / joint.friction.smoothing), np.ones(len(speed)),
-            ]
-        )  # fmt: skip
-        value, width = _regressed(X[fitted], current[fitted])
-        predicted = X @ value
-        made.append(_made(joint.name, value, width, current, predicted, fitted, scored))
+        speed = predictor.velocity[:, j]
+        slides = np.tanh(speed / joint.friction.smoothing)
+        columns = torque[:, j], predictor.acceleration[:, j], speed, slides, np.ones(len(speed))
+        made.append(np.column_stack(columns))
     return made
+
+
+def _left(current, predicted):
+    """Fraction of the current's sum of squares, about its mean, that a prediction leaves."""
+    whole = np.sum((current - current.mean()) ** 2)
+    return float(np.sum((current - predicted) ** 2) / max(whole, 1e-300))
 
 
 def _regressed(X, y):
@@ -118,15 +135,8 @@ def _regressed(X, y):
     return regression(X, y, min(bandwidth(left[:, None]), len(y) // 4))
 
 
-def _made(name, value, width, current, predicted, fitted, scored):
+def _made(name, value, width, left):
     """A `MotorFit` from the regression's coefficients: inertia and friction are ratios to the first one."""
-    left = [
-        float(
-            np.sum((current - predicted)[p] ** 2)
-            / max(np.sum((current[p] - current[p].mean()) ** 2), 1e-300)
-        )
-        for p in (fitted, scored)
-    ]
     a, wide = value[0], width[0] / max(abs(value[0]), 1e-300)
     ratio = lambda k: (float(value[k] / a), float(np.hypot(width[k] / a, value[k] / a * wide)))  # noqa: E731
     return MotorFit(

@@ -48,8 +48,10 @@ HELD = ("links[*].mass_per_length", "gauges[*].position")
 STEP = 1e-7
 #: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal's [-].
 FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
-#: Largest autoregression that is used [-].
-MAX_MEMORY = 0.98
+#: Residuals are taken to be forgotten within this [s], even where they last longer: with an autoregression of one, the
+#: level of a gauge would not count at all. A smaller one than the true is as any filter of the residuals: the values
+#: are still consistent, and the intervals allow for what is left of the colour.
+LONGEST_MEMORY = 0.5
 #: Starts, and the range of factors of stiffness and play from the second one on.
 STARTS, RANGE = 6, (0.6, 1.7)
 #: Kinds that a start varies; kinds that stay as they are for its first steps.
@@ -58,9 +60,10 @@ LATER = ("offset", "delay", "drift", "hub_inertia")
 #: Each start is fitted to the first samples, this fraction of all, at least so many seconds of them.
 START_PART, START_SECONDS = 0.35, 10.0
 #: Evaluations of a start, and of each pass with new weights; largest number of passes.
-START_STEPS, PASS_STEPS, PASSES = 18, 30, 10
-#: Evaluations after which derivatives are computed anew, and not by secants: they cost as much as 25 evaluations.
-BETWEEN = 6
+START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
+#: From the second pass on, secants stand for derivatives until so many evaluations were made: one derivative of all
+#: quantities costs as much as 25 of these. Far from the values they lead astray.
+BETWEEN = 3
 #: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
 FIRST_TOLERANCE = 1e-4
 #: The weights belong to the values once a pass leaves at least this fraction of the sum of squares, and the
@@ -71,7 +74,7 @@ SINGULAR = 1e-4
 #: Deviation of the prior about the file's value, in scales: what strains hardly tell stays near it [-].
 PRIOR = 1.0
 #: What takes part in a combination: this fraction of the singular vector [-].
-INVOLVED = 0.1
+INVOLVED = 0.03
 #: Smallest noise [-].
 MIN_NOISE = 1e-9
 #: A residual of a model that diverges, in deviations.
@@ -221,7 +224,7 @@ def fit_start(arm, recording, options, number, threads=1):
     found = strain_quantities(arm, recording)
     problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found, threads)
     problem.begin(0)
-    problem.weigh()  # all starts alike, so that their sums compare
+    problem.weigh_each()  # all starts alike, so that their sums compare
     problem.begin(number)
     problem.solve(START_STEPS, 1e-3, LATER)
     return problem.cost, problem.values
@@ -271,6 +274,7 @@ class StrainProblem:
         self.memory = np.full(g, FIRST_MEMORY)
         self.whiten = np.diag(1.0 / np.maximum(FIRST_NOISE * spread, MIN_NOISE))
         self.covariance_of_new = np.diag(np.maximum(FIRST_NOISE * spread, MIN_NOISE) ** 2)
+        self.endless = np.zeros(g, bool)
         self.duration = max(float(recording.time[-1]), recording.period)
         self.cost = np.inf
 
@@ -379,8 +383,11 @@ class StrainProblem:
             if self.free[bias]:
                 self.values[bias] = level
 
-    def solve(self, steps, tolerance, later=(), keep=None):
-        """Least squares from the current values, quantities of the kinds `later` held; ``keep()`` after each step."""
+    def solve(self, steps, tolerance, later=(), keep=None, between=0):
+        """Least squares from the current values, quantities of the kinds `later` held; ``keep()`` after each step.
+
+        Derivatives are computed anew after `between` evaluations.
+        """
         self.predictor.adapt(self.at(self.values).arm)
         which = np.array(
             [j for j in np.flatnonzero(self.free) if self.found[j].kind not in later], int
@@ -397,7 +404,8 @@ class StrainProblem:
             return values
 
         middle = self.file[which] / self.scale[which]
-        secant = Secant(lambda x: self.made(full(x)), lambda x: self.derivatives(full(x), which))
+        derivatives = lambda x: self.derivatives(full(x), which)  # noqa: E731
+        secant = Secant(lambda x: self.made(full(x)), derivatives, between)
 
         def residuals(x):
             r = self.of_made(secant.value(x)).ravel()
@@ -425,15 +433,32 @@ class StrainProblem:
                 break  # not by the secants' fault
         self.cost, self.values = self.best
 
+    def left(self):
+        """Residuals (s, g), 0 where nothing was measured; None while the model does not follow the motion."""
+        self.predictor.adapt(self.at(self.values).arm)
+        e = np.where(self.known, self.measured - self.made(self.values), 0.0)
+        return e if np.isfinite(e).all() else None
+
+    def weigh_each(self):
+        """Weigh each gauge by what is left of it: of a poor fit, what gauges have alike is vibration, not noise."""
+        e = self.left()
+        if e is not None:
+            new = self.new_part(e)
+            count = np.maximum((new != 0.0).sum(axis=0), 1)
+            size = np.sqrt(np.sum(new**2, axis=0) / count)
+            self.whiten = np.diag(1.0 / np.maximum(size, MIN_NOISE))
+
     def weigh(self):
         """Memory and covariance of the residuals, and the weights that follow from them."""
-        e = np.where(self.known, self.measured - self.made(self.values), 0.0)
-        if not np.isfinite(e).all():  # no model yet that follows the motion
+        e = self.left()
+        if e is None:
             return
         both = self.known[1:] & self.known[:-1]
         power = np.maximum(np.sum(np.where(both, e[:-1] ** 2, 0.0), axis=0), 1e-300)
         product = np.sum(np.where(both, e[1:] * e[:-1], 0.0), axis=0)
-        self.memory = np.clip(product / power, 0.0, MAX_MEMORY)
+        longest = np.exp(-self.recording.period / LONGEST_MEMORY)
+        self.memory = np.clip(product / power, 0.0, longest)
+        self.endless = self.memory == longest
         new = self.new_part(e)
         count = np.maximum((new != 0.0).sum(axis=0), 1)
         covariance = new.T @ new / np.sqrt(np.outer(count, count))
@@ -449,8 +474,9 @@ class StrainProblem:
         for number in range(stage, PASSES):
             memory = self.memory
             self.solve(
-                PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number)
-            )
+                PASS_STEPS, 1e-6 if number else FIRST_TOLERANCE, keep=self._keeper(state, number),
+                between=BETWEEN if number else 0,
+            )  # fmt: skip
             report(f"pass {number + 1} of {PASSES}: {self.cost:.6g}")
             if number == 0:
                 self.leave_out_alike()
@@ -537,6 +563,7 @@ class StrainProblem:
             covariance[np.ix_(which, which)] = block
             widths[which] = NORMAL * np.sqrt(np.diag(block))
         wide = self._wide(widths)
+        self.warn_of_endless()
         setup = self.at(self.values)
         noise = np.sqrt(np.diag(self.covariance_of_new))
         return StrainFit(
@@ -546,6 +573,17 @@ class StrainProblem:
             tuple(self.found[i].name for i, _ in self.left_out) + wide, self.alike, starts,
             tuple(self.warnings),
         )  # fmt: skip
+
+    def warn_of_endless(self):
+        """Name gauges whose residuals last longer than any memory that is used."""
+        names = [
+            n for n, slow in zip(self.setup.arm.gauge_names, self.endless, strict=True) if slow
+        ]
+        if names:
+            self.warnings.append(
+                f"what the model leaves of {', '.join(names)} changes slower than in {LONGEST_MEMORY:g} s: something"
+                " slow is missing in the model, or a gauge drifts by more than a line; its level hardly counts"
+            )
 
     def _wide(self, widths):
         """Names of quantities whose interval is wider than the limit, with a warning for each."""
@@ -569,10 +607,12 @@ class Secant:
     ----------
     function, derivatives : callable
         ``function(x)`` of shape (s, g), ``derivatives(x)`` (s, g, p), for x (p,).
+    between : int
+        Values after which derivatives are computed anew.
     """
 
-    def __init__(self, function, derivatives):
-        self._function, self._derivatives = function, derivatives
+    def __init__(self, function, derivatives, between):
+        self._function, self._derivatives, self._between = function, derivatives, between
         self._last = self._at = None
         self._count = 0
 
@@ -593,9 +633,9 @@ class Secant:
         return self._last[1]
 
     def derivative(self, x):
-        """Derivatives at x, anew after `BETWEEN` values."""
+        """Derivatives at x."""
         y = self.value(x)
-        usable = self._at is not None and self._count <= BETWEEN
+        usable = self._at is not None and self._count <= self._between
         if not (usable and np.isfinite(y).all() and np.isfinite(self._at[1]).all()):
             D, self._count = self._derivatives(x), 0
         else:

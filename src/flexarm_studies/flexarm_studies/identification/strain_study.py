@@ -63,7 +63,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     -------
     found : StrainFit
     result : dict
-        Plain data: ``parts`` with scores by gauge, ``ring_downs``, ``currents``, ``pickup``.
+        Plain data: ``parts`` with scores by gauge, ``ring_downs`` (of `other`, if given), ``currents``, ``pickup``.
     run : tuple
         Recording, measured and predicted strains (s, g), from the beginning to the end of all that was predicted.
     """
@@ -72,8 +72,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     spans = [fit] if other is not None or score is None else [fit, score]
     begin = _begin(recording, min(a for a, _ in spans))
     run = recording.between(begin, max(b for _, b in spans))
-    row = lambda t: round((t - run.start) / recording.period)  # noqa: E731
-    fitted = slice(max(row(fit[0]), 0), min(row(fit[1]), len(run.position)))
+    fitted = _rows(run, fit)
     options = replace(options or Options(), lead=fitted.start)
     found = identify_strains(arm, run.part(fitted.stop), options, **fitting)
     middle = 0.5 * (fitted.stop - 1) * run.period
@@ -81,21 +80,23 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     picked = _picked(run, predicted, fitted, wanted)
     given = found, recording, run, predicted, picked
     parts = {"fit": _scored(*given, fitted, fitted, wanted, options)}
-    if other is None and score is not None:
-        scored = slice(max(row(score[0]), 0), min(row(score[1]), len(run.position)))
-        parts["score"] = _scored(*given, scored, fitted, wanted, options)
-    elif other is not None:
+    if other is not None:
+        scored = _rows(other, score)
         parts["score"] = _other(found, other, score, picked, wanted, options)
-    noise = _noise(recording, found)
-    rings = scores.ring_downs(run, predicted, noise)
-    last = scored if other is None and score is not None else fitted
-    motors = motor_fits(found, run, fitted, last, options.corner)
+    elif score is not None:
+        scored = _rows(run, score)
+        parts["score"] = _scored(*given, scored, fitted, wanted, options)
+    else:
+        scored = fitted
+    shown = (run, predicted) if other is None else (other, predict(found, other, options))
+    rings = scores.ring_downs(*shown, _noise(other or recording, found))
+    motors = motor_fits(found, run, fitted, scored, options.corner, other)
     result = {
         "fit_s": fit,
         "score_s": score,
         "parts": parts,
         "currents": [_motor(m) for m in motors],
-        "ring_downs": [_ring(run, *r) for r in rings],
+        "ring_downs": [_ring(shown[0], *r) for r in rings],
         "pickup": _pickup(picked),
     }
     return found, result, (run, predicted)
@@ -156,11 +157,16 @@ def _other(found, other, score, picked, wanted, options):
     rests = sorted(rest.stretches(other), key=lambda p: p.stop - p.start)
     if rests:
         predicted = predicted + np.nanmean((other.strain - predicted)[rests[-1]], axis=0)
-    rows = np.round((np.array(score) - other.start) / other.period).astype(int)
-    part = slice(max(int(rows[0]), 0), min(int(rows[1]), len(other.position)))
+    part = _rows(other, score)
     made, sizes = {"model": predicted}, {}
     _with_pickup(made, sizes, picked, other)
     return _table(found, other, other, made, sizes, part, wanted.above)
+
+
+def _rows(recording, span):
+    """The samples of a recording from beginning to end of a `span` [s]."""
+    rows = np.round((np.array(span) - recording.start) / recording.period).astype(int)
+    return slice(max(int(rows[0]), 0), min(int(rows[1]), len(recording.position)))
 
 
 def _table(found, recording, run, made, sizes, part, above):

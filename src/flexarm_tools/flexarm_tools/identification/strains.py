@@ -231,11 +231,12 @@ def text_of(result, line):
         )
     if result["ring_downs"]:
         yield ""
-        yield f"{'ring-down [s]':18}{'gauge':10}{'measured [Hz], damping':>36}{'modelled':>20}"
+        yield f"{'ring-down [s]':18}{'gauge':10}{'measured [Hz], damping':>38}{'modelled':>20}"
     for ring in result["ring_downs"]:
         yield (
             f"{ring['from_s']:6.2f} to {ring['to_s']:6.2f}  {ring['gauge']:10}"
-            f"{ring['measured_frequency']:14.3f} {ring['measured_damping']:11.4f}"
+            f"{ring['measured_frequency']:8.3f} +- {ring['frequency_width'] or np.nan:.3f}"
+            f" {ring['measured_damping']:10.4f}"
             f" +- {ring['damping_width'] or np.nan:.4f}"
             f"{ring['modelled_frequency'] or np.nan:12.3f} {ring['modelled_damping'] or np.nan:7.4f}"
         )
