@@ -51,7 +51,7 @@ FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
 #: Residuals are taken to be forgotten within this [s], even where they last longer: with an autoregression of one, the
 #: level of a gauge would not count at all. A smaller one than the true is as any filter of the residuals: the values
 #: are still consistent, and the intervals allow for what is left of the colour.
-LONGEST_MEMORY = 0.5
+MAX_MEMORY_TIME = 0.5
 #: Starts, and the range of factors of stiffness and play from the second one on.
 STARTS, RANGE = 6, (0.6, 1.7)
 #: Kinds that a start varies; kinds that stay as they are for its first steps.
@@ -456,7 +456,7 @@ class StrainProblem:
         both = self.known[1:] & self.known[:-1]
         power = np.maximum(np.sum(np.where(both, e[:-1] ** 2, 0.0), axis=0), 1e-300)
         product = np.sum(np.where(both, e[1:] * e[:-1], 0.0), axis=0)
-        longest = np.exp(-self.recording.period / LONGEST_MEMORY)
+        longest = np.exp(-self.recording.period / MAX_MEMORY_TIME)
         self.memory = np.clip(product / power, 0.0, longest)
         self.endless = self.memory == longest
         new = self.new_part(e)
@@ -581,7 +581,7 @@ class StrainProblem:
         ]
         if names:
             self.warnings.append(
-                f"what the model leaves of {', '.join(names)} changes slower than in {LONGEST_MEMORY:g} s: something"
+                f"what the model leaves of {', '.join(names)} changes slower than in {MAX_MEMORY_TIME:g} s: something"
                 " slow is missing in the model, or a gauge drifts by more than a line; its level hardly counts"
             )
 
