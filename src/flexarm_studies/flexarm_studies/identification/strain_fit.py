@@ -384,9 +384,10 @@ class StrainProblem:
                 self.values[bias] = level
 
     def solve(self, steps, tolerance, later=(), keep=None, between=0):
-        """Least squares from the current values, quantities of the kinds `later` held; ``keep()`` after each step.
+        """Least squares from the current values, in so many `steps` at most, to a relative `tolerance` of the sum.
 
-        Derivatives are computed anew after `between` evaluations.
+        Quantities of the kinds `later` are held; ``keep()`` is called after each step; derivatives are computed anew
+        after `between` evaluations.
         """
         self.predictor.adapt(self.at(self.values).arm)
         which = np.array(
