@@ -88,15 +88,19 @@ class JointPid(SlowLaw):
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
         _, coulomb, self._smoothing = model.friction_table().T.copy()
         self._cancelled = self.parameters["friction"] * coulomb
-        self._slides, self._expected = np.zeros(n), np.zeros(n)
+        self._cancels, self._slides, self._more = (
+            some(self._cancelled),
+            np.zeros((2, n)),
+            np.zeros(n),
+        )
 
     @contextmanager
     def without_friction(self):
-        cancelled, self._cancelled = self._cancelled, np.zeros_like(self._cancelled)
+        cancels, self._cancels = self._cancels, False
         try:
             yield
         finally:
-            self._cancelled = cancelled
+            self._cancels = cancels
 
     @property
     def stiffness(self):
@@ -142,18 +146,19 @@ class JointPid(SlowLaw):
         u += damping * (motion.velocity - qd)
         u += self.integral
         u = self._low_pass(u)
-        if some(self._cancelled):
+        if self._cancels:
             u += self._friction(qd, motion.velocity)
         return u
 
     def _friction(self, qd, expected):
         """What is cancelled of the friction at joint speeds qd, beyond that of the `expected` ones, (n,) [N m]."""
-        for speed, out in ((qd, self._slides), (expected, self._expected)):
-            np.divide(speed, self._smoothing, out=out)
-            np.tanh(out, out=out)
-        self._slides -= self._expected
-        self._slides *= self._cancelled
-        return self._slides
+        slides, more = self._slides, self._more
+        slides[0], slides[1] = qd, expected
+        slides /= self._smoothing
+        np.tanh(slides, out=slides)
+        np.subtract(slides[0], slides[1], out=more)
+        more *= self._cancelled
+        return more
 
     def absorb(self, torque):
         before = self.integral.copy()
