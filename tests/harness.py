@@ -119,7 +119,7 @@ class Bench(Nodes, Session):
     # Processes -------------------------------------------------------------------------------
 
     def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
-        """Start a node's installed executable; `key` names its log and process."""
+        """Start a node as its installed executable does, by `preloaded`; `key` names its log and process."""
         command = [executable(NODES[name], name), *arguments(parameters, file, remaps)]
         return self.processes.start(key or name, command, preloaded.start)
 
