@@ -240,11 +240,18 @@ class Arm:
         return self.wait_standing(int(answer.message.split()[-1]))
 
     def run(self, seconds):
-        """Run on for so long, then stand; the samples of the session by stamp [ns]."""
+        """Run on for exactly so long, then stand; the samples of the session by stamp [ns]."""
         end = self.now + round(seconds * 1e9)
+        node = f"{self.namespace}simulator"
+        before = self.bench.get(node, "pause_at")
+        at = 1e-9 * (end - simulator.Simulator.START_NS)
+        assert self.bench.set(node, pause_at=at)[0].successful
         self.pause(False)
         self.wait_until(end)
         self.stand()
+        assert self.now == end, (self.now, end)
+        # Where it pauses after a reset.
+        assert self.bench.set(node, pause_at=before)[0].successful
         return self.samples()
 
     def wait_standing(self, sequence=None, session=None):
@@ -492,13 +499,13 @@ def segments(pid):
     return found
 
 
-#: FastDDS gives this port to all processes of the machine, whatever their domain: not one node's to leave.
-SHARED_PORT = SHM / "fastrtps_port7002"
+#: FastDDS gives these ports to all processes of the machine, whatever their domain: not one node's to leave.
+SHARED_PORTS = tuple(f"fastrtps_port{number}" for number in range(7000, 7400))
 
 
 def abandoned(paths):
     """Those of `paths` that still exist and that no living process has open."""
-    paths = {p for p in paths if p.exists() and not p.name.startswith(SHARED_PORT.name)}
+    paths = {p for p in paths if p.exists() and not p.name.startswith(SHARED_PORTS)}
     for entry in Path("/proc").iterdir():
         if paths and entry.name.isdigit():
             paths -= segments(entry.name)

@@ -146,7 +146,6 @@ def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(bench, arm, scr
 
     # Move: to where the sliders point, a radian from here.
     screen.wait_for_value("joint1", "1")
-    # Slowly: the loop runs on for a while after the request to pause.
     screen.field("duration").fill("10")
     screen.field("duration").dispatch_event("blur")
     screen.click("Move there")

@@ -15,9 +15,9 @@ PARAMETERS = (
     parameter("lockstep", False, read_only=True).described(
         "One period per torque that answers the last state, as fast as the machine goes; false: real time."
     ),
-    parameter("pause_at", 0.0, "s", -1.0, 1e6, read_only=True).described(
+    parameter("pause_at", 0.0, "s", -1.0, 1e6).described(
         "In lockstep, pause at this simulated time, once, until `~/pause` is called with data false;"
-        " negative: never."
+        " negative, or a time that is past: never."
     ),
     parameter("resend_period", 0.1, "s", 0.01, 10.0, read_only=True).described(
         "In lockstep or paused, the state is sent again after so long without an answer (wall time)."
@@ -73,6 +73,9 @@ class RealTime:
         if node.safe and not was_safe:
             node.report("no fresh torque: the safe action is applied")
 
+    def set_pause(self, time):
+        """Nothing to do: real time stands only on request."""
+
     def pauses_at(self, sequence):
         """Whether a pause begins at this sample."""
         return False
@@ -103,9 +106,7 @@ class Lockstep:
     def __init__(self, node):
         self._node = node
         self._resent = 0  # times since the last step
-        at = node.parameters["pause_at"]
-        # Counted in samples: the same in every run.
-        self._pause = round(at * 1e9 / node.sim.period_ns) if at >= 0.0 else None
+        self.set_pause(node.parameters["pause_at"])
 
     def alone(self):
         """Silence of one controller after which the other is alone, see `TorqueGate` [s]."""
@@ -114,6 +115,10 @@ class Lockstep:
     def connect(self, torques):
         """Make `joint_torque` the control path."""
         self._node.make_control_path(torques)
+
+    def set_pause(self, time):
+        """Pause at this simulated time [s], counted in samples: the same in every run; negative: never."""
+        self._pause = round(time * 1e9 / self._node.sim.period_ns) if time >= 0.0 else None
 
     def pauses_at(self, sequence):
         """Whether a pause begins at this sample."""

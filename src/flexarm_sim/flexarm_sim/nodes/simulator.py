@@ -69,6 +69,8 @@ class SimulatorNode(Driver):
             self.sim.settings["initial_position"] = self.parameters["initial_position"]
         if "faults" in names:
             self.faults.set(self.parameters["faults"])
+        if "pause_at" in names:
+            self.pacing.set_pause(self.parameters["pause_at"])
 
     # The device --------------------------------------------------------------------------------
 
