@@ -998,6 +998,40 @@ def test_the_range_of_a_joint_is_kept_with_its_braking_distance(limited, beyond,
     assert core.state == state, core.reason
 
 
+@pytest.mark.parametrize(
+    ("margin", "ahead", "why"),
+    [(1.0, 0.0, ""), (1.0, 0.15, "position of joint1 is"), (0.0, 0.0, "position of joint1 is")],
+    ids=["judged", "judged, not followed", "not judged"],
+)
+def test_a_judged_motion_within_the_range_is_not_stopped_for_its_braking_distance(
+    limited, margin, ahead, why
+):
+    """The straight arm's weight leaves little torque to brake it with; hanging, it has enough."""
+    (joint,) = limited.arm.joints
+    limits = replace(joint.limits, position=(-2.4, -1.2))
+    arm = replace(limited.arm, gravity=(0.0, -9.81, 0.0), joints=(replace(joint, limits=limits),))
+    hanging = build(arm)
+    a, B = slow_subsystem(hanging.terms(np.zeros(1), np.zeros(1)))
+    weight = abs(a[0]) / B[0, 0]
+    core = controller(
+        hanging,
+        torque_limit=[1.05 * weight],
+        trajectory_torque_margin=margin,
+        tracking_error_limit=0.0,
+    )
+    core.step(sample(0, -2.0))
+    verdict = core.offer(motion(start=-2.0, end=-1.2, duration=1.7))
+    assert verdict.accepted, verdict.reason
+    states = []
+    for k in range(1, 1900):
+        q = core.reference.position + ahead * (k > 800)
+        core.step(sample(k, q, velocity=core.reference.velocity.copy()))
+        states.append(core.state)
+    assert why in core.reason and (State.STOPPING in states or core.state == State.FAULT) == bool(
+        why
+    )
+
+
 def test_a_torque_at_its_limit_for_long_stops_the_arm(arm_r):
     core = controller(arm_r, Scripted(*[100.0] * 700), saturation_time=0.3, torque_limit=[1.0])
     k = tracking(core, 300)

@@ -135,6 +135,7 @@ class ArmController:
         self._authority = Authority(model, settings)
         self.torque = self._authority.torque
         self.supervisor = Supervisor(model, settings, self.torque_limit)
+        self._expected = None
         self._applied = Applied(model, settings, self.torque_limit)
         self.torque_delay = TorqueDelay(n)
         self._take_limits(settings)
@@ -436,6 +437,8 @@ class ArmController:
         if self.payload is not None:
             self._note(sample, dt)
         reference.sample(sample.stamp_ns)
+        if reference.path is not self._expected:
+            self._expect(reference.path)
         q, qd = sample.position, sample.velocity
         np.subtract(reference.position, q, out=self.position_error)
         np.subtract(reference.velocity, qd, out=self.velocity_error)
@@ -470,6 +473,15 @@ class ArmController:
         if verdict == State.STOPPING and (reference.active or reference.pending):
             self.brake(why)  # from the next sample on
         return self.enabled
+
+    def _expect(self, path):
+        """Another path is followed, or none: where its torque was judged, the arm can brake with its accelerations."""
+        self._expected = path
+        most = np.zeros(self.model.n_joints)
+        if path is not None and np.isfinite(self.torque_allowed).all():
+            margin = self.supervisor.settings["trajectory_torque_margin"]
+            most = path.followed.peaks()[1] / max(margin, 1.0)
+        self.supervisor.expect(most)
 
     def _fast_fraction(self, fraction, dt):
         """Fraction of the fast torque that is applied: it follows `enable_fast` in a ramp."""

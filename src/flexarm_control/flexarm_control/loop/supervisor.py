@@ -14,9 +14,13 @@ The arm is stopped smoothly when a limit is exceeded, that is, when one of these
 .. math:: |q_r - q|/e_{max},\; |\dot q|/\dot q_{max},\; |\delta|/\delta_{max},\; |\varepsilon|/\varepsilon_{max},\;
           t_{saturated}/t_{max}
 
-and, for the joints' range with braking distance, :math:`q + \dot q|\dot q|/2D` with D the deceleration that the
-torque limit allows. A ratio above `FAULT_RATIO` is a fault, and so is a limit that stays exceeded for `limit_patience`,
-or a state that can't be trusted.
+and, for the joints' range with braking distance, :math:`q + \dot q|\dot q|/2D`. D is the deceleration that the torque
+limit of the joint allows a straight arm, or the largest acceleration of the motion that is followed, if that is larger:
+its torque was judged on receipt, with the other joints' torques and in its own configurations. While a joint follows a
+motion that brakes, :math:`\dot q_r^2 \le 2D|q_{end} - q_r|`, so that a motion within the range is not stopped.
+
+A ratio above `FAULT_RATIO` is a fault, and so is a limit that stays exceeded for `limit_patience`, or a state that
+can't be trusted.
 """
 
 from enum import IntEnum
@@ -142,6 +146,7 @@ class Supervisor:
         self._ratio, self._value = np.zeros((2, len(self._names)))
         self._no_error, self._kernels = np.zeros(model.n_joints), kernels.compiled()
         self._rows = gauge_rows(model, model.arm.gauges)
+        self._of_motion = np.zeros(model.n_joints)
         self.forget()
         self.configure(settings, torque_limit)
 
@@ -179,14 +184,20 @@ class Supervisor:
         # Range, braking deceleration and margin of each joint.
         low, high = arm.position_limits.T
         margin = limit[self._parts[2]]
-        able = np.maximum(able, np.finfo(float).tiny)
-        ranges = np.stack([low, high, able, 0.99 * FAULT_RATIO * margin], axis=1)
+        self._able = np.maximum(able, np.finfo(float).tiny)
+        ranges = np.stack([low, high, self._able, 0.99 * FAULT_RATIO * margin], axis=1)
         self._ranges = ranges[: n if margin[0] < np.inf else 0]
+        self.expect(self._of_motion)
         self._limit, self._inverse = limit, 1.0 / limit
         watches_strain = np.isfinite(limit[self._parts[4]]).any()
         self._watched_rows = self._rows[: None if watches_strain else 0]
         self.deceleration = np.where(wanted > 0.0, wanted, finite)
         self.deceleration_given = wanted > 0.0
+
+    def expect(self, acceleration):
+        """The motion that is followed has these largest accelerations, (n,) [rad/s^2]: the arm can brake so, too."""
+        self._of_motion = acceleration
+        self._ranges[:, 2] = np.maximum(self._able, acceleration)[: len(self._ranges)]
 
     def forget(self):
         """No limit has been exceeded so far."""
