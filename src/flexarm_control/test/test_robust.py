@@ -31,6 +31,7 @@ from flexarm_control.robust.uncertain import (
     uncertain_loops,
 )
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
@@ -529,6 +530,16 @@ def test_torque_reaches_no_mode_that_turns_by_more_than_a_radian_during_the_dela
     at = np.array([[0.0, 0.5]])
     assert reach(two_link, at, 0.01) == 100.0
     assert reach(two_link, at, 1e-4) == pytest.approx(1.5 * two_link.frequencies(at[0])[-1])
+
+
+@pytest.mark.parametrize(("stiffness", "corner"), [(1.0, 500.0), (400.0, None), (1e5, 1000.0)])
+def test_filtered_derivatives_of_a_fast_arm_lag_less(two_link, stiffness, corner):
+    """A radian per sample is enough for a slow arm; a fast one has 15 omega_1, up to two radians per sample."""
+    arm = build(scaled(two_link.arm, stiffness=stiffness))
+    found = design_module.sampling_for(arm, np.zeros((1, 2)), QUICK)[0]
+    wanted = corner or 15.0 * design_module.lowest(arm)
+    assert_allclose([found.joint_corner, found.modal_corner], wanted, rtol=1e-9)
+    assert corner or 500.0 < wanted < 1000.0
 
 
 def test_the_set_holds_what_it_says(two_link):

@@ -37,8 +37,9 @@ from .uncertain import (
     uncertain_loops,
 )
 
-#: Corner of the filtered derivatives over omega_c.
-FILTER = 2.0
+#: Corner of the filtered derivatives over omega_c, at most one radian per sample; of a fast arm, for which the lag of
+#: such a filter counts, at least so many times omega_1, at most two radians per sample.
+FILTER, FAST_ARM, PER_SAMPLE = 2.0, 15.0, 2.0
 #: Corners of the torque's low pass that are tried, over omega_1; infinite: none.
 LOW_PASS = (np.inf, 20.0, 8.0, 4.0)
 #: A low pass costs margins of gain and phase, and is taken where it makes the decay larger by more than this factor.
@@ -303,6 +304,7 @@ def sampling_for(nominal, at, settings):
     h = 1.0 / settings.rate
     omega_c = reach(nominal, at, settings.delay + 0.5 * h)
     corner = min(settings.rate, FILTER * omega_c)
+    corner = max(corner, min(PER_SAMPLE * settings.rate, FAST_ARM * lowest(nominal)))
     rubs = any(joint.friction.coulomb for joint in nominal.arm.joints)
     friction = CANCELLED if rubs else 0.0
     return Sampling(h, settings.delay, corner, corner, friction=friction), omega_c
