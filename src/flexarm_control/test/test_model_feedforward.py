@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from flexarm_control import trajectory
 from flexarm_control.composite.design import design
 from flexarm_control.fading import Fading
-from flexarm_control.feedforward.model import regulator
+from flexarm_control.feedforward.model import gains_along, path_of, regulator
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.linear import linear_plant, sampled
@@ -51,6 +51,25 @@ def test_the_regulator_holds_where_samples_are_too_far_apart_for_that_of_continu
         assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains[period])).max() < 1.0
     Phi, Gamma = sampled(*plant, 3e-2)
     assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains[1e-3])).max() > 1.0
+
+
+def test_regulators_hold_everywhere_along_a_motion_there_and_back():
+    """Gains are linear in time: between one before the arm turns and one after it, they are of other configurations."""
+    model, period = build(arm_file.load("long_reach")), 2e-3
+    start, there, back = (
+        np.array([0.0, 1.2, 0.8, -0.8]),
+        np.array([0.184, 0.959, 1.149, -0.541]),
+        np.array([0.009, 1.099, 1.024, -0.716]),
+    )
+    names, still = model.joint_names, np.zeros(4)
+    points = [(2724, there), (3124, there), (5024, back)]
+    data = trajectory.validate(names, names, 0, [(t * MS, q, still, still, []) for t, q in points])
+    path = path_of(data, np.stack([start, still, still]))
+    gains, state = gains_along(model, path, period), np.zeros((3, 4))
+    for t in np.linspace(0.0, 5.02, 50):
+        path.evaluate(round(t * 1e9), state)
+        Phi, Gamma = sampled(*linear_plant(model, state[0], coulomb=False), period)
+        assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains.at(t))).max() < 1.0, t
 
 
 def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):

@@ -57,6 +57,9 @@ LOST = 1.0
 APART = 0.12
 #: Relative change of the plant with the joints below which one gain serves everywhere.
 NEGLIGIBLE = 1e-6
+#: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
+#: a joint turns by more than this in it [rad].
+CHECKS, NEAREST = 7, APART / 8.0
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
@@ -154,7 +157,16 @@ def path_of(trajectory, start):
 
 
 def gains_along(model, path, period):
-    """Regulators along a path for samples of a `period` [s]; each interpolation is checked in its middle."""
+    """`Gains` along a path for samples of a `period` [s], checked on the path at `CHECKS` times of each interval.
+
+    An interval whose interpolated gain does not hold the arm there is halved, while a joint turns by more than
+    `NEAREST` in it.
+
+    Raises
+    ------
+    DesignError
+        Where a configuration has no regulator, or the gain of so short an interval does not hold.
+    """
     n, state = model.n_joints, np.zeros((3, model.n_joints))
     grid = np.linspace(0.0, path.duration_ns / SECOND, 400)
     q = np.empty((grid.size, n))
@@ -163,19 +175,35 @@ def gains_along(model, path, period):
         q[k] = state[0]
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
     count = int(np.ceil(way[-1] / APART)) + 1
-    at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], count)))
-    gains = np.array([regulator(model, q[k], period) for k in at])
-    for i in range(len(at) - 1):
-        middle, K = 0.5 * (q[at[i]] + q[at[i + 1]]), 0.5 * (gains[i] + gains[i + 1])
-        Phi, Gamma = sampled(*linear_plant(model, middle, coulomb=False), period)
-        largest = np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max()
-        if largest >= 1.0:
+    at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], count))).tolist()
+    gains = [regulator(model, q[k], period) for k in at]
+    i = 0
+    while i < len(at) - 1:
+        here, there = at[i], at[i + 1]
+        if _hold_between(model, q[here : there + 1], gains[i : i + 2], period):
+            i += 1
+            continue
+        if way[there] - way[here] <= NEAREST or there - here < 2:
             raise DesignError(
                 f"the regulator of {model.arm.name} does not hold between joint configurations"
-                f" {np.round(q[at[i]], 3).tolist()} and {np.round(q[at[i + 1]], 3).tolist()} at {1.0 / period:g} Hz",
+                f" {np.round(q[here], 3).tolist()} and {np.round(q[there], 3).tolist()} at {1.0 / period:g} Hz",
                 field="feedforward",
             )
-    return Gains(grid[at], gains)
+        middle = (here + there) // 2
+        at.insert(i + 1, middle)
+        gains.insert(i + 1, regulator(model, q[middle], period))
+    return Gains(grid[at], np.array(gains))
+
+
+def _hold_between(model, q, gains, period):
+    """Whether the gains of both ends, linear in time, hold the sampled arm in the configurations between, q (k, n)."""
+    steps = len(q) - 1
+    for k in np.unique(np.linspace(0, steps, CHECKS + 2).astype(int))[1:-1]:
+        K = gains[0] + k / steps * (gains[1] - gains[0])
+        Phi, Gamma = sampled(*linear_plant(model, q[k], coulomb=False), period)
+        if np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() >= 1.0:
+            return False
+    return True
 
 
 class _Source(NamedTuple):
