@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -256,6 +257,40 @@ def test_a_healthy_run_has_no_alarm_and_its_arm_is_another():
     assert all(g.bits and g.noise for g in known.gauges) and known.gauges == arms[0].gauges
 
 
+def test_of_a_healthy_run_samples_are_lost_and_stamps_are_off():
+    driver = healthy.UsualDriver(Case("R", "kalman", False).scenario())
+    true, lost, off = driver.loop.measure(), 0, []
+    begun = true.stamp_ns
+    assert driver._messages(true, 0.1) == [true] and true.stamp_ns == begun
+    for _ in range(3000):
+        true.stamp_ns = begun
+        lost += not driver._messages(true, 1.0)
+        off.append((true.stamp_ns - begun) / driver.loop.simulator.period_ns)
+    assert lost / 3000 == pytest.approx(0.2, abs=0.03)
+    assert -0.4 <= min(off) < -0.39 and 0.39 < max(off) <= 0.4
+
+
+def test_what_was_prepared_serves_runs_that_begin_the_same_motion_in_the_same_place():
+    plans, made = healthy.Plans(), []
+
+    def prepared(case, number, place):
+        def prepare(trajectory):
+            made.append(trajectory)
+            return SimpleNamespace(trajectory=trajectory)
+
+        reference = SimpleNamespace(resting=np.array([place]))
+        controller = SimpleNamespace(reference=reference, prepare=prepare)
+        return plans.prepared(case, number, controller, f"{case} {number} {place}")
+
+    first, again = prepared("R", 1, 0.0), prepared("R", 1, 0.0)
+    assert made == ["R 1 0.0"] and first is not again and first == again
+    for case, number, place in (("R", 1, 0.5), ("R", 2, 0.0), ("two_link", 1, 0.0)):
+        assert prepared(case, number, place).trajectory == f"{case} {number} {place}"
+    prepared("R", 3, 0.0)  # of all but the last four nothing is kept
+    prepared("R", 1, 0.0)
+    assert made[-1] == "R 1 0.0" and len(made) == 6
+
+
 def test_a_healthy_arm_moves_there_and_part_of_the_way_back_each_time_otherwise():
     case = Case("R", "kalman", False)
     ways = [motion(case, np.random.default_rng(seed)) for seed in (1, 1, 2)]
@@ -281,7 +316,7 @@ def test_short_motions_at_200_hz_with_lost_samples_are_no_alarm(monkeypatch):
         faults.append(f"state drop from={begin:.4f} for={lasts:.4f}")
     faults.append(f"state jitter by={random.choice([0.0, 0.4]) / 200.0} seed=8")
 
-    def offer(driver, scenario):
+    def offer(driver, *_):
         time, place, points = 0, driver.loop.simulator.position.copy(), []
         for _ in range(8):
             time += int(1e9 * random.uniform(0.1, 0.8))
@@ -312,13 +347,12 @@ def test_healthy_runs_take_turns_and_go_on_where_an_interrupted_study_ended(
     assert [name[0] for name, _ in calls] == ["R"] * 6
     assert command.attack(options(*words, "--healthy", "800")) == 1
     assert len(calls) == len(set(calls)) == 8
-    assert capsys.readouterr().out.splitlines()[-6:] == [
+    assert capsys.readouterr().out.splitlines()[-5:] == [
         "800 healthy samples in 8 runs, 1 of them with an alarm",
-        "R, kalman, without velocity: 300 samples in 3 runs",
-        "R, kalman, with velocity: 300 samples in 3 runs",
-        "two_link, kalman, without velocity: 100 samples in 1 runs",
-        "two_link, kalman, with velocity: 100 samples in 1 runs",
-        "two_link, kalman, with velocity, seed 1: an alarm",
+        "R, kalman, without velocity: 500 samples in 5 runs",
+        "R, kalman, with velocity: 100 samples in 1 runs",
+        "two_link, kalman, without velocity: 200 samples in 2 runs",
+        "two_link, kalman, without velocity, seed 1: an alarm",
     ]
     with out.open("a") as file:
         file.write('{"case": "R, kal')  # cut off by the interruption
@@ -329,7 +363,7 @@ def test_healthy_runs_take_turns_and_go_on_where_an_interrupted_study_ended(
 
 
 def test_what_no_control_bears_is_no_healthy_run():
-    first = [case for case, _ in itertools.islice(healthy.planned(chosen(), 0), 100)]
+    first = [case for case, _ in itertools.islice(healthy.planned(chosen(), 0), 300)]
     assert {case.observer for case in first if case.arm == "long_reach"} == {"filtered_derivative"}
     assert {case.observer for case in first if case.arm == "two_link"} == set(observers())
     with pytest.raises(FlexarmError, match="has no case"):

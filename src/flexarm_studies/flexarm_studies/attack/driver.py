@@ -68,8 +68,12 @@ class Gate:
         if self.renews or sequence > self._newest:
             self._sent[sequence] = time, self.names(time)
             self._newest = sequence
-        for old in [k for k, (t, _) in self._sent.items() if t < time - TORQUE_TIMEOUT - ROUNDING]:
-            del self._sent[old]
+        while self._sent and self._oldest() < time - TORQUE_TIMEOUT - ROUNDING:
+            del self._sent[next(iter(self._sent))]
+
+    def _oldest(self):
+        """When the oldest sample that is kept was sent [s]."""
+        return next(iter(self._sent.values()))[0]
 
     def offer(self, session, sequence, controller, torque, time):
         """A controller's torque (n,) [N m], None for DISABLED, that answers a sample, at a `time` [s]."""

@@ -118,7 +118,15 @@ class Trace:
         return slice(int(np.searchsorted(self.time, time - 1e-9)), None)
 
 
-def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.0, holds=False):
+def drive(
+    driver,
+    events=(),
+    until=START + MOTION + AFTER,
+    begin=np.inf,
+    rest=0.0,
+    holds=False,
+    prepare=None,
+):
     """Run a `LyingDriver` through the case's motion.
 
     Parameters
@@ -132,6 +140,8 @@ def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.
         After `begin` the run is over once no torque acts and all joints have been slower than `rest` for `RESTED`.
     holds : bool
         A run is over as well when the arm rests under a torque.
+    prepare : callable, optional
+        Gives the preparation of a trajectory; not given: the controller's own.
 
     Returns
     -------
@@ -149,7 +159,7 @@ def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.
     while driver.time <= until + 1e-9:
         time = driver.time
         if not offered and time >= START - 2e-9:
-            _offer(driver, scenario)
+            _offer(driver, scenario, prepare or loop.controller.prepare)
             offered = True
         while events and events[0][0] <= time + 1e-9:
             events.pop(0)[1]()
@@ -197,19 +207,19 @@ def drive(driver, events=(), until=START + MOTION + AFTER, begin=np.inf, rest=0.
     )
 
 
-def _offer(driver, scenario):
+def _offer(driver, scenario, prepare):
     """Offer the motion, to begin at the next sample."""
     loop = driver.loop
     motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
-    plan = loop.controller.prepare(motion) if loop.controller.plans else None
+    plan = prepare(motion) if loop.controller.plans else None
     verdict = loop.controller.offer(motion, plan)
     if not verdict.accepted:
         raise FlexarmError(f"the motion is refused: {verdict.reason}", field=scenario.arm.name)
 
 
-def driver_of(scenario, *args, **others):
-    """A `LyingDriver` whose arm is at the start of the motion."""
-    driver = LyingDriver(scenario, *args, **others)
+def driver_of(scenario, *args, kind=LyingDriver, **others):
+    """A `LyingDriver`, or another `kind`, whose arm is at the start of the motion."""
+    driver = kind(scenario, *args, **others)
     loop = driver.loop
     motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
     if motion.times_ns[0] == 0:
