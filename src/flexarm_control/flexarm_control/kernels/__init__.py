@@ -8,13 +8,14 @@ from functools import cache
 
 from flexarm_dynamics.kernels import load, rigid
 
-from . import eigenvectors, law, limits, manifold, readings
+from . import eigenvectors, law, limits, manifold, readings, strains
 
 
 @cache
 def compiled():
     """The compiled functions of all modules here."""
     sources = [
-        load.source(module) for module in (rigid, eigenvectors, law, limits, manifold, readings)
+        load.source(module)
+        for module in (rigid, eigenvectors, law, limits, manifold, readings, strains)
     ]
     return load.joined("control", sources, inline=("larger", "unit", "solve"))

@@ -3,18 +3,59 @@
 
 import numpy as np
 
-#: Rows of what `jumps` keeps of each reading.
-LINE, RESIDUAL, BOUND, FLOOR, NOISE, SCALE, SQUARE, EXCESS = 0, 1, 2, 3, 4, 5, 6, 7
+#: Rows of what `jumps` keeps of each reading; the last one is the reading as it came.
+LINE, RESIDUAL, BOUND, FLOOR, NOISE, SCALE, SQUARE, EXCESS, CAME = 0, 1, 2, 3, 4, 5, 6, 7, 8
+#: Rows of its counts: samples in a row that were replaced, and samples in which none is.
+RUN, GRACE = 0, 1
+#: Rows of the torque: the last sample's and its change, those of the sample that is judged.
+LAST, CHANGE, NEW, NEW_CHANGE = 0, 1, 2, 3
 #: Rows of what does not change: rms noise, acceleration by what is not reported, whether it is a rate, that of lost
 #: samples' torque, steps of the encoders at positions and at velocities.
 OF_NOISE, OF_PUSH, OF_RATE, OF_LOST, OF_COUNT, OF_SPEED_COUNT = 0, 1, 2, 3, 4, 5
 #: Rows of what `agreement` keeps of each window and pair.
 CHANGED, DRIVEN, MISSED, BETWEEN, START, FIRST = 0, 1, 2, 3, 4, 5
+#: What a comparison finds: nothing to compare, that it fits, that it does not.
+UNKNOWN, FIT, BEYOND = 0, 1, 2
 
 
 def larger(a, b):
     """The larger of two numbers; NaN if one of them is, as `np.maximum` has it."""
     return a if a >= b or a != a else b
+
+
+def gather(position, strain, amplitude, velocity, rate, value, raw):
+    """Put the readings into one vector, `value`, and those that may stand still, (q, strain, qd), into `raw`."""
+    n, g, m = position.size, strain.size, amplitude.size
+    for i in range(n):
+        raw[i] = value[i] = position[i]
+        raw[n + g + i] = value[n + g + m + i] = velocity[i]
+    for i in range(g):
+        raw[n + i] = value[n + i] = strain[i]
+    for i in range(m):
+        value[n + g + i], value[2 * n + g + m + i] = amplitude[i], rate[i]
+
+
+def arrive(value, torque, strength, rows, torques):
+    """Note the readings as they came, (N,), in `rows`, and in the last two rows of `torques`, (4, n), the torque.
+
+    Zeros and NaN mean that the torque is unknown; its change is `strength`, (n,), then [N m]. A change goes on for a
+    while: 0.7 of it in the next sample.
+    """
+    for i in range(value.size):
+        rows[CAME, i] = value[i]
+    acts, known = False, True
+    for i in range(torque.size):
+        acts |= torque[i] != 0.0
+        known &= np.isfinite(torque[i])
+    known &= acts
+    for i in range(torque.size):
+        torques[NEW, i], torques[NEW_CHANGE, i] = np.nan, strength[i]
+        if known:
+            step = abs(torque[i] - torques[LAST, i])
+            torques[NEW, i] = torque[i]
+            if step == step:
+                torques[NEW_CHANGE, i] = step
+            torques[NEW_CHANGE, i] = larger(torques[NEW_CHANGE, i], 0.7 * torques[CHANGE, i])
 
 
 def judge_jumps(
@@ -38,7 +79,7 @@ def judge_jumps(
     fixed : ndarray, shape (6, N)
     gain : ndarray, shape (N, n)
     growth, deviations : float
-    rows : ndarray, shape (8, N)
+    rows : ndarray, shape (9, N)
         The first six rows are written.
     """
     dt, unseen = steps
@@ -70,20 +111,23 @@ def judge_jumps(
     return beyond
 
 
-def learn_jumps(rows, replaced, spread, learns, weight, keep):
-    """Follow noise and excess, from the residuals of readings that were believed.
+def learn_jumps(rows, replaced, counts, often, spread, learns, weight, keep, fade):
+    """Follow noise and excess, from the residuals of readings that were believed, and count those that were not.
 
     Parameters
     ----------
-    rows : ndarray, shape (8, N)
-        The last two rows are followed.
+    rows : ndarray, shape (9, N)
+        Square and excess are followed.
     replaced : ndarray of bool, shape (N,)
-        Readings that were not believed.
+        Readings that were not believed; false afterwards.
+    counts : ndarray of int, shape (2, N)
+    often : ndarray, shape (N,)
+        Readings that were replaced of late.
     spread : float
     learns : bool
         Whether all is taken for noise.
-    weight, keep : float
-        Of a new square, and of an old excess.
+    weight, keep, fade : float
+        Of a new square, of an old excess, and of a reading that was replaced.
     """
     for i in range(replaced.size):
         residual, noise = rows[RESIDUAL, i], rows[NOISE, i]
@@ -97,10 +141,16 @@ def learn_jumps(rows, replaced, spread, learns, weight, keep):
             rms = excess = 0.0
         rows[SQUARE, i] += (rms * rms - rows[SQUARE, i]) * weight
         rows[EXCESS, i] = larger(rows[EXCESS, i] * keep, excess)
+        counts[GRACE, i] = max(counts[GRACE, i] - 1, 0)
+        counts[RUN, i] = counts[RUN, i] + 1 if replaced[i] else 0
+        often[i] = often[i] * fade + (1.0 if replaced[i] else 0.0)
+        replaced[i] = False
 
 
-def remember(value, stamp, past, times):
+def remember(value, stamp, past, times, torques):
     """Move the past on by one sample."""
+    for i in range(torques.shape[1]):
+        torques[LAST, i], torques[CHANGE, i] = torques[NEW, i], torques[NEW_CHANGE, i]
     last = past.shape[0] - 1
     for k in range(last):
         times[k] = times[k + 1]
@@ -109,6 +159,14 @@ def remember(value, stamp, past, times):
     times[last] = stamp
     for i in range(value.size):
         past[last, i] = value[i]
+
+
+def is_given(value, indices):
+    """Whether one of the readings with these `indices` is a number."""
+    given = False
+    for i in indices:
+        given |= np.isfinite(value[i])
+    return given
 
 
 def begin_agreement(value, pairs, rate, windows, ages):
@@ -136,7 +194,7 @@ def agree(
     run,
     evidence,
 ):
-    """Compare the rates with their values over all windows; whether a pair is beyond its bound.
+    """Compare the rates with their values over all windows.
 
     Parameters
     ----------
@@ -165,7 +223,14 @@ def agree(
         Samples in a row that each pair has been beyond its bound.
     evidence : ndarray, shape (2, w, k)
         Change of the value and what the rate gives, when a pair is beyond its bound.
+
+    Returns
+    -------
+    int
+        `UNKNOWN` rates, all of them; `FIT`; `BEYOND`: one pair at least is beyond its bound.
     """
+    if not is_given(value, pairs[1]):
+        return UNKNOWN
     scale, missed, delay = factors
     any_wrong = False
     for w in range(len(lengths)):
@@ -197,7 +262,7 @@ def agree(
                 evidence[0, w, j] = windows[CHANGED, w, j]
                 evidence[1, w, j] = windows[DRIVEN, w, j]
     renew(value, pairs, lengths, rate, windows, ages)
-    return any_wrong
+    return BEYOND if any_wrong else FIT
 
 
 def renew(value, pairs, lengths, rate, windows, ages):
@@ -214,79 +279,159 @@ def renew(value, pairs, lengths, rate, windows, ages):
                 restart(value, pairs, rate, windows, w, j)
 
 
-def low_passed(rows, weights, signal):
-    """Take a sample of several signals; `rows`, (5, N), and `weights`, (3, 5), are those of `low_pass.LowPass`."""
-    for i in range(signal.size):
-        last, y1, y2, y3 = rows[0, i], rows[2, i], rows[3, i], rows[4, i]
-        rows[0, i], rows[1, i] = signal[i], last
-        for k in range(3):
-            value = weights[k, 0] * signal[i] + weights[k, 1] * last
-            rows[2 + k, i] = value + weights[k, 2] * y1 + weights[k, 3] * y2 + weights[k, 4] * y3
-
-
-def mapped(strain, amplitude, project, rows, middle, half, out):
-    """Fill `out`, (2 g,), with the strains' part that amplitudes explain, and by how much the amplitudes' differ.
-
-    Whether all of it is finite, and no gauge at an end of its range.
+def changed(readings, last, middle, half, same):
+    """Fill the changes since the last readings, which these replace, and which readings stand still.
 
     Parameters
     ----------
-    strain, middle, half : ndarray, shape (g,)
-        Readings, and their ranges.
-    amplitude : ndarray, shape (m,)
-    project : ndarray, shape (g, g)
-    rows : ndarray, shape (g, m)
-    out : ndarray, shape (2 g,)
+    readings : ndarray, shape (N,)
+    last : ndarray, shape (2, N)
+        The last readings, and their changes; overwritten.
+    middle, half : ndarray, shape (N,)
+        Of the readings' ranges: what is at an end of it does not stand still.
+    same : ndarray of bool, shape (N,)
+
+    Returns
+    -------
+    bool
+        Whether one stands still.
     """
-    g, good = strain.size, True
-    for i in range(g):
-        own, its = 0.0, 0.0
-        for j in range(g):
-            own += project[i, j] * strain[j]
-        for j in range(amplitude.size):
-            its += rows[i, j] * amplitude[j]
-        out[i], out[g + i] = own, its - own
-        good &= np.isfinite(own) and np.isfinite(its) and abs(strain[i] - middle[i]) < half[i]
-    return good
-
-
-def apart(rows, zero, corner, large, fast, keep):
-    """Largest difference of `mapped`'s second half to its zero, and how large and fast the first half is of late.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (5, 2 g)
-        Of the `low_pass.LowPass` of what `mapped` gives.
-    zero : ndarray, shape (2 g,)
-    corner : float
-        Of the low pass [rad/s].
-    large, fast, keep : float
-        Before this sample, and what is left of that.
-    """
-    g, difference = zero.size // 2, 0.0
-    large, fast = keep * large, keep * fast
-    for i in range(g):
-        difference = max(difference, abs(rows[4, g + i] - zero[g + i]))
-        large = max(large, abs(rows[4, i] - zero[i]))
-        fast = max(fast, abs(corner * (rows[3, i] - rows[4, i])))
-    return difference, large, fast
-
-
-def changed(readings, last, change):
-    """Fill `change` with how far readings are from the last ones, which they replace; whether one is the same."""
-    same = False
+    some = False
     for i in range(readings.size):
-        change[i] = abs(readings[i] - last[i])
-        last[i] = readings[i]
-        same |= change[i] == 0.0
-    return same
+        change = abs(readings[i] - last[0, i])
+        last[0, i], last[1, i] = readings[i], change
+        same[i] = change == 0.0 and not abs(readings[i] - middle[i]) >= half[i]
+        some |= same[i]
+    return some
 
 
-def less(smallest, change):
-    """Take what is smaller of the changes, NaN aside."""
+def follow_changes(change, same, still, smallest, changes):
+    """Count for how long readings stand still; note how far the others moved.
+
+    Parameters
+    ----------
+    change : ndarray, shape (N,)
+    same, still : ndarray of bool and int, shape (N,)
+    smallest : ndarray, shape (N,)
+        Smallest change so far, NaN aside.
+    changes : ndarray, shape (N,)
+        Filled with the changes; that of a reading that stands still stays.
+    """
     for i in range(change.size):
+        if same[i]:
+            still[i] += 1
+            continue
+        still[i] = 0
+        changes[i] = change[i]
         if change[i] < smallest[i]:
             smallest[i] = change[i]
+
+
+def follow_joints(
+    dt, torque, amplitude, inertia, rows, bent, friction, travel, still, least, moved, found
+):
+    """Follow how far the torque should have moved joints that stand still; see `standstill`.
+
+    Parameters
+    ----------
+    dt : float
+        Since the last sample [s].
+    torque : ndarray, shape (n,)
+        Finite.
+    amplitude : ndarray, shape (m,)
+        Of the modes; NaN: unknown.
+    inertia : ndarray, shape (n, n)
+        Inverse of the joints' mass matrix.
+    rows : ndarray, shape (3, n)
+        Torques of the weight, of bent links without deflection, and of what noise of the amplitudes makes [N m].
+    bent : ndarray, shape (n, m)
+        Torque of the bent links per amplitude.
+    friction : tuple of ndarray and float
+        (n,) of each joint [N m], and the fraction of weight and bending that is unsure.
+    travel : ndarray, shape (n,)
+        [rad]
+    still : ndarray of int, shape (n,)
+    least : int
+        Samples for which a joint must stand still.
+    moved : ndarray, shape (2, n)
+        Speed and angle that the torque has made since; followed.
+    found : ndarray of bool, shape (n,)
+        Filled with the joints that should have moved.
+
+    Returns
+    -------
+    bool
+        Whether there is one.
+    """
+    n, acts, known, some = torque.size, False, True, False
+    for j in range(amplitude.size):
+        known &= np.isfinite(amplitude[j])
+    net, unsure = np.empty(n), np.empty(n)
+    for i in range(n):
+        acts |= torque[i] != 0.0
+        of_links = 0.0
+        if known:
+            for j in range(amplitude.size):
+                of_links += bent[i, j] * amplitude[j]
+            of_links += rows[1, i]
+        net[i] = torque[i] - rows[0, i] + of_links
+        unsure[i] = friction[0][i] + friction[1] * (abs(rows[0, i]) + abs(of_links)) + rows[2, i]
+    for i in range(n):
+        wanted, doubt = 0.0, 0.0
+        for j in range(n):
+            wanted += inertia[i, j] * net[j]
+            doubt += abs(inertia[i, j]) * unsure[j]
+        left = max(abs(wanted) - doubt, 0.0) if acts else 0.0  # nothing acts, or brakes do
+        if still[i] <= 1:
+            moved[0, i] = moved[1, i] = 0.0
+        moved[0, i] += dt * (left if wanted > 0.0 else -left)
+        moved[1, i] += dt * moved[0, i]
+        found[i] = still[i] >= least and abs(moved[1, i]) > travel[i]
+        some |= found[i]
+    return some
+
+
+def stopped(readings, still, smallest, changes, tiny, gauges, limits, found):
+    """Find gauges and joint velocities that stand still, and whether all positions and gauges do; see `standstill`.
+
+    Parameters
+    ----------
+    readings : ndarray, shape (N,)
+        Joint positions, strains, joint velocities.
+    still, smallest, tiny : ndarray, shape (N,)
+    changes : ndarray, shape (k, N)
+        Before each reading became still.
+    gauges : ndarray, shape (3, g)
+        Noise that was seen, noise that is stated, and how many equal readings that rules out.
+    limits : tuple of int and float
+        Samples that count, and the ratio of changes.
+    found : ndarray of bool, shape (N,)
+        Filled with those of the gauges and velocities.
+
+    Returns
+    -------
+    bool
+        Whether positions and gauges do, all of them, and one of them did at once.
+    """
+    g, (least, times) = gauges.shape[1], limits
+    n = (readings.size - g) // 2
+    end, all_quiet, at_once = n + g, True, False
+    for i in range(readings.size):
+        quiet = still[i] >= least
+        mean = 0.0
+        for k in range(changes.shape[0]):
+            mean += changes[k, i]
+        mean /= changes.shape[0]
+        abrupt = quiet and mean > times * smallest[i] and mean > tiny[i]
+        if i < end:
+            all_quiet &= quiet
+            at_once |= abrupt
+        # A joint that a brake has stopped is still at once; its velocity is zero then, and the links swing.
+        found[i] = abrupt and i >= n and not (i >= end and readings[i] == 0.0)
+        if n <= i < end:
+            j = i - n
+            found[i] |= gauges[0, j] >= 0.5 * gauges[1, j] and still[i] >= gauges[2, j]
+    return end > n and all_quiet and at_once
 
 
 def all_well(strain, low, high, last):

@@ -19,7 +19,6 @@ s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a
 import numpy as np
 
 from ... import kernels
-from ...arrays import some
 from ...kernels import readings
 
 #: Lengths of the windows in samples; the short one is quick, the long one sees slow motion and coarse encoders.
@@ -92,20 +91,18 @@ class Agreement:
         ndarray of int or None
             Pairs for which there is evidence; None in nearly all samples.
         """
-        if not some(np.isfinite(value[self.pairs[1]])):  # none is given
-            self._begun = False
-            return None
         if not self._begun:
-            self._begun = True
+            self._begun = self._kernels.is_given(value, self.pairs[1])
             self._kernels.begin_agreement(value, self.pairs, self._rate, self._windows, self._ages)
             return None
         fast = self.channels.fastest * dt > 1.0
         factors = (FAST_SCALE, FAST_MISSED, LATE) if fast else (SCALE, 1.0, LATE)
-        wrong = self._kernels.agree(
+        verdict = self._kernels.agree(
             value, self.pairs, dt, jitter, change, self._gain, factors, self._noise, WINDOWS, self._rate,
             self._windows, self._ages, self._run, self._evidence,
         )  # fmt: skip
-        if not wrong:
+        if verdict != readings.BEYOND:
+            self._begun = verdict != readings.UNKNOWN
             return None
         found = np.flatnonzero(self._run >= PERSISTENT)
         return found if found.size else None

@@ -19,6 +19,7 @@ from math import exp
 import numpy as np
 
 from ... import kernels
+from ...kernels import readings, strains
 from .agreement import LATE
 from .low_pass import LowPass
 from .strain_law import corner_of
@@ -42,8 +43,8 @@ class SourceAmplitudes:
 
     Attributes
     ----------
-    difference, bound : float
-        Largest of the last sample over the gauges, and what it may be [strain].
+    bound : float
+        What the largest difference may be [strain].
     """
 
     def __init__(self, channels, strain_map):
@@ -51,15 +52,19 @@ class SourceAmplitudes:
         self._rows, self._project = strain_map.rows, strain_map.rows @ strain_map.inverse
         self._floor = ZERO * max(g.full_scale for g in c.model.arm.gauges)
         self._low, self._kernels = LowPass(2 * c.g, corner_of(c.model)), kernels.compiled()
-        self._now = np.zeros(2 * c.g)
+        self._state = np.zeros(3)
         self.reset()
 
     def reset(self):
         """Forget the past, the zeros included."""
         self._age, self._count, self._beyond = 0.0, 0, 0
         self._zero = np.zeros(2 * self._channels.g)
-        self._large = self._fast = 0.0
-        self.difference, self.bound = 0.0, self._floor
+        self._state[:], self.bound = 0.0, self._floor
+
+    @property
+    def difference(self):
+        """Largest of the last sample over the gauges [strain]."""
+        return float(self._state[strains.DIFFERENCE])
 
     def update(self, value, dt):
         """Take the readings of a new sample.
@@ -77,26 +82,19 @@ class SourceAmplitudes:
         bool
             Whether amplitudes and strains contradict each other.
         """
-        c, now = self._channels, self._now
-        strain, amplitude = value[c.strain], value[c.amplitude]
-        if amplitude[0] != amplitude[0]:  # NaN, as most sources have it
+        c, low, state = self._channels, self._low, self._state
+        low.weigh(dt)
+        ways = self._count, low.corner, exp(-dt / KEPT), self._age + dt <= LEARNT
+        found = self._kernels.source_amplitudes(
+            value, c.g, self._project, self._rows, *c.range, low.weights, low.rows, self._zero, state, ways
+        )  # fmt: skip
+        if found != readings.FIT:
             if self._count:
                 self.reset()
             return False
-        if not self._kernels.mapped(strain, amplitude, self._project, self._rows, *c.range, now):
-            self.reset()
-            return False
-        if self._count == 0:
-            self._low.start(now)
-        else:
-            self._low.update(now, dt)
         self._count += 1
         self._age += dt
-        if self._age <= LEARNT:
-            self._zero += (self._low.signal - self._zero) / self._count
-        self.difference, self._large, self._fast = self._kernels.apart(
-            self._low.rows, self._zero, self._low.corner, self._large, self._fast, exp(-dt / KEPT)
-        )
-        self.bound = self._floor + SHARE * self._large + LATE * self._fast
-        self._beyond = self._beyond + 1 if self.difference > self.bound else 0
+        difference, large, fast = state.tolist()
+        self.bound = self._floor + SHARE * large + LATE * fast
+        self._beyond = self._beyond + 1 if difference > self.bound else 0
         return self._beyond >= PERSISTENT

@@ -19,6 +19,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from ... import kernels
+
 #: Rms noise where the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
 #: fraction of full scale [-]. What the first samples show is taken where it is larger.
 UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
@@ -97,6 +99,8 @@ class Channels:
         self.fastest = float(self.model.frequencies().max(initial=0.0))
         self.noise = self._noise(strain_map)
         self.gain, self.push = self._accelerations(strain_map)
+        self._no_velocity, self._no_strain, self._no_modes = (np.full(k, np.nan) for k in (n, g, m))
+        self._gather = kernels.compiled().gather
 
     def _noise(self, strain_map):
         noise = np.empty(self.size)
@@ -138,15 +142,14 @@ class Channels:
             push = np.concatenate([hard, *soft, hard, soft[1]])
         return gain, push
 
-    def at_end(self, strain):
-        """Which of the gauges' readings, (g,), are at an end of their range; not those that are NaN."""
-        middle, half = self.range
-        return np.abs(strain - middle) >= half
-
-    def read(self, sample, out):
-        """The readings of an `ArmSample` into `out`, shape (N,)."""
-        out[self.position] = sample.position
-        out[self.strain] = np.nan if sample.strain is None else sample.strain
-        out[self.amplitude] = np.nan if sample.amplitude is None else sample.amplitude
-        out[self.velocity] = sample.velocity if sample.velocity_known else np.nan
-        out[self.rate] = np.nan if sample.rate is None else sample.rate
+    def read(self, sample, out, raw):
+        """The readings of an `ArmSample` into `out`, shape (N,), and its (q, strain, qd) into `raw`, (2 n + g,)."""
+        self._gather(
+            sample.position,
+            self._no_strain if sample.strain is None else sample.strain,
+            self._no_modes if sample.amplitude is None else sample.amplitude,
+            sample.velocity if sample.velocity_known else self._no_velocity,
+            self._no_modes if sample.rate is None else sample.rate,
+            out,
+            raw,
+        )

@@ -22,7 +22,7 @@ from math import exp, sqrt
 import numpy as np
 
 from ... import kernels
-from ...arrays import finite, some
+from ...arrays import some
 from ...kernels import readings
 
 #: Samples in a row whose reading is replaced; at the next one the jump is taken for lasting.
@@ -69,7 +69,8 @@ class Jumps:
         counts = np.zeros((2, c.size))
         counts[0, c.position] = counts[1, c.velocity] = c.count
         self._fixed = np.vstack([c.noise, c.push, c.is_rate, lost, counts])
-        self._value, self._rows = np.zeros(c.size), np.zeros((8, c.size))
+        self._rows, self._torques = np.zeros((9, c.size)), np.zeros((4, c.n))
+        self._value = self._rows[readings.CAME]
         self._line, self._bound = self._rows[readings.LINE], self._rows[readings.BOUND]
         self._residual, self._square = self._rows[readings.RESIDUAL], self._rows[readings.SQUARE]
         self._excess = self._rows[readings.EXCESS]
@@ -82,10 +83,14 @@ class Jumps:
         self._past = np.full((self.span + 1, size), np.nan)
         self._times = np.zeros(self.span + 1)
         self._rows[:], self._often = 0.0, np.zeros(size)
-        self._run, self._grace = np.zeros(size, int), np.zeros(size, int)
+        self._counts = np.zeros((2, size), int)
+        self._run, self._grace = self._counts
         self._seen, self.period, self.jitter = 0, 0.0, 0.0
         self._unseen = 0.0
-        self._torque, self._change = np.full(self.channels.n, np.nan), self.channels.strength.copy()
+        self._torques[readings.LAST], self._torques[readings.CHANGE] = (
+            np.nan,
+            self.channels.strength,
+        )
 
     def judge(self, value, torque, dt, steps):
         """Judge the readings of a new sample; nothing is remembered of it before `take`.
@@ -109,18 +114,10 @@ class Jumps:
             And of those that jumped for good, which stay as they are; None in nearly all samples.
         """
         c, past, times = self.channels, self._past, self._times
-        np.copyto(self._value, value)
+        self._kernels.arrive(value, torque, c.strength, self._rows, self._torques)
         self._dt, self._steps = dt, steps
         self._late = abs(dt - steps * self.period) if self.period else 0.0
         self._outliers = self._lasting = None
-        if not some(torque) or not finite(torque):
-            self._new_change = c.strength
-            self._new_torque = None
-        else:
-            change = np.abs(torque - self._torque)
-            change[np.isnan(change)] = c.strength[np.isnan(change)]
-            self._new_change = np.maximum(change, 0.7 * self._change)
-            self._new_torque = torque.copy()
         self._new_unseen = 0.0
         if self._seen < 2:
             return None, None
@@ -129,7 +126,7 @@ class Jumps:
         rho = dt / (times[-1] - times[first])
         self._spread = sqrt(1.0 + (1.0 + rho) ** 2 + rho * rho)
         beyond = self._kernels.judge_jumps(
-            value, past, times, first, (dt, self._new_unseen), max(self.jitter, self._late), self._new_change,
+            value, past, times, first, (dt, self._new_unseen), max(self.jitter, self._late), self.torque_change,
             self._fixed, c.gain, GROWTH, DEVIATIONS, self._rows,
         )  # fmt: skip
         if not beyond or self._seen < LEARNT:
@@ -167,7 +164,7 @@ class Jumps:
         dt = self._dt
         if self._seen >= 2:
             self._learn(dt)
-        self._kernels.remember(value, stamp, self._past, self._times)
+        self._kernels.remember(value, stamp, self._past, self._times, self._torques)
         if self._lasting is not None and self._lasting.size:
             # The new level is where it goes on from; its slope shows in the next samples.
             self._past[:, self._lasting] = value[self._lasting]
@@ -176,12 +173,6 @@ class Jumps:
         if self._gap:
             # The slope over the gap is none of the present motion.
             self._grace[~self._far] = self.span + 2
-        if self._new_torque is None:
-            self._torque[:] = np.nan
-            self._change = self.channels.strength.copy()
-        else:
-            self._torque[:] = self._new_torque
-            self._change = self._new_change
         self._unseen = self._new_unseen
         self._seen += 1
         each = dt / self._steps
@@ -193,33 +184,18 @@ class Jumps:
 
     def _learn(self, dt):
         """Follow noise and excess, from the residuals of readings that were believed."""
-        replaced = self._replaced
         if self._outliers is not None:
-            replaced[self._outliers] = True
+            self._replaced[self._outliers] = True
+            self.bridged[self._outliers] += 1
         self._kernels.learn_jumps(
-            self._rows, replaced, self._spread, self._seen < LEARNT, 1.0 / min(self._seen, 1000),
-            exp(-dt / EXCESS_TIME),
+            self._rows, self._replaced, self._counts, self._often, self._spread, self._seen < LEARNT,
+            1.0 / min(self._seen, 1000), exp(-dt / EXCESS_TIME), exp(-dt / RARE_TIME),
         )  # fmt: skip
-        if self._outliers is not None:
-            replaced[:] = False
-        if some(self._grace):
-            self._grace[self._grace > 0] -= 1
-        if some(self._often):
-            self._often *= np.exp(-dt / RARE_TIME)
-        if self._outliers is None:
-            if some(self._run):
-                self._run[:] = 0
-            return
-        run = self._run.copy()
-        self._run[:] = 0
-        self._run[self._outliers] = run[self._outliers] + 1
-        self._often[self._outliers] += 1.0
-        self.bridged[self._outliers] += 1
 
     @property
     def torque_change(self):
         """Step of the torque before the sample that was judged last, (n,); a large one where it is unknown [N m]."""
-        return self._new_change
+        return self._torques[readings.NEW_CHANGE]
 
     @property
     def rms(self):

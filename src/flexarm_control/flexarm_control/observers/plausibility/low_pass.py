@@ -31,12 +31,19 @@ class LowPass:
         Number of signals N.
     corner : float
         omega [rad/s].
+
+    Attributes
+    ----------
+    rows : ndarray, shape (5, N)
+        Last sample, the one before it, and the states :math:`y_1` to :math:`y_3`.
+    weights : ndarray, shape (3, 5)
+        Of the sample, the one before it and the states, in each new state.
     """
 
     def __init__(self, size, corner):
         self.corner = corner
         self.rows, self._kernels = np.zeros((5, size)), kernels.compiled()
-        self._weights, self._dt = np.zeros((3, 5)), 0.0
+        self.weights, self._dt = np.zeros((3, 5)), 0.0
 
     def start(self, signal):
         """Take it for the past, shape (N,): as if it had stood still until now."""
@@ -48,11 +55,13 @@ class LowPass:
 
     def update(self, signal, dt):
         """Take a new sample, shape (N,), `dt` [s] after the last."""
-        if abs(dt - self._dt) > SAME * dt:
-            self._weigh(dt)
-        self._kernels.low_passed(self.rows, self._weights, signal)
+        self.weigh(dt)
+        self._kernels.low_passed(self.rows, self.weights, signal)
 
-    def _weigh(self, dt):
+    def weigh(self, dt):
+        """Make `weights` for a sample `dt` [s] after the last."""
+        if abs(dt - self._dt) <= SAME * dt:
+            return
         x = self.corner * dt
         a = exp(-x)
         b = a * x
@@ -63,7 +72,7 @@ class LowPass:
         r1 = 1.0 - s1 / x
         r2 = r1 - s2 / x
         r3 = r2 - s3 / x
-        self._weights[:] = (
+        self.weights[:] = (
             (r1, s1 - r1, a, 0.0, 0.0),
             (r2, s2 - r2, b, a, 0.0),
             (r3, s3 - r3, c, b, a),

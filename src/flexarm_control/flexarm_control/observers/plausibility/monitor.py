@@ -122,11 +122,8 @@ class Monitor:
             Whether the observer must start afresh: a joint's position has jumped for good.
         """
         c, value = self.channels, self._value
-        c.read(sample, value)
+        c.read(sample, value, self._raw)
         self._has_strain = sample.strain is not None
-        raw = self._raw
-        raw[: c.n], raw[c.n : c.n + c.g] = value[c.position], value[c.strain]
-        raw[c.n + c.g :] = value[c.velocity]
         self._dt, self._steps = dt, steps
         if dt == 0.0:
             self.reset()
@@ -289,12 +286,7 @@ class Monitor:
         compared, wiring = False, None
         if self._law is not None and self._has_strain:
             strain = self._value[c.strain]
-            if some(c.at_end(strain)):  # cut off, it follows no law
-                self._law.reset()
-            else:
-                compared, wiring = self._law.update(
-                    sample.position, strain, sample.velocity, dt, noise
-                )
+            compared, wiring = self._law.update(sample.position, strain, sample.velocity, dt, noise)
         self._watch_rate(stamp)
         if self._samples < LEARNT:
             return

@@ -68,20 +68,24 @@ class Standstill:
         self._travel = TRAVEL * np.maximum(c.count, c.noise[c.position])
         self._gravity = any(model.arm.gravity)
         self._amplitude_noise = DEVIATIONS * c.noise[c.amplitude]
-        self._gauges = slice(c.n, c.n + c.g)
-        self._change, self._kernels = np.zeros(size), kernels.compiled()
+        self._middle, self._half = np.zeros(size), np.full(size, np.inf)
+        self._middle[c.n : c.n + c.g], self._half[c.n : c.n + c.g] = c.range
+        self._last, self._same = np.zeros((2, size)), np.zeros(size, bool)
+        self._gauges = np.stack([np.zeros(c.g), self._stated, self._needed])
+        self._found, self._no_amplitude = np.zeros(size, bool), np.full(c.m, np.nan)
+        self._kernels = kernels.compiled()
         self.reset()
 
     def reset(self):
         """Forget the past."""
         c, size = self.channels, self.still.size
         self.still[:] = 0
-        self._last = None
+        self._begun = False
         self._changes = np.zeros((BEFORE, size))
         self._next = 0
         self._smallest = np.full(size, np.inf)
-        self._speed, self._moved = np.zeros((2, c.n))
-        self._inertia = self._weight = self._pushed = self._bent = None
+        self._moved = np.zeros((2, c.n))
+        self._inertia = None
 
     def update(self, readings, torque, noise, dt, amplitude=None):
         """Take a new sample.
@@ -110,80 +114,60 @@ class Standstill:
         frame : bool
             Whether all joint positions and gauges stand still.
         """
-        if self._last is None:
-            self._last = readings.copy()
-            return NONE, NONE, NONE, False
-        change = self._change
-        if not self._kernels.changed(readings, self._last, change):
-            return self._all_moved(change)
-        same = change == 0.0
-        # A gauge at the end of its range stands still, too: `GaugeHealth` says what it is.
-        same[self._gauges] &= ~self.channels.at_end(readings[self._gauges])
-        if not some(same):
-            return self._all_moved(change)
-        self.still += 1
-        self.still[~same] = 0
-        np.fmin(self._smallest, change, out=self._smallest, where=~same)
-        self._remember(change, same)
+        if not self._begun:
+            self._begun, self._last[0] = True, readings
+            return NOTHING
+        some_still = self._kernels.changed(
+            readings, self._last, self._middle, self._half, self._same
+        )
+        self._kernels.follow_changes(
+            self._last[1], self._same, self.still, self._smallest, self._changes[self._next]
+        )
+        self._next = (self._next + 1) % BEFORE
+        if not some_still:
+            self._inertia = None
+            return NOTHING
         return self._judge(readings, torque, noise, dt, amplitude)
-
-    def _all_moved(self, change):
-        """What `update` gives for readings of which none stands still."""
-        self.still[:] = 0
-        self._kernels.less(self._smallest, change)
-        self._changes[self._next] = change
-        self._next = (self._next + 1) % BEFORE
-        self._inertia = None
-        return NONE, NONE, NONE, False
-
-    def _remember(self, change, same):
-        """Keep the changes before a reading became still; those of a still one are kept as they are."""
-        np.copyto(self._changes[self._next], change, where=~same)
-        self._next = (self._next + 1) % BEFORE
 
     def _judge(self, readings, torque, noise, dt, amplitude):
         still, n, end = self.still, self.channels.n, self.channels.n + self.channels.g
         joints = NONE
         if some(still[:n]):
             joints = self._unmoved(readings[:n], torque, dt, amplitude)
-        quiet = still >= ABRUPT
-        if not some(quiet):
+        self._gauges[0] = noise
+        frame = self._kernels.stopped(
+            readings, still, self._smallest, self._changes, self._tiny, self._gauges, (ABRUPT, TIMES), self._found
+        )  # fmt: skip
+        if not frame and not some(self._found):
             return joints, NONE, NONE, False
-        mean = self._changes.mean(axis=0)
-        abrupt = quiet & (mean > TIMES * self._smallest) & (mean > self._tiny)
-        # A joint that a brake has stopped is still at once; its velocity is zero then, and the links swing.
-        frame = bool(end > n and quiet[:end].all() and abrupt[:end].any())
-        silent = (noise >= 0.5 * self._stated) & (still[n:end] >= self._needed)
-        gauges = np.flatnonzero(abrupt[n:end] | silent)
-        velocities = np.flatnonzero(abrupt[end:] & (readings[end:] != 0.0))
-        return joints, gauges, velocities, frame
+        gauges = np.flatnonzero(self._found[n:end])
+        return joints, gauges, np.flatnonzero(self._found[end:]), frame
 
     def _unmoved(self, position, torque, dt, amplitude):
         """Joints that the torque should have moved since they have been still."""
-        still = self.still[: self.channels.n]
+        n = self.channels.n
         if not finite(torque):
             return NONE
         if self._inertia is None:
-            terms = self.channels.model.terms(position, np.zeros(position.size))
-            size = position.size
-            self._inertia = np.linalg.inv(terms.M[:size, :size])
-            self._weight = terms.f1.copy() if self._gravity else np.zeros(size)
-            across = np.linalg.solve(terms.M[size:, size:], terms.M[size:, :size]).T
-            self._pushed, self._bent = across @ terms.f2 * self._gravity, across @ terms.K2
-            self._noise = np.linalg.norm(self._bent * self._amplitude_noise, axis=1)
-        bent = 0.0 * self._weight
-        if amplitude is not None and finite(amplitude):
-            bent = self._pushed + self._bent @ amplitude
-        unsure = self._friction + WEIGHT * (np.abs(self._weight) + np.abs(bent)) + self._noise
-        wanted = self._inertia @ (torque - self._weight + bent)
-        left = np.maximum(np.abs(wanted) - np.abs(self._inertia) @ unsure, 0.0)
-        if not some(torque):
-            left[:] = 0.0  # nothing acts, or brakes do
-        began = still <= 1
-        self._speed[began] = self._moved[began] = 0.0
-        self._speed += dt * np.sign(wanted) * left
-        self._moved += dt * self._speed
-        return np.flatnonzero((still >= ABRUPT) & (np.abs(self._moved) > self._travel))
+            self._hold(position)
+        amplitude = self._no_amplitude if amplitude is None else amplitude
+        friction, found = (self._friction, WEIGHT), self._found[:n]
+        moved = self._kernels.follow_joints(
+            dt, torque, amplitude, self._inertia, self._held, self._bent, friction, self._travel, self.still[:n],
+            ABRUPT, self._moved, found,
+        )  # fmt: skip
+        return np.flatnonzero(found) if moved else NONE
+
+    def _hold(self, position):
+        """What moves joints that stand in a configuration, (n,), and what holds them."""
+        n = self.channels.n
+        terms = self.channels.model.terms(position, np.zeros(n))
+        self._inertia = np.linalg.inv(terms.M[:n, :n])
+        across = np.linalg.solve(terms.M[n:, n:], terms.M[n:, :n]).T
+        self._bent = across @ terms.K2
+        weight, pushed = terms.f1 * self._gravity, across @ terms.f2 * self._gravity
+        noise = np.linalg.norm(self._bent * self._amplitude_noise, axis=1)
+        self._held = np.stack([weight, pushed, noise])
 
 
 def _needed(gauge):
@@ -197,3 +181,4 @@ def _needed(gauge):
 
 
 NONE = np.zeros(0, int)
+NOTHING = NONE, NONE, NONE, False

@@ -32,10 +32,11 @@ turn their signs.
 """
 
 from itertools import combinations
+from math import exp
 
 import numpy as np
 
-from ...arrays import some
+from ... import kernels
 from .low_pass import LowPass
 from .zero_drift import TOLERANCE, ZeroDrift, law_matrices
 
@@ -96,6 +97,7 @@ class StrainLaw:
         self.hypotheses = list(_hypotheses(gauges, places))
         self._hypothesis = np.stack([h[2] for h in self.hypotheses])
         self._concerned = np.stack([self._groups[list(h[1])].any(axis=0) for h in self.hypotheses])
+        self._of_counts, self._of_position = (STEP * c.count) ** 2 / 12.0, c.noise[c.position] ** 2
         self._project = strain_map.rows @ strain_map.inverse
         self._kept = round(MEMORY / INTERVAL)
         self.drift = ZeroDrift(c, strain_map, payload)
@@ -104,6 +106,9 @@ class StrainLaw:
         self._young = slice(size, size + ONSETS * c.g)
         size += ONSETS * c.g * c.heavy
         self._now, self._low = np.zeros(size), LowPass(size, self.corner)
+        self._moved, self._residual = np.zeros(c.g + c.n), np.zeros((2, c.g))
+        self._fast = np.zeros((3 + 2 * ONSETS, c.g))
+        self._moments, self._kernels = ONSETS * c.heavy, kernels.compiled()
         self.reset()
 
     def reset(self):
@@ -141,15 +146,15 @@ class StrainLaw:
         Returns
         -------
         compared : bool
-            Whether this sample ended an interval, so that `drift` is new.
+            Whether this sample ended an interval, so that `drift` is new. Not where a gauge is at an end of its range:
+            then the past is forgotten.
         wiring : int or None
             Index of the hypothesis that wins against the arm file's wiring.
         """
-        g, n, now = self.channels.g, self.channels.n, self._now
-        now[:g], now[g : g + n] = strain, position
-        self._noise = noise
-        if self.channels.heavy:
-            now[self._young].reshape(ONSETS, g)[:] = strain
+        now, self._noise = self._now, noise
+        if not self._kernels.pick_up(strain, position, *self.channels.range, self._moments, now):
+            self.reset()  # cut off, it follows no law
+            return False, None
         if self._inertia is None or dt > GAP / self.corner:
             self._begin(position, velocity)
             return False, None
@@ -179,38 +184,28 @@ class StrainLaw:
         self._now[first : first + self.channels.m] = terms.f2
 
     def _compare(self, dt):
-        g, n, w = self.channels.g, self.channels.n, self.corner
-        filtered, second = self._low.signal, self._low.second
-        p = self.drive @ second[g : g + n] + self._bend @ filtered[g + n : g + n + self.channels.m]
-        residual = filtered[:g] + self._load @ second[:g] + p
-        self.drift.update(residual, second[: g + n], filtered[g : g + n], dt)
+        g, n, low, moved = self.channels.g, self.channels.n, self._low, self._moved
+        residual, fast = self._residual, self._fast
+        self._kernels.not_explained(
+            low.rows, low.corner, self.drive, self._load, self._bend, moved, residual
+        )
+        self.drift.update(residual[0], moved, low.signal[g : g + n], dt)
         if not self.channels.heavy:
             return None
-        young = np.concatenate([filtered[self._young], second[self._young]]).reshape(-1, g)
-        raw = np.concatenate([filtered[:g], second[:g], p]).reshape(3, g)
-        raw = np.concatenate([raw, young])
-        k = 1.0 - np.exp(-WASHOUT * w * dt)
-        if self._number == 0:
-            self._slow[:] = raw
-            self._slow[3:] = 0.0
-        self._slow += k * (raw - self._slow)
-        fast = raw - self._slow
+        k = 1.0 - exp(-WASHOUT * low.corner * dt)
+        self._kernels.high_passed(
+            low.rows, low.corner, residual[1], self._slow, fast, k, self._number == 0
+        )
         self._until -= dt
         if self._until <= 0.0:
             self._begin_anew(fast)
         self._history[self._number % self._kept] = fast
         self._number += 1
-        strain, acceleration, p = fast[:3]
-        z = self._project @ strain + self._load @ acceleration
-        keep = np.exp(-dt / MEMORY)
-        self._sums *= keep
-        self._sums += (1.0 - keep) * np.stack([(z + p) ** 2, z * z + p * p])
-        # Sums over the gauges of one link and direction.
-        misfit, total = self._sums @ self._groups
-        doubtful = self._clear(total) & (misfit > MISFIT * total)
-        self._run[~doubtful] = 0
-        self._run[doubtful] += 1
-        if self._number < self._kept or not some(self._run >= PERSISTENT):
+        long = self._kernels.follow_misfit(
+            fast, self._project, self._load, self._groups, self._sums, exp(-dt / MEMORY), self._run,
+            self._noise_of_law(), (CLEAR, MISFIT, PERSISTENT),
+        )  # fmt: skip
+        if self._number < self._kept or not long:
             return None
         return self._decide()
 
@@ -224,22 +219,22 @@ class StrainLaw:
         self._slow[rows] = fast[rows] = 0.0
         self._history[:, rows] = 0.0
 
-    def _clear(self, total):
-        """Whether z and p, summed over a link's gauges, are larger than noise makes them, by gauge."""
+    def _noise_of_law(self):
+        """What noise makes of z and p, summed over a link's gauges, by gauge."""
         c, w = self.channels, self.corner
-        rms = np.maximum(c.noise[c.strain], self._noise)
-        gauge = (WHITE**2 * w * self._interval) * rms**2
-        encoder = (STEP * c.count) ** 2 / 12.0
-        encoder += (WHITE**2 * w * self._interval) * c.noise[c.position] ** 2
-        noise = gauge + w**4 * (self._load**2 @ gauge + self.drive**2 @ encoder)
-        return total > CLEAR**2 * (noise @ self._groups)
+        left = WHITE**2 * w * self._interval  # of a white noise's square
+        gauge = left * np.maximum(c.noise[c.strain], self._noise) ** 2
+        encoder = self._of_counts + left * self._of_position
+        return self._kernels.noise_of_law(
+            gauge, encoder, w**4, self.drive, self._load, self._groups
+        )
 
     def _decide(self):
         """The hypothesis that fits much better, if there is one."""
         strain, acceleration, p, *young = np.moveaxis(self._history, 1, 0)  # each (kept, g)
         z = strain @ self._project.T + acceleration @ self._load.T
         misfit, total = ((z + p) ** 2).mean(axis=0), (z * z + p * p).mean(axis=0)
-        clear = self._clear(total @ self._groups)
+        clear = total @ self._groups > CLEAR**2 * self._noise_of_law()
         misfit, total = misfit * clear, total * clear + ~clear
         nominal = self._concerned @ misfit / (self._concerned @ total)
         doubtful = self._concerned[:, clear & (self._run >= PERSISTENT)].any(axis=1)

@@ -30,13 +30,16 @@ When all residuals together are what a wrong acceleration of one joint makes, :m
 position may be wrong as well as the strains, or something pushes the arm: joint and gauges are named together.
 """
 
+from math import exp
+
 import numpy as np
 
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.models import model as models
 
-from ...arrays import some
+from ... import kernels
+from ...kernels import strains
 
 #: Change of a zero that is none, as a fraction of full scale [-]; margin of what a payload does [-].
 ZERO, MARGIN = 0.006, 1.2
@@ -74,20 +77,22 @@ class ZeroDrift:
 
     def __init__(self, channels, strain_map, payload=TOLERANCE):
         c = self.channels = channels
-        self._floor = ZERO * np.array([a.full_scale for a in c.model.arm.gauges])
-        self._drive, self._load, self._weight = _payload_changes(c.model, strain_map, payload)
-        self.doubted, self.correction = np.zeros(c.g, bool), np.zeros(c.g)
+        self._drive, self._load, weight = _payload_changes(c.model, strain_map, payload)
+        rows = self._rows = np.zeros((8, c.g))
+        rows[strains.LEAST] = ZERO * np.array([a.full_scale for a in c.model.arm.gauges])
+        rows[strains.BY_WEIGHT] = weight
+        self.residual, self.bound = rows[strains.LEFT], rows[strains.ALLOWED]
+        self.correction = rows[strains.CORRECTION]
+        self.doubted, self._kernels = np.zeros(c.g, bool), kernels.compiled()
         self.reset()
 
     def reset(self):
         """Forget the past, zero and correction included."""
-        g = self.channels.g
         self._age, self._count = 0.0, 0
-        self._zero, self._low, self._moving = np.zeros((3, g))
+        self._rows[strains.ZERO :] = 0.0
+        self.bound[:] = self._rows[strains.LEAST]
         self._start = None
-        self.residual, self.bound = np.zeros(g), self._floor.copy()
-        self.found = NONE
-        self.doubted[:], self.correction[:] = False, 0.0
+        self.found, self.doubted[:] = NONE, False
 
     def update(self, residual, acceleration, position, dt):
         """Take the law's residual of a comparison.
@@ -103,27 +108,18 @@ class ZeroDrift:
         dt : float
             Since the last comparison [s].
         """
-        g, k = self.channels.g, 1.0 - np.exp(-dt / SLOW)
         if self._start is None:
-            self._start, self._low = position.copy(), residual.copy()
-        size = np.abs(acceleration)
-        moving = self._drive @ size[g:] + self._load @ size[:g]
+            self._start, self._rows[strains.SLOW] = position.copy(), residual
         learns = self._age <= LEARNT
-        if learns and (moving < self._floor).all():
+        ways = self._count, 1.0 - exp(-dt / SLOW), 1.0 - exp(-dt / CORRECTED), learns, NOTHING
+        learnt, wrong = self._kernels.follow_drift(
+            residual, acceleration, position, self._start, self._drive, self._load, self.doubted, self._rows, ways
+        )  # fmt: skip
+        if learnt:
             self._age += dt
             self._count += 1
-            self._zero += (residual - self._zero) / self._count
-        self._low += k * (residual - self._low)
-        self._moving += k * (moving - self._moving)
-        np.subtract(self._low, self._zero, out=self.residual)
-        turned = np.abs(position - self._start).sum()
-        self.bound = self._floor + self._moving + min(turned, 2.0) * self._weight
-        wrong = np.abs(self.residual) > self.bound
-        self.found = np.flatnonzero(wrong) if not learns and some(wrong) else NONE
-        if some(self.doubted) or some(self.correction):
-            wanted = np.where(self.doubted, residual - self._zero, 0.0)
-            self.correction += (1.0 - np.exp(-dt / CORRECTED)) * (wanted - self.correction)
-            self.correction[np.abs(self.correction) < NOTHING * self._floor] = 0.0
+        beyond = wrong and not learns
+        self.found = np.flatnonzero(np.abs(self.residual) > self.bound) if beyond else NONE
 
     def joint(self, drive):
         """The joint whose acceleration explains all residuals of two gauges or more; None if there is none.
