@@ -36,7 +36,7 @@ def gather(position, strain, amplitude, velocity, rate, value, raw):
 
 
 def arrive(value, torque, strength, rows, torques):
-    """Note the readings as they came, (N,), in `rows`, and in the last two rows of `torques`, (4, n), the torque.
+    """Note readings as they came, `value` (N,), in `rows`, and the torque in the last two rows of `torques`, (4, n).
 
     Zeros and NaN mean that the torque is unknown; its change is `strength`, (n,), then [N m]. A change goes on for a
     while: 0.7 of it in the next sample.
