@@ -777,16 +777,10 @@ LIMITS = [
         "observers/plausibility",
         TESTS + "test_reading_checks.py",
         (
-            "standstill",
-            "a joint that stands: what others' friction may hold",
-            "np.abs(self._inertia) @ unsure",
-            "np.diag(self._inertia) * unsure",
-        ),
-        (
             "amplitudes",
             "amplitudes beside strains: as much as they are",
-            "+ SHARE * self._large",
-            "+ 2.5 * self._large",
+            "+ SHARE * large",
+            "+ 2.5 * large",
         ),
         (
             "channels",
@@ -815,6 +809,18 @@ LIMITS = [
             "a velocity beside its position: torque steps between samples",
             "between *= 0.25 * dt * dt",
             "between *= 0.0",
+        ),
+        (
+            "readings",
+            "a joint that stands: what others' friction may hold",
+            "doubt += abs(inertia[i, j]) * unsure[j]",
+            "doubt += abs(inertia[i, j]) * unsure[j] * (i == j)",
+        ),
+        (
+            "strains",
+            "what the motion does not explain: the strains' own inertia",
+            "inertia += load[i, j] * moved[j]",
+            "inertia -= load[i, j] * moved[j]",
         ),
     ),
     *of(
