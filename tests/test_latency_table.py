@@ -2,7 +2,6 @@
 """What `flexarm latency` makes of the windows that it measured."""
 
 import argparse
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -63,8 +62,11 @@ def test_redesigning_needs_a_case_at_500_hz():
 def test_what_is_set_meanwhile_are_designs_that_are_accepted(name):
     case = next(c for c in measure.CASES if c.arm == name and c.rate == 500.0)
     given = parameters(case.file) if case.file else {}
-    for values in itertools.chain(*latency_redesign.values_of(case).values()):
-        scenario.loop_of(scenario.Scenario(name, {**given, **values}, rate=case.rate))
+    values = latency_redesign.values_of(case)
+    for alpha, grid in zip(*values.values(), strict=True):
+        given |= alpha  # stays in the node when the grid is set
+        scenario.loop_of(scenario.Scenario(name, given, rate=case.rate))
+        scenario.loop_of(scenario.Scenario(name, {**given, **grid}, rate=case.rate))
 
 
 def test_missed_samples_count_with_those_answered():

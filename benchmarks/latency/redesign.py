@@ -35,7 +35,7 @@ class Redesign:
     Attributes
     ----------
     alphas : tuple of float
-        Of `fast.alpha`.
+        Of `fast.alpha`; the grids are built with the first.
     grids : tuple of int
         Of `fast.grid`, with `fast.type` scheduled_lqr.
     reach : float
@@ -58,7 +58,8 @@ def values_of(case):
     """What is set in turns, by `ALPHA` and `GRID`: lists of name to value."""
     redesign, middle = REDESIGNS[case.arm], 0.5 * (np.array(case.begin) + np.array(case.end))
     low, high = (middle + side * redesign.reach for side in (-1.0, 1.0))
-    ends = {"fast.low": low.tolist(), "fast.high": high.tolist()}
+    # What a set leaves out stays as the last one had it: the grid has an alpha of its own.
+    ends = {"fast.low": low.tolist(), "fast.high": high.tolist(), "fast.alpha": redesign.alphas[0]}
     return {
         ALPHA: [{"fast.type": "lqr", "fast.alpha": alpha} for alpha in redesign.alphas],
         GRID: [{"fast.type": "scheduled_lqr", "fast.grid": g, **ends} for g in redesign.grids],
