@@ -87,8 +87,11 @@ def test_readings_are_low_passed_as_by_the_matrix():
 )
 def test_gauges_are_well_that_move_within_their_range(strain, well):
     low, high, last = np.full(2, -1.0), np.ones(2), np.array([0.0, 0.3])
-    assert COMPILED.all_well(np.array(strain), low, high, last) == well
+    same, seen = np.full(2, 7), np.zeros((2, 2, 2))
+    assert COMPILED.all_well(np.array(strain), low, high, last, same, seen) == well
     assert last.tolist() == (strain if well else [0.0, 0.3])
+    assert same.tolist() == ([0, 0] if well else [7, 7])
+    assert seen.tolist() == ([[strain] * 2] * 2 if well else np.zeros((2, 2, 2)).tolist())
 
 
 def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1):

@@ -131,6 +131,41 @@ def test_gauges_and_velocities_are_found_that_stop_at_once_or_longer_than_their_
     np.testing.assert_array_equal(found, wanted)
 
 
+@pytest.mark.parametrize("bad", [np.nan, INF, -2.0, None])
+@pytest.mark.parametrize("group", range(4))
+def test_a_sample_is_refused_if_one_reading_is_no_number_or_too_large(random, group, bad):
+    groups = [random.uniform(-1.0, 1.0, k) for k in (N, N, M, M)]
+    if bad is not None:
+        groups[group][random.integers(groups[group].size)] = bad
+    assert COMPILED.below(1.5, *groups) == (bad is None)
+    assert COMPILED.is_beyond(groups[group], 1.5) == (bad is not None and bad == bad)
+
+
+@pytest.mark.parametrize("bad", [np.nan, INF, None])
+@pytest.mark.parametrize("group", range(4))
+def test_a_state_is_joined_whole_or_not_at_all(random, group, bad):
+    groups, out = [random.normal(size=k) for k in (N, M, N, M)], np.zeros(2 * (N + M))
+    if bad is not None:
+        groups[group][-1] = bad
+    assert COMPILED.join(*groups, out) == (bad is None)
+    np.testing.assert_array_equal(out, np.concatenate(groups) if bad is None else 0.0)
+
+
+def test_a_derivative_is_filtered_as_its_equation_has_it(random):
+    last, now, rate = random.normal(size=(3, M))
+    slope = (now - last) / 1e-3
+    wanted = slope + (rate - slope) * np.exp(-0.5)
+    COMPILED.filtered_derivative(now, 1e-3, 500.0, last, rate)
+    np.testing.assert_allclose(rate, wanted, rtol=1e-12)
+    np.testing.assert_array_equal(last, now)
+
+
+def test_a_row_of_readings_is_kept(random):
+    groups, out = [random.normal(size=k) for k in (N, N, N, G)], np.zeros(3 * N + G)
+    COMPILED.keep(*groups, out)
+    np.testing.assert_array_equal(out, np.concatenate(groups))
+
+
 def test_rates_are_compared_if_one_is_given():
     value = np.array([1.0, np.nan, np.nan])
     assert COMPILED.is_given(value, np.array([1, 0]))

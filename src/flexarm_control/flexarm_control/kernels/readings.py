@@ -23,6 +23,61 @@ def larger(a, b):
     return a if a >= b or a != a else b
 
 
+def below(limit, position, velocity, amplitude, rate):
+    """Whether all readings are below a `limit` in size; not NaN."""
+    good = True
+    for i in range(position.size):
+        good &= abs(position[i]) < limit
+    for i in range(velocity.size):
+        good &= abs(velocity[i]) < limit
+    for i in range(amplitude.size):
+        good &= abs(amplitude[i]) < limit
+    for i in range(rate.size):
+        good &= abs(rate[i]) < limit
+    return good
+
+
+def is_beyond(values, limit):
+    """Whether one of the `values` is at a `limit` in size, or beyond it; not NaN."""
+    beyond = False
+    for i in range(values.size):
+        beyond |= abs(values[i]) >= limit
+    return beyond
+
+
+def join(position, amplitude, velocity, rate, out):
+    """Put a state into `out`, (2 n + 2 m,); whether it is finite: nothing is written otherwise."""
+    n, m, good = position.size, amplitude.size, True
+    for i in range(n):
+        good &= np.isfinite(position[i]) and np.isfinite(velocity[i])
+    for i in range(m):
+        good &= np.isfinite(amplitude[i]) and np.isfinite(rate[i])
+    if good:
+        for i in range(n):
+            out[i], out[n + m + i] = position[i], velocity[i]
+        for i in range(m):
+            out[n + i], out[2 * n + m + i] = amplitude[i], rate[i]
+    return good
+
+
+def filtered_derivative(amplitude, dt, bandwidth, last, rate):
+    """Filter the derivative of the amplitudes, all (m,), into `rate`; see `observers.filtered_derivative`."""
+    left = np.exp(-bandwidth * dt)
+    for i in range(amplitude.size):
+        difference = (amplitude[i] - last[i]) / dt
+        rate[i] = (rate[i] - difference) * left + difference
+        last[i] = amplitude[i]
+
+
+def keep(position, velocity, torque, strain, out):
+    """Put readings into one row `out`, (3 n + g,)."""
+    n = position.size
+    for i in range(n):
+        out[i], out[n + i], out[2 * n + i] = position[i], velocity[i], torque[i]
+    for i in range(strain.size):
+        out[3 * n + i] = strain[i]
+
+
 def gather(position, strain, amplitude, velocity, rate, value, raw):
     """Put the readings into one vector, `value`, and those that may stand still, (q, strain, qd), into `raw`."""
     n, g, m = position.size, strain.size, amplitude.size
@@ -434,13 +489,26 @@ def stopped(readings, still, smallest, changes, tiny, gauges, limits, found):
     return end > n and all_quiet and at_once
 
 
-def all_well(strain, low, high, last):
-    """Whether all readings are within their ranges, and none is that before it; `last` is then replaced by them."""
+def all_well(strain, low, high, last, same, seen):
+    """Whether all readings are within their ranges, and none is that before it; all that is kept follows them then.
+
+    Parameters
+    ----------
+    strain, low, high : ndarray, shape (g,)
+        Readings, and the ends of their ranges.
+    last : ndarray, shape (g,)
+    same : ndarray of int, shape (g,)
+        For how many samples each has been the same.
+    seen : ndarray, shape (2, g, g)
+        Least and largest reading of every gauge since each of them moved.
+    """
     for i in range(strain.size):
         if not low[i] < strain[i] < high[i] or strain[i] == last[i]:
             return False
     for i in range(strain.size):
-        last[i] = strain[i]
+        last[i], same[i] = strain[i], 0
+        for j in range(strain.size):
+            seen[0, i, j] = seen[1, i, j] = strain[j]
     return True
 
 

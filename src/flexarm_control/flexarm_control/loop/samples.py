@@ -5,7 +5,9 @@ from collections import deque
 
 import numpy as np
 
-from flexarm_dynamics.errors import MessageError, check_finite
+from flexarm_dynamics.errors import MAX_MEASUREMENT, MessageError, check_finite
+
+from .. import kernels
 
 
 class ArmSample:
@@ -78,6 +80,15 @@ class ArmSample:
         ------
         MessageError
         """
+        none = self.position[:0]
+        if kernels.compiled().below(
+            MAX_MEASUREMENT,
+            self.position,
+            self.velocity if self.velocity_known else none,
+            none if self.amplitude is None else self.amplitude,
+            none if self.rate is None else self.rate,
+        ):
+            return
         joints, modes = model.joint_names, model.mode_names
         check_finite(self.position, joints, "joint_position")
         if self.velocity_known:

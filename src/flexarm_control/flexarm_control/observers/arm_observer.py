@@ -7,7 +7,7 @@ from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError, ModelError
 from flexarm_dynamics.parameters import check_all, parameter
 
-from ..arrays import finite, some
+from .. import kernels
 from ..component import make
 from ..loop.samples import WRAP, ArmSample, SampleOrder
 from . import gauge_health
@@ -109,8 +109,10 @@ class ArmObserver:
             model, self.strain_map, self.gauges, settings["payload_tolerance"]
         )
         n, m = model.n_joints, model.n_modes
-        self.position, self.velocity = np.zeros(n), np.zeros(n)
-        self.amplitude, self.rate = np.zeros(m), np.zeros(m)
+        self._state, self._kernels = np.zeros(2 * (n + m)), kernels.compiled()
+        self.position, self.amplitude, self.velocity, self.rate = np.split(
+            self._state, (n, n + m, 2 * n + m)
+        )
         self._measured, self._derivative = np.zeros(n), np.zeros(n)
         self._mapped, self._nothing = np.zeros(m), np.zeros(0)
         self._motion = Motion(model)
@@ -276,26 +278,20 @@ class ArmObserver:
         observer = self.observer
         smooth = self.settings["smooth_position"] and observer.joint_position is not None
         estimated = not sample.velocity_known and observer.joint_velocity is not None
-        x = np.concatenate(
-            [
-                observer.joint_position if smooth else sample.position,
-                observer.amplitude,
-                observer.joint_velocity if estimated else sample.velocity,
-                observer.rate,
-            ]
-        )
+        position = observer.joint_position if smooth else sample.position
+        velocity = observer.joint_velocity if estimated else sample.velocity
+        amplitude, rate = observer.amplitude, observer.rate
         if self.settings["delay"] and observer.converged:
+            x = np.concatenate([position, amplitude, velocity, rate])
             x = self._predicted(x, sample.torque, self.settings["delay"])
-        if not finite(x):
+            n, p = position.size, x.size // 2
+            position, amplitude, velocity, rate = np.split(x, (n, p, p + n))
+        if not self._kernels.join(position, amplitude, velocity, rate, self._state):
             # It would stay so for ever.
             observer.reset()
             name = type(observer).__name__
             problem = "has lost the arm: its estimate is not finite"
             raise MessageError(problem, field=f"observer {name}")
-        start = 0
-        for group in (self.position, self.amplitude, self.velocity, self.rate):
-            group[:] = x[start : start + group.size]
-            start += group.size
 
     def _predicted(self, x, torque, delay):
         """The state after the delay."""
@@ -328,9 +324,8 @@ class ArmObserver:
         if sample.amplitude is None and self.strain_map is None:
             problem = f"can't be mapped: the arm file of {self.model.arm.name} has no gauges"
             raise MessageError(problem, field="strain")
-        wild = np.abs(sample.torque) >= MAX_TORQUE  # false for NaN, which means unknown
-        if some(wild):
-            i = int(np.argmax(wild))
+        if self._kernels.is_beyond(sample.torque, MAX_TORQUE):  # NaN, which means unknown, is not
+            i = int(np.argmax(np.abs(sample.torque) >= MAX_TORQUE))
             raise MessageError(
                 "is beyond any arm's torque",
                 field=f"joint_torque of {self.model.joint_names[i]}",

@@ -13,10 +13,9 @@ It needs no model. A slow rate is delayed by 1/omega_c + omega_c h^2/12, and noi
 (Sangveraphunsiri 1984 after Siciliano & Book 1986.)
 """
 
-import numpy as np
-
 from flexarm_dynamics.parameters import parameter
 
+from .. import kernels
 from .base import Observer
 
 
@@ -35,6 +34,7 @@ class FilteredDerivative(Observer):
     def __init__(self, model, parameters):
         super().__init__(model, parameters)
         self.bandwidth = self.parameters["bandwidth"]
+        self._filter = kernels.compiled().filtered_derivative
 
     def update(self, sample, dt):
         if self._elapsed < 0.0:
@@ -42,11 +42,7 @@ class FilteredDerivative(Observer):
             self.rate[:] = 0.0
             self._elapsed = 0.0
             return
-        difference = (sample.amplitude - self.amplitude) / dt
-        self.rate -= difference
-        self.rate *= np.exp(-self.bandwidth * dt)
-        self.rate += difference
-        self.amplitude[:] = sample.amplitude
+        self._filter(sample.amplitude, dt, self.bandwidth, self.amplitude, self.rate)
         if not self.converged:
             self._elapsed += dt
             self.converged = self._elapsed * self.bandwidth >= self.SETTLING

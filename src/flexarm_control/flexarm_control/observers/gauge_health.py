@@ -127,7 +127,8 @@ class GaugeHealth:
         self.lost = ()
         self._last, self._same = np.full(count, np.nan), np.zeros(count, int)
         self._hold, self._holding = np.zeros(count, int), False
-        self._min_seen, self._max_seen = np.full((2, count, count), np.nan)
+        self._seen = np.full((2, count, count), np.nan)
+        self._min_seen, self._max_seen = self._seen
         self._square = np.zeros(count)
 
     def doubt(self, indices):
@@ -158,10 +159,10 @@ class GaugeHealth:
         """Whether all is well, as in nearly all samples; if so, the readings are taken note of."""
         if self._holding or np.count_nonzero(self.doubted):
             return False
-        if not self._kernels.all_well(strain, self._low, self._high, self._last):
+        if not self._kernels.all_well(
+            strain, self._low, self._high, self._last, self._same, self._seen
+        ):
             return False
-        self._same[:] = 0
-        self._max_seen[:] = self._min_seen[:] = strain
         if self._redundant:
             self._judge_residual(strain)
         return True
@@ -264,8 +265,12 @@ class BiasCalibration:
     def __init__(self, model, strain_map, samples=200):
         arm = model.arm
         self.model, self.strain_map, self.samples = model, strain_map, samples
-        self._position, self._velocity, self._torque = np.zeros((3, samples, len(arm.joints)))
-        self._strain = np.zeros((samples, len(arm.gauges)))
+        n = len(arm.joints)
+        self._kept = np.zeros((samples, 3 * n + len(arm.gauges)))
+        self._position, self._velocity, self._torque, self._strain = np.split(
+            self._kept, (n, 2 * n, 3 * n), axis=1
+        )
+        self._keep = kernels.compiled().keep
         counts = np.array([j.encoder_counts or np.inf for j in arm.joints])
         self._span = self.REST_ANGLE + 4.0 * np.pi / counts
         self._resolution = resolution(arm.gauges)
@@ -278,10 +283,9 @@ class BiasCalibration:
 
     def push(self, sample):
         """Keep a sample that has strains, on the control path."""
-        k = self._next
-        self._position[k], self._velocity[k] = sample.position, sample.velocity
-        self._torque[k], self._strain[k] = sample.torque, sample.strain
-        self._next = (k + 1) % self.samples
+        row = self._kept[self._next]
+        self._keep(sample.position, sample.velocity, sample.torque, sample.strain, row)
+        self._next = (self._next + 1) % self.samples
         self.count = min(self.count + 1, self.samples)
 
     @property
