@@ -618,8 +618,8 @@ LAWS = [
         (
             "filtered_derivative",
             "settling",
-            "self.rate *= np.exp(-self.bandwidth * dt)",
-            "self.rate *= np.exp(-2.0 * self.bandwidth * dt)",
+            "dt, self.bandwidth, self.amplitude",
+            "dt, 2.0 * self.bandwidth, self.amplitude",
         ),
         (
             "luenberger",
