@@ -768,8 +768,8 @@ LIMITS = [
         (
             "sampling",
             "any period: transitions add up",
-            "Gamma = first.Gamma + first.Phi @ Gamma",
-            "Gamma = first.Gamma + Gamma",
+            "Gamma = first.Gamma + first.Phi @ then.Gamma",
+            "Gamma = first.Gamma + then.Gamma",
         ),
     ),
     *of(

@@ -8,8 +8,8 @@ e^{Ah}`, :math:`\Gamma(h) = \int_0^h e^{As}ds` and :math:`Q(h) = \int_0^h e^{As}
     \Phi(h_0 + e) = \Phi(e)\Phi(h_0), \quad \Gamma(h_0 + e) = \Gamma(h_0) + \Phi(h_0)\Gamma(e), \quad
     Q(h_0 + e) = \Phi(e)Q(h_0)\Phi(e)^T + Q(e),
 
-so that only multiples :math:`h_0` of a short period g need the exponential, and are kept. The rest e, below g,
-is a Taylor series whose terms do not depend on e:
+so that multiples :math:`h_0` of a short period g come from that period by doubling, and are kept. The rest e, below g,
+and the period g itself are a Taylor series whose terms do not depend on e:
 
 .. math::
     \Phi(e) = \sum_k \frac{e^k}{k!}A^k, \quad \Gamma(e) = \sum_k \frac{e^{k+1}}{(k+1)!}A^k, \quad
@@ -21,7 +21,7 @@ chosen for x below `REACH`, and K so that both are below `ERROR`. A positive res
 cancels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -67,7 +67,7 @@ class Sampling:
     Attributes
     ----------
     grid : float
-        The short period g [s]. A multiple of it has the very step of `discretise`.
+        The short period g [s].
     """
 
     def __init__(self, A, density=None):
@@ -101,7 +101,19 @@ class Sampling:
         return out.reshape(count + 1, -1)
 
     def _multiple(self, k):
-        return discretise(self._A, k * self.grid, self._density)
+        """The step over k short periods: that over half of them twice, and once the short one if k is odd."""
+        if k == 1:
+            return self._short(self.grid)
+        half = self._kept(k // 2)
+        step = _after(half, half)
+        step = _after(step, self._kept(1)) if k % 2 else step
+        return replace(step, length=k * self.grid)
+
+    def _short(self, rest):
+        """The step over a `rest` that is no longer than the short period [s], by the series."""
+        N = len(self._A)
+        parts = (rest**self._powers @ self._terms).reshape(-1, N, N)
+        return Step(rest, self._A, parts[0], parts[1], parts[2] if len(parts) == 3 else None)
 
     def step(self, length):
         """The `Step` over a `length` [s] that is not negative."""
@@ -110,13 +122,15 @@ class Sampling:
         first = self._kept(whole) if whole else None
         if first is not None and abs(rest) < 1e-12:
             return first
-        N, A = len(self._A), self._A
-        parts = (max(rest, 0.0) ** self._powers @ self._terms).reshape(-1, N, N)
-        Phi, Gamma, Q = parts[0], parts[1], parts[2] if len(parts) == 3 else None
-        if first is not None:
-            Gamma = first.Gamma + first.Phi @ Gamma
-            if Q is not None:
-                Q = Phi @ first.Q @ Phi.T + Q
-                Q = 0.5 * (Q + Q.T)
-            Phi = Phi @ first.Phi
-        return Step(length, A, Phi, Gamma, Q)
+        then = self._short(max(rest, 0.0))
+        return then if first is None else replace(_after(first, then), length=length)
+
+
+def _after(first, then):
+    """The `Step` over one period, `first`, and over another one of the same system after it."""
+    Gamma = first.Gamma + first.Phi @ then.Gamma
+    Q = first.Q
+    if Q is not None:
+        Q = then.Phi @ Q @ then.Phi.T + then.Q
+        Q = 0.5 * (Q + Q.T)
+    return Step(first.length + then.length, first.A, then.Phi @ first.Phi, Gamma, Q)

@@ -18,8 +18,9 @@ gradient of Coulomb friction at rest is wrong for a moving joint.
 
 Designs are made per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
 the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion. Linearisations
-are kept per configuration; a new time step there costs a short series (`flexarm_dynamics.sampling`) in place of two
-matrix exponentials, as at every sample of a source whose stamps jitter or whose samples get lost.
+are kept per configuration. There a time step is a short series and some products (`flexarm_dynamics.sampling`), without
+a matrix exponential: a source's stamps may jitter and its samples get lost, and an arm that moves comes to a new
+configuration now and then.
 """
 
 from dataclasses import dataclass
