@@ -2,13 +2,15 @@
 """What `flexarm latency` makes of the windows that it measured."""
 
 import argparse
+import os
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.latency import command as latency
-from benchmarks.latency import measure
+from benchmarks.latency import measure, processor
 from benchmarks.latency import redesign as latency_redesign
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.loop import scenario
@@ -20,7 +22,9 @@ CASE = measure.CASES[1]
 def window(milliseconds, missed=0, enabled=None):
     times = [1e-3 * t for t in milliseconds]
     enabled = len(times) if enabled is None else enabled
-    return {"latencies": times, "enabled": enabled, "missed": missed, "lost": 0}
+    taken = {"simulator": 0.2, "observer": 0.3}
+    found = {"latencies": times, "enabled": enabled, "missed": missed, "lost": 0}
+    return {**found, "processor": taken}
 
 
 def test_ratios_are_taken_round_by_round():
@@ -37,6 +41,25 @@ def test_ratios_are_taken_round_by_round():
     cells = measure.table([bare, row]).splitlines()[-1].split(" | ")
     assert cells[1:3] == ["three processes", "1.50"]
     assert cells[-4:] == ["0.100", "10 %", "0.040", "4 % |"]
+
+
+def test_processor_time_is_compared_with_the_relays_round_by_round():
+    # Two samples in each window, of which one may be missed.
+    three, one = ("simulator", "observer", "controller"), ("simulator", "observer_controller")
+    relay = [{**window([1.0] * 2), "processor": dict.fromkeys(three, s)} for s in (2e-4, 6e-4)]
+    loop = [{**window([1.0], 1), "processor": dict.fromkeys(one, s)} for s in (3e-4, 9e-4)]
+    taken, ratio = processor.summary(loop, relay)
+    assert taken == {name: pytest.approx(0.3) for name in one}
+    assert ratio == pytest.approx(1.0)
+    rows = [{"case": "R", "chain": "in one", "processor_ms": taken, "processor_ratio": ratio}]
+    (line,) = processor.table(rows).splitlines()[2:]
+    assert line == "| R | in one | 0.30 | 0.30 both |  | 0.60 | 1.00 |"
+
+
+def test_processor_time_is_that_of_the_process():
+    before = time.process_time()
+    found = processor.spent(os.getpid())
+    assert before <= found <= time.process_time()
 
 
 def test_redesigning_is_compared_within_each_round():
@@ -100,7 +123,8 @@ def test_options_choose_the_cases():
 
 
 def row(chain, median, missed):
-    return {"chain": chain, "latency_ms": {"p50": median}, "missed": missed}
+    taken = {"case": "R", "processor_ms": {"simulator": 0.2}, "processor_ratio": 1.0}
+    return {"chain": chain, "latency_ms": {"p50": median}, "missed": missed, **taken}
 
 
 @pytest.mark.parametrize(
@@ -156,5 +180,6 @@ def test_relay_and_loop_answer_in_real_processes():
     )
     for chain in found.values():
         assert len(chain["windows"][0]["latencies"]) > 10
+        assert all(taken > 0.0 for taken in chain["windows"][0]["processor"].values())
     assert found["three processes"]["windows"][0]["enabled"] > 10
     assert found["three processes"]["mathematics"]["controller"] > 0.0

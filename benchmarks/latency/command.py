@@ -9,7 +9,7 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.markdown import write_between
 from flexarm_studies.progress import Progress
 
-from . import redesign
+from . import processor, redesign
 from .measure import CASES, CHAINS, measure, summary, table
 
 BEGIN, END = "<!-- latency: begin -->", "<!-- latency: end -->"
@@ -135,6 +135,8 @@ def latency(options):
             "is measured at 500 Hz", field="--redesign", hint="have it among the --rates"
         )
     tables.append(_table_of(everything, cases, options, "beside a relay", _beside_the_relay))
+    tables.append(processor.table([row for case in everything for row in case["rows"]]))
+    print(tables[-1], flush=True)
     if options.redesign:
         tables.append(_table_of(everything, again, options, "while designing", _while_designing))
     if options.json:

@@ -24,6 +24,8 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies import markdown
 from flexarm_studies.loop import parameter_files
 
+from . import processor
+
 #: Percentiles of the latency.
 NAMES = ("p50", "p95", "p99")
 #: What takes turns: the processes beside the simulator, and whether they are the loop's.
@@ -177,12 +179,13 @@ class Chain:
 
     def window(self, seconds):
         """Let it run for a while; what the simulator found."""
-        before = len(self.figures())
+        before, meter = len(self.figures()), processor.Meter(self.processes.running)
         self.pause(False)
         time.sleep(seconds)
         self.pause(True)
+        taken = meter.taken()
         found = self.wait_for("the simulator's figures", lambda: self.figures()[before:])
-        return found[-1]
+        return {**found[-1], "processor": taken}
 
     def figures(self):
         """What the simulator found, one for each window so far."""
@@ -284,6 +287,8 @@ def summary(case, found):
             "lost": sum(w["lost"] for w in windows) / max(sent, 1),
             "enabled": sum(w["enabled"] for w in windows) / answered,
         }
+        relay = found["relay"]["windows"]
+        row["processor_ms"], row["processor_ratio"] = processor.summary(windows, relay)
         base = float(np.median(bare[:, 0]))
         for part, seconds in chain.get("mathematics", {}).items():
             row[f"{part}_ms"] = 1e3 * seconds
