@@ -739,7 +739,7 @@ def test_a_slow_motion_is_stopped_faster_than_it_would_stop_itself():
     assert generator.path.duration_ns < 0.5 * S
 
 
-@pytest.mark.parametrize(("length", "least"), [(0.1, 0.36), (10.0, 0.45)])
+@pytest.mark.parametrize(("length", "least"), [(0.85, 0.36), (10.0, 0.45)])
 def test_a_stop_lasts_more_than_a_period_of_the_lowest_mode(length, least):
     generator = ReferenceGenerator(["a"], period=0.3)
     generator.start([0.0], 0)
@@ -747,6 +747,42 @@ def test_a_stop_lasts_more_than_a_period_of_the_lowest_mode(length, least):
     generator.sample(0)
     generator.stop(round(0.5 * length * S), 1e3, given=False)
     assert generator.path.duration_ns == pytest.approx(least * S)
+
+
+@pytest.mark.parametrize("stop", [0.3, 0.5, 1.5])
+def test_a_motion_that_ends_before_the_stop_and_hardly_farther_is_followed_to_its_end(stop):
+    rows, period = [(1, 0.5, 0.6, 0.2), (2, 1.0, 0.0, 0.0)], 2.28
+    own, stopped = (held(period=period) for _ in range(2))
+    for generator in (own, stopped):
+        generator.offer(one(rows))
+        at(generator, 0.0)
+    stopped.stop(round(stop * S), 1e3, given=False)
+    path, later = stopped.path, stop + 0.1
+    for time in np.arange(stop, 2.2, 0.07):
+        assert at(stopped, time) == pytest.approx(at(own, time), abs=1e-12)
+        assert stopped.stopping == (time < 2.0) and not (stopped.active or stopped.finished)
+        if time > later:
+            stopped.stop(round(time * S), 1e3, given=False)
+            assert stopped.path is path or time >= 2.0
+
+
+@pytest.mark.parametrize(
+    ("rows", "stop", "why"),
+    [
+        ([(2, 1.0, 0.0, 0.0)], 0.1, "it ends much later"),
+        ([(1.4, 1.0, 0.0, 0.0), (2, 0.0, 0.0, 0.0)], 1.3, "it turns back"),
+        ([(1, 0.5), (2, 1.0)], 1.7, "it ends with a jump of the velocity"),
+        ([(2, 1.0, 0.0)], 1.7, "it ends with a jump of the acceleration"),
+    ],
+)
+def test_other_motions_are_slowed_down(rows, stop, why):
+    generator = held(period=0.6)
+    generator.offer(one(rows))
+    at(generator, 0.0)
+    speed = generator.path.near(round(stop * S), 0.0, generator._near) and generator._near[1, 0]
+    generator.stop(round(stop * S), 1e3, given=False)
+    assert generator.path.speed(generator.path.start_ns, 0.3) < 0.9, why
+    assert abs(at(generator, stop + 0.3)[1]) < abs(speed) or speed < 0.2
 
 
 def test_near_is_the_stops_own_derivative():

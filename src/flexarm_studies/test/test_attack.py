@@ -278,9 +278,9 @@ def test_what_was_prepared_serves_runs_that_begin_the_same_motion_in_the_same_pl
             made.append(trajectory)
             return SimpleNamespace(trajectory=trajectory)
 
-        reference = SimpleNamespace(resting=np.array([place]))
-        controller = SimpleNamespace(reference=reference, prepare=prepare)
-        return plans.prepared(case, number, controller, f"{case} {number} {place}")
+        controller = SimpleNamespace(reference=SimpleNamespace(resting=np.array([place])))
+        loop = SimpleNamespace(controller=controller, prepared=prepare)
+        return plans.prepared(case, number, loop, f"{case} {number} {place}")
 
     first, again = prepared("R", 1, 0.0), prepared("R", 1, 0.0)
     assert made == ["R 1 0.0"] and first is not again and first == again

@@ -13,6 +13,9 @@ whose first three derivatives are zero at both ends. Acceleration, jerk and snap
     q^{(3)} &= q_r^{(3)}\dot s^3 + 3 q_r^{(2)}\dot s\ddot s + q_r^{(1)} s^{(3)},
 
 are then as continuous as those of the trajectory. A slow manifold is made of them, and moves without a step.
+
+A trajectory that ends before such a stop does, and hardly farther, is followed to its end at its own speed: it comes to
+rest sooner, and with the motion that was planned for the links.
 """
 
 import math
@@ -24,6 +27,8 @@ from .values import SECOND
 
 #: Places of a polynomial at which its acceleration and jerk are looked at, as fractions of its length.
 PLACES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+#: Velocity and acceleration at a smooth end are at most so much of the largest [-].
+SMOOTH = 1e-6
 
 
 def hermite(duration, before, after):
@@ -219,6 +224,12 @@ class Path:
         return np.maximum(_peaks(self._coefficients[:1], first), self._rest_peaks)
 
     @property
+    def ends_smoothly(self):
+        """Whether velocity and acceleration come to zero at the end, beside the largest on the path."""
+        last = _derivatives(self._coefficients[-1:], self.lengths[-1:, None])[:2, 0]
+        return bool((np.abs(last) <= SMOOTH * self.peaks()[:2]).all())
+
+    @property
     def starts(self):
         """Where each polynomial begins, from the start of the path, (k,) [s]."""
         return self._knots_ns[:-1] / SECOND
@@ -395,6 +406,11 @@ class SlowedPath:
         path.near(*self._place(0.5 * self._slowing.duration), self._end)
         self._end[1:] = 0.0
 
+    @property
+    def end(self):
+        """Position that is held after the end, (n,) [rad]."""
+        return self._end[0]
+
     def _place(self, s):
         """Stamp of the path, and what is left to it [s], at a time s of the path since the stop began [s]."""
         whole = int(s * SECOND)
@@ -452,6 +468,37 @@ class SlowedPath:
         moving = self._way.near(place, rest, out)
         at_rate(out, speed, change)
         return moving
+
+
+class FinishedPath:
+    """A path that is followed to its end as a stop: it comes to rest there sooner than if it were slowed down.
+
+    Parameters
+    ----------
+    path : Path
+        Begun, and not changed any more.
+    start_ns : int
+        Stamp of the stop [ns].
+    """
+
+    trajectory_id, scaled = 0, False
+
+    def __init__(self, path, start_ns):
+        self.followed, self.start_ns = path, start_ns
+        self.duration_ns = path.start_ns + path.duration_ns - start_ns
+        self.begin_state = np.zeros_like(path.begin_state)
+        path.evaluate(start_ns, self.begin_state)
+        self.elapsed, self.piece, self.effort = path.elapsed, path.piece, path.effort
+        self.evaluate, self.near = path.evaluate, path.near
+
+    @property
+    def pushes(self):
+        """Whether there is an effort on the way."""
+        return self.followed.pushes
+
+    def speed(self, stamp_ns, offset=0.0):
+        """How fast the path's time goes [-]."""
+        return 1.0
 
 
 def at_rate(state, rate, change):

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
 
-from .path import Path, SlowedPath, Slowing
+from .path import FinishedPath, Path, SlowedPath, Slowing
 from .request import JointTrajectoryData
 from .scaling import ScaledPath, TimeLaw
 from .values import (
@@ -37,6 +37,10 @@ MORE = 1.15, 1.3
 SLOW_FRACTION = 0.2
 #: Least duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
 PERIODS = 1.2, 1.5
+#: A stop follows a motion to its end, if that is sooner, and this fraction of the stop's way farther at most [-].
+FARTHER = 0.2
+#: At so many places of the way beyond that is judged; rounding [rad].
+LOOKS, BEYOND_ROUNDING = 9, 1e-9
 #: Least time in which speed scaling changes, or an effort goes [s].
 MIN_RAMP = 0.1
 #: A turn of a continuous joint [rad].
@@ -524,8 +528,9 @@ class ReferenceGenerator:
         - otherwise: acceleration and jerk are at most `MORE` times the motion's own largest, or, for a slow motion,
           what slowing down with `SLOW_FRACTION` D takes.
 
-        The bounds hold for every joint. If the path ends before, the reference ends with it. A stop within a stop
-        changes nothing but that trajectories which wait are cancelled.
+        The bounds hold for every joint. A trajectory that ends before, without a jump, and no more than `FARTHER` of the
+        stop's way farther, is followed to its end at its own speed. Of any other that ends before, the stop's reference
+        ends with it. A stop within a stop changes nothing but that trajectories which wait are cancelled.
 
         Parameters
         ----------
@@ -548,8 +553,7 @@ class ReferenceGenerator:
         moving, path = self._moves_at(stamp_ns), self._path
         if moving and path.trajectory_id:
             limits = _limits(path, bound, np.asarray(given, dtype=bool), self._period)
-            duration_ns = _braking_time(path, stamp_ns, *limits)
-            path = SlowedPath(path, stamp_ns, duration_ns)
+            path = _stopped(path, stamp_ns, _braking_time(path, stamp_ns, *limits))
         elif not moving and effort.any():
             path, moving = self._fading(effort, stamp_ns), True
         self._drop_all()
@@ -649,6 +653,21 @@ def _limits(path, deceleration, given, period):
         np.where(given, np.inf, np.maximum(MORE[1] * jerk, quick)),
     )
     return bounds, shortest
+
+
+def _stopped(path, stamp_ns, duration_ns):
+    """The path of a stop from a stamp on, which takes a time, both in [ns]; see module `path`."""
+    slowed = SlowedPath(path, stamp_ns, duration_ns)
+    left_ns = path.start_ns + path.duration_ns - stamp_ns
+    if path.scaled or left_ns > duration_ns or not path.ends_smoothly:
+        return slowed
+    begin, end = slowed.begin_state[0], slowed.end
+    state, beyond = np.zeros((3, begin.size)), np.zeros_like(begin)
+    for ahead_ns in np.linspace(0.5 * min(duration_ns, 2 * left_ns), left_ns, LOOKS).astype(int):
+        path.near(stamp_ns + int(ahead_ns), 0.0, state)
+        np.maximum(beyond, np.abs(state[0] - end), out=beyond)
+    finishes = (beyond <= FARTHER * np.abs(end - begin) + BEYOND_ROUNDING).all()
+    return FinishedPath(path, stamp_ns) if finishes else slowed
 
 
 def _braking_time(path, stamp_ns, limits, shortest):

@@ -105,13 +105,13 @@ class Plans:
     def __init__(self):
         self._kept = {}
 
-    def prepared(self, case, number, controller, trajectory):
-        """What a case's `controller` prepares for its motion of this `number`."""
-        key = str(case), number, controller.reference.resting.tobytes()
+    def prepared(self, case, number, loop, trajectory):
+        """What the controller of a case's `loop` prepares for its motion of this `number`; None where it can't."""
+        key = str(case), number, loop.controller.reference.resting.tobytes()
         if key not in self._kept:
             while len(self._kept) >= self.KEPT:
                 del self._kept[next(iter(self._kept))]
-            self._kept[key] = controller.prepare(trajectory)
+            self._kept[key] = loop.prepared(trajectory)
         return copy(self._kept[key])
 
 
@@ -127,7 +127,7 @@ def healthy_run(case, seed):
     driver = driver_of(own, kind=UsualDriver)
 
     def prepare(trajectory):
-        return PLANS.prepared(case, number, driver.loop.controller, trajectory)
+        return PLANS.prepared(case, number, driver.loop, trajectory)
 
     try:
         trace = drive(driver, until=START + lasts + HOLDS, prepare=prepare)

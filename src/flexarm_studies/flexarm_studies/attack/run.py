@@ -141,7 +141,7 @@ def drive(
     holds : bool
         A run is over as well when the arm rests under a torque.
     prepare : callable, optional
-        Gives the preparation of a trajectory; not given: the controller's own.
+        Gives the preparation of a trajectory, or None; not given: the loop's own.
 
     Returns
     -------
@@ -159,7 +159,7 @@ def drive(
     while driver.time <= until + 1e-9:
         time = driver.time
         if not offered and time >= START - 2e-9:
-            _offer(driver, scenario, prepare or loop.controller.prepare)
+            _offer(driver, scenario, prepare or loop.prepared)
             offered = True
         while events and events[0][0] <= time + 1e-9:
             events.pop(0)[1]()
