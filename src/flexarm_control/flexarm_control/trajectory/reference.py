@@ -528,9 +528,9 @@ class ReferenceGenerator:
         - otherwise: acceleration and jerk are at most `MORE` times the motion's own largest, or, for a slow motion,
           what slowing down with `SLOW_FRACTION` D takes.
 
-        The bounds hold for every joint. A trajectory that ends before, without a jump, and no more than `FARTHER` of the
-        stop's way farther, is followed to its end at its own speed. Of any other that ends before, the stop's reference
-        ends with it. A stop within a stop changes nothing but that trajectories which wait are cancelled.
+        The bounds hold for every joint. A trajectory that ends before, without a jump, and no more than `FARTHER` of
+        the stop's way farther, is followed to its end at its own speed. Of any other that ends before, the stop's
+        reference ends with it. A stop within a stop changes nothing but that trajectories which wait are cancelled.
 
         Parameters
         ----------
