@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.plausibility.agreement import Agreement
 from flexarm_control.observers.plausibility.amplitudes import SourceAmplitudes
 from flexarm_control.observers.plausibility.channels import Channels
 from flexarm_control.observers.plausibility.jumps import Jumps
 from flexarm_control.observers.plausibility.low_pass import LowPass
+from flexarm_control.observers.plausibility.monitor import Monitor
 from flexarm_control.observers.plausibility.standstill import Standstill
 from flexarm_control.observers.plausibility.strain_law import StrainLaw
 from flexarm_control.observers.plausibility.zero_drift import CORRECTED, SLOW
@@ -400,6 +402,33 @@ def test_amplitudes_that_the_sources_own_strains_contradict_are_found(factor, bi
     """Whatever constant bias the raw strains have: amplitudes come from calibrated ones."""
     found = contradictions(lambda a: factor * a, amplitude=1.0, bias=bias)
     assert found is not None and 0.0 < found < 0.6
+
+
+@pytest.mark.parametrize(
+    ("begin", "trust", "text"),
+    [
+        (1.5, ArmSample.STOP, "modal_amplitude of link1_y_mode1 jumped"),
+        (np.pi / 3.0, ArmSample.DISTRUSTED, "contradict each other"),
+    ],
+)
+def test_amplitudes_that_jump_away_from_the_strains_are_done_without(begin, trust, text):
+    """The strains went on without a jump, so they are right; where nothing jumped, either may be wrong."""
+    m = models.build(known_arm())
+    map_ = StrainMap(m)
+    monitor, sample = Monitor(m, map_, None), ArmSample(1, m.n_modes, 2)
+    position, strains = readings(known_arm(), 4.0, amplitude=1.0)
+    for k, (q, e) in enumerate(zip(position, strains, strict=True)):
+        wrong = PERIOD * k >= begin
+        sample.position[:], sample.strain, sample.velocity_known = q, e, False
+        sample.amplitude = (-1.0 if wrong else 1.0) * (map_.inverse @ e)
+        sample.stamp_ns = 1_000_000_000 + round(1e9 * PERIOD * k)
+        sample.trust, sample.doubt = ArmSample.TRUSTED, ""
+        monitor.judge(sample, PERIOD if k else 0.0, 1)
+        monitor.take(sample)
+        monitor.mark(sample)
+        assert wrong or sample.trust == ArmSample.TRUSTED
+    assert sample.trust == trust and text in sample.doubt
+    assert (sample.amplitude is None) == (trust == ArmSample.STOP)
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])

@@ -13,7 +13,8 @@ a gauge whose zero drifts                     STOP, without that gauge, or with 
 strains and a joint that contradict           STOP
 modal amplitudes that jump                    STOP, from the strains; DISTRUSTED without them
 modal rates that do not fit                   STOP; they are not used
-amplitudes and strains that contradict        DISTRUSTED: which of the two is wrong does not show
+amplitudes and strains that contradict        STOP, from the strains, if the amplitudes have jumped; else DISTRUSTED:
+                                              which of the two is wrong does not show
 more than `jumps.FREQUENT` outliers           STOP
 ============================================  =======================================================
 """
@@ -321,7 +322,14 @@ class Monitor:
         c, check = self.channels, self._amplitudes
         if self._gauges is not None and some(self._gauges.doubted):
             check.reset()
-        elif check.update(self._value, self._dt):
+            return
+        if not check.update(self._value, self._dt):
+            return
+        jumped = [name for name in c.names[c.amplitude] if self.doubts.about(name)]
+        if jumped:  # that was the beginning: the source's own strains went on without it
+            for name in jumped:
+                self.doubts.add(name, ArmSample.STOP, "", stamp, for_good=True)
+        else:
             modes = [c.model.mode_names[i] for i in range(c.m)]
             of = modes[0] if c.m == 1 else f"{', '.join(modes[:-1])} and {modes[-1]}"
             text = (
