@@ -149,6 +149,18 @@ def test_friction_that_is_cancelled_damps_no_loop_that_sticks(two_link):
     assert np.abs(poles(0.0, 1.0)[:2] - poles(0.0, 0.0)[:2]).max() > 0.1
 
 
+def test_a_joint_that_sticks_is_as_stiff_as_its_return_makes_it(two_link):
+    friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
+    joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    rough, q = build(replace(two_link.arm, joints=joints)), np.array([0.0, 0.7])
+    sampling = Sampling(2e-3, 2e-3, 300.0, 300.0, friction=0.8, return_rate=5.0)
+    stiff = sampled_loop(rough, rough, q, sampling, sticking=0.5)
+    plain = sampled_loop(rough, rough, q, replace(sampling, return_rate=0.0), sticking=0.5)
+    K = np.zeros((2, plain.N.shape[0]))
+    K[:, :2] = 0.5 * 0.8 * 5.0 * 0.02 / 0.01 * np.eye(2)
+    assert_allclose(stiff.F, plain.F - plain.G @ K @ plain.N, atol=1e-12)
+
+
 def test_an_arm_with_coulomb_friction_sticks_with_every_payload_and_for_movements_of_several_sizes(
     designed,
 ):

@@ -764,6 +764,19 @@ def test_joint_pid_cancels_a_part_of_the_friction_that_its_motion_does_not_have(
     assert_allclose(law.feedback(still, qd, ref), wanted, rtol=1e-12)
 
 
+def test_joint_pid_pushes_a_joint_that_sticks_beside_its_place_back(two_link):
+    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
+    rough = replace(
+        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    )
+    law = law_of("joint_pid", model.build(rough), friction=0.8, return_rate=5.0)
+    q, still, ref = np.array([0.002, -10.0]), np.zeros(2), reference([0.0, 0.0], [0.0, 0.0])
+    wanted = 0.8 * 0.5 * np.array([np.tanh(-0.01 / 0.02), 1.0])  # never more than is cancelled
+    assert_allclose(law.feedback(q, still, ref), wanted, rtol=1e-12)
+    moving = reference([0.0, 0.0], [0.5, 0.5])
+    assert_allclose(law.feedback(q, moving.velocity, moving), [0.0, 0.0], atol=1e-9)
+
+
 @pytest.mark.parametrize("bandwidth", [0.0, 50.0])
 def test_a_torque_that_the_integral_takes_over_does_not_go_through_the_low_pass(arm_r, bandwidth):
     gains = {"stiffness": [9.0], "damping": [1.0], "integral": [2.0], "bandwidth": bandwidth}

@@ -62,6 +62,9 @@ USUAL = 0.6
 CANCELLED = 0.8
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
+#: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
+#: its friction cancelled: as fast as the fastest decay. More would hold it so stiffly that it damps no link any more.
+RETURN = FASTEST * (1.0 - CANCELLED) / CANCELLED
 
 
 @dataclass(frozen=True)
@@ -203,6 +206,8 @@ class Design:
         at = {"schedule": numbers(self.configurations)} if self.scheduled else {}
         cancelled = self.sampling.friction
         friction = {"slow.friction": cancelled} if cancelled else {}
+        if self.sampling.return_rate:
+            friction["slow.return_rate"] = numbers([self.sampling.return_rate])[0]
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -304,10 +309,11 @@ def sampling_for(nominal, at, settings):
     h = 1.0 / settings.rate
     omega_c = reach(nominal, at, settings.delay + 0.5 * h)
     corner = min(settings.rate, FILTER * omega_c)
-    corner = max(corner, min(PER_SAMPLE * settings.rate, FAST_ARM * lowest(nominal)))
+    omega_1 = lowest(nominal)
+    corner = max(corner, min(PER_SAMPLE * settings.rate, FAST_ARM * omega_1))
     rubs = any(joint.friction.coulomb for joint in nominal.arm.joints)
-    friction = CANCELLED if rubs else 0.0
-    return Sampling(h, settings.delay, corner, corner, friction=friction), omega_c
+    cancelled = {"friction": CANCELLED, "return_rate": RETURN * omega_1} if rubs else {}
+    return Sampling(h, settings.delay, corner, corner, **cancelled), omega_c
 
 
 def design(arm, settings=None, uncertainty=None, progress=None, gains=None):

@@ -18,10 +18,12 @@ Friction holds a joint where its error is small: the integral moves it on slowly
 than the friction is not damped. So a part :math:`\gamma` of the arm file's Coulomb friction, less that of the motion,
 which :math:`\bar u` has, is added without the low pass:
 
-.. math:: u_f = \gamma\,f_c\,[\tanh(\dot q/v_s) - \tanh(\dot q_{ref}/v_s)] .
+.. math:: u_f = \gamma\,f_c\,[\tanh((\dot q + \lambda e)/v_s) - \tanh(\dot q_{ref}/v_s)] .
 
-With :math:`\gamma` below 1 friction is left over, whatever the delay: by itself it moves no joint. In turn, where the
-friction is less than :math:`\gamma` of the file's, small movements grow. Linear loops are judged without both.
+A joint that sticks beside its place is pushed back as if it moved there at the speed :math:`\lambda e`: without that it
+creeps, and the integral grows until it breaks loose. With :math:`\gamma` below 1 friction is left over, whatever the
+delay: by itself this moves no joint whose place is where it is. In turn, where the friction is less than :math:`\gamma`
+of the file's, small movements grow. Linear loops are judged without both.
 
 The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
 an angle: a change of K_w does not move it.
@@ -71,6 +73,10 @@ class JointPid(SlowLaw):
             "Part of the arm file's Coulomb friction that joint_pid cancels where a joint moves otherwise than its"
             " motion; a joint with less friction than that part may hunt."
         ),
+        parameter("return_rate", 0.0, "1/s", 0.0, 1e4).described(
+            "Where joint_pid cancels friction, a joint's speed counts as greater by its error times this: one that"
+            " sticks beside its place is pushed back."
+        ),
         SCHEDULE,
         BANDWIDTH,
     )
@@ -88,6 +94,7 @@ class JointPid(SlowLaw):
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
         _, coulomb, self._smoothing = model.friction_table().T.copy()
         self._cancelled = self.parameters["friction"] * coulomb
+        self._return_rate = self.parameters["return_rate"]
         self._cancels, self._slides, self._more = (
             some(self._cancelled),
             np.zeros((2, n)),
@@ -151,9 +158,14 @@ class JointPid(SlowLaw):
         return u
 
     def _friction(self, qd, expected):
-        """What is cancelled of the friction at joint speeds qd, beyond that of the `expected` ones, (n,) [N m]."""
+        """What is cancelled of the friction at joint speeds qd and the present error, beyond that of `expected` speeds.
+
+        All are (n,), in rad/s; what is returned is in N m.
+        """
         slides, more = self._slides, self._more
-        slides[0], slides[1] = qd, expected
+        np.multiply(self._error, self._return_rate, out=slides[0])
+        slides[0] += qd
+        slides[1] = expected
         slides /= self._smoothing
         np.tanh(slides, out=slides)
         np.subtract(slides[0], slides[1], out=more)
