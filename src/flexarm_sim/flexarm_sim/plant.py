@@ -116,7 +116,7 @@ class Plant:
         self._check()
 
     def _check(self):
-        if not np.isfinite(self.state).all():
+        if np.count_nonzero(np.isfinite(self.state)) < self.state.size:
             raise ModelError(
                 "is no longer finite: torque or speed are beyond the range of its model",
                 field=f"state of {self.model.arm.name}",

@@ -42,8 +42,12 @@ class Sensors:
         self._low, self._high = np.array([g.range for g in arm.gauges]).reshape(-1, 2).T
         self._count = np.array([g.step for g in arm.gauges])  # [-] strain per count
         self._counted = self._count > 0.0
+        # Asked of every sample: an array takes longer to say it than to be rounded.
+        self._drifts, self._is_noisy = bool(self.walk.any()), bool(self.sigma.any())
         counts = np.array([j.encoder_counts for j in arm.joints], float)
         self._step = np.where(counts > 0, 2.0 * np.pi / np.where(counts > 0, counts, 1.0), 0.0)
+        self._quantised = self._step > 0.0
+        self._rounds, self._counts = bool(self._quantised.any()), bool(self._counted.any())
         self._seed = seed
         self.reset()
 
@@ -58,8 +62,8 @@ class Sensors:
     def position(self, q, out):
         """Encoder readings of the angles `q`, rounded to counts if the arm file states them, into `out` (n,) [rad]."""
         out[:] = q
-        quantised = self._step > 0.0
-        if quantised.any():
+        if self._rounds:
+            quantised = self._quantised
             out[quantised] = self._step[quantised] * np.round(q[quantised] / self._step[quantised])
         return out
 
@@ -67,14 +71,14 @@ class Sensors:
         """Gauge readings for amplitudes `delta`, one period after the last ones, into `out` (gauges,) [-]."""
         np.dot(self.rows, delta, out=out)
         out += self.bias
-        if self.walk.any():
+        if self._drifts:
             if not self._first:
                 self.drift += self.walk * self._walk_random.standard_normal(out.size)
             self._first = False
             out += self.drift
-        if self.sigma.any():
+        if self._is_noisy:
             out += self.sigma * self._random.standard_normal(out.size)
-        if self._counted.any():
+        if self._counts:
             c = self._counted
             out[c] = self._count[c] * np.round(out[c] / self._count[c])
         np.maximum(out, self._low, out=out)
