@@ -96,6 +96,26 @@ def test_every_lie_is_one_that_the_simulators_node_can_tell_or_an_action(arm):
         assert lie.kind in run.OF_KIND and re.compile(lie.says)
 
 
+def test_an_outlier_counts_beyond_what_other_noise_changes():
+    time = 0.01 * np.arange(10.0)
+
+    def trace(torque):
+        return SimpleNamespace(
+            time=time, torque=np.full((10, 1), torque), since=lambda at: slice(5, None)
+        )
+
+    honest = SimpleNamespace(limit=np.ones(1), trace=trace(0.0), other=trace(0.06))
+    for noise, torque, outlier in (
+        (True, 0.04, 0.04),
+        (True, 0.2, 0.14),
+        (True, 0.06, 0.0),
+        (False, 0.2, 0.2),
+    ):
+        honest.case = SimpleNamespace(noise=noise)
+        assert run._outlier(honest, trace(torque), 0.05) == pytest.approx(outlier)
+    assert run._outlier(honest, trace(np.nan), 0.05) == 1.0
+
+
 def test_an_outlier_is_one_sample():
     arm = arm_file.load("R")
     (line,) = lies.LIES["one encoder sample off by 0.02 rad"].lines(arm, 1.2, 0.001)

@@ -10,7 +10,8 @@ A run is compared with the honest one of the same case, `Honest`, whose motion s
 - *step*: the largest change of torque between two samples over that in the motion, begin and end included: a motion
   whose jerk jumps changes its torque most there, and so does a run that is stopped after it. A motion that kicks by
   more than `KICK` of the torque limit is no scale beyond that;
-- *outlier*: how far the torque is from that of the honest run, as a fraction of its limit;
+- *outlier*: how far the torque is from that of the honest run, as a fraction of its limit; if that is too much, less
+  what other noise of the sensors alone changes in it;
 - *returning*: the largest torque in the first `SOON` after an interruption, less what holds the arm against gravity,
   as a fraction of its limit;
 - *silent*: for how long a torque acts without a new sample [s];
@@ -20,6 +21,7 @@ A run is compared with the honest one of the same case, `Honest`, whose motion s
 
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -252,6 +254,11 @@ class Honest:
         steps = np.abs(np.diff(trace.torque[trace.since(START)], axis=0)).max(axis=0)
         self.step = np.minimum(np.maximum(steps, MIN_SCALE * steps.max()), KICK * self.limit)
 
+    @cached_property
+    def other(self):
+        """`Trace` of an honest run with other noise."""
+        return drive(driver_of(replace(self.scenario, seed=self.scenario.seed + 1)))
+
     def static(self, position):
         """What holds the arm against gravity, (n,) [N m]."""
         still = np.zeros(self.model.n_joints)
@@ -325,8 +332,15 @@ def measured(honest, lie, trace, driver, at):
 
 def _outlier(honest, trace, at):
     """Distance of the torque from the honest run's, over its limit; 1 where only one of them has any."""
-    count = min(trace.time.size, honest.trace.time.size)
-    part = slice(trace.since(at).start, count)
+    part = slice(trace.since(at).start, min(trace.time.size, honest.trace.time.size))
+    difference = _apart(honest, trace, part)
+    if difference > CRITERIA["outlier"] and honest.case.noise:
+        difference = max(0.0, difference - _apart(honest, honest.other, part))
+    return difference
+
+
+def _apart(honest, trace, part):
+    """Largest distance of a trace's torque from the honest one's in a part of both, over the limit; see `_outlier`."""
     difference = np.abs(trace.torque[part] - honest.trace.torque[part]) / honest.limit
     return float(np.where(np.isfinite(difference), difference, 1.0).max())
 

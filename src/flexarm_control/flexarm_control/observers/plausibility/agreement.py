@@ -13,7 +13,8 @@ The sum is what the rule can miss: also that a step of the torque moves a light 
 two samples, which begin and end such a swing in the same phase when a mode is as fast as the sampling. Windows of
 `WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are evidence: a sign is wrong, a
 scale by more than s, one of the two stands still, or the value drifts.
-s is 10 %, and 50 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings.
+s is 10 %, and 35 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings,
+but a factor of two is found.
 """
 
 import numpy as np
@@ -28,7 +29,7 @@ PERSISTENT = 4
 #: Ratio by which a rate may be wrong [-].
 SCALE = 0.1
 #: The same, and the factor of what the trapezoidal rule can miss, where modes are fast for the sampling [-].
-FAST_SCALE, FAST_MISSED = 0.5, 2.0
+FAST_SCALE, FAST_MISSED = 0.35, 2.0
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005
 #: Standard deviations that noise may reach.
