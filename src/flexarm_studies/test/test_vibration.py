@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 from flexarm_dynamics.models import model
 from flexarm_sim.plant import Plant
-from flexarm_studies.vibration import cases, figure, pushes, report, study
+from flexarm_studies.vibration import cases, figure, limit, pushes, report, study
 from flexarm_studies.vibration.position_arm import MAX_SUBSTEPS, PositionArm, Swing
 from flexarm_studies.vibration.time_laws import jerk_limited, resampled, trapezoid
 
@@ -128,6 +128,20 @@ def test_the_table_counts_what_is_within_what_is_wanted():
     )
     (line,) = report.trials_table([(row, [0.3, 0.1, 0.05, 0.01, 0.01, 0.01])])[2:]
     assert line.startswith("| x, motion 1 | retimed | 0.1 | 0.3 | 0.1 | 0.05 |")
+
+
+def test_the_least_that_a_time_law_leaves_is_far_below_what_modes_tell():
+    case = cases.all_of(0)["payload x1"]()
+    unshaped, left, least = study.at_least(case, 1)
+    assert least < 0.5 * left < 0.05 * unshaped
+    (line,) = report.limit_table([({"arm": "x", "motion": 1}, (0.04, 0.008, 0.0002))])[2:]
+    assert line == "| x, motion 1 | 40 | 8 | 0.2 | 0.2 | 0.005 |"
+
+
+def test_the_directions_of_the_norm_miss_little_of_it():
+    vector = np.abs(np.random.default_rng(1).normal(size=(200, 3)))
+    found = (vector @ limit.directions().T).max(axis=1) / np.linalg.norm(vector, axis=1)
+    assert 0.985 < found.min() <= found.max() <= 1.0 + 1e-12
 
 
 @pytest.mark.slow

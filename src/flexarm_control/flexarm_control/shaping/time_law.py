@@ -21,6 +21,18 @@ frequencies is `robust_shapers.AT_DESIGN` times as large at most. The programme 
 solution before. Every motion that a shaper can make of a straight one is such a time law, too, but for the rounding of
 the accelerations, so that no less is left by a shaper.
 
+Modes that come close on the way change their shapes, and hand energy to each other. How much, frequencies alone do not
+tell; its form is, for what mode k hands to mode m,
+
+.. math:: C_{mk} = \int_0^T \dot\sigma(t)\, z_k(t)\, e^{\int_t^T(-\zeta_m\omega_m + j\omega_{d,m})d\tau}\,dt,
+
+the first correction, times an unknown number of order 1. It is linear in the accelerations, too, with
+:math:`\dot\sigma` of the solution before; :math:`|C_{mk}| \le \epsilon\,n_m` / `COUPLED` keeps it small.
+
+A drive at its torque limit does not do what it is commanded. The `robust` shaper of the same modes spreads the
+accelerations out; a new time law has no larger ones than that, where there is one. One that would leave more than the
+given motion, at any frequency within the spread, is not used.
+
 Time laws of piecewise linear acceleration that are least exciting, for one constant mode, are an old use of linear
 programming (Singh 2010, *Optimal Reference Shaping for Dynamical Systems*, chapter 5).
 """
@@ -30,6 +42,7 @@ from scipy.optimize import linprog
 
 from ..motions.robust_shapers import AT_DESIGN
 from .piecewise import PiecewiseMotion
+from .shaped_motion import ShapedMotion
 
 #: Pieces of the acceleration per period of the lowest mode, at least so many in all, and at most. More of them leave
 #: less of the modes that are measured, and excite more of those that are not.
@@ -40,6 +53,8 @@ FINE, PLACES = 6, 400
 FACTORS, DIRECTIONS = 9, 16
 #: The given motion may leave next to nothing by chance: it counts for this fraction of its largest at least [-].
 FLOOR = 0.3
+#: What one mode hands to another counts so many times; at how many factors of the frequencies it is looked at.
+COUPLED, COUPLED_FACTORS = 10.0, 3
 #: Solutions, each along the one before.
 ROUNDS = 3
 #: A motion is straight if it stays this close to its line, over its length [-].
@@ -48,8 +63,9 @@ STRAIGHT = 1e-4
 STOP, LONGER = 1.3, 1.3
 #: Rounding of the speeds [-].
 SLACK = 1e-9
-#: A linear programme is given up after this time [s].
-PATIENCE = 1.0
+#: A linear programme is given up after so many iterations, some 100 are usual: a count, so that a busy computer finds
+#: the same motion.
+ITERATIONS = 10_000
 
 
 def along(motion):
@@ -131,9 +147,19 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf):
         for own, limit in zip(line.own, (velocity, acceleration), strict=True)
     ]
     law = Law(line, motion.duration + modes.periods / line.lowest, limits)
-    times = np.linspace(*motion.knots[[0, -1]], law.middles.size)
-    x = law.solution(norms, progress(0, times))
-    return None if x is None else (law, norms, x)
+    sigma = progress(0, np.linspace(*motion.knots[[0, -1]], law.middles.size))
+    x = law.solution(norms, sigma, _gentle(motion, modes))
+    if x is None:
+        x = law.solution(norms, sigma)
+    return None if x is None or law.worst(x, norms) > 1.0 else (law, norms, x)
+
+
+def _gentle(motion, modes):
+    """Largest acceleration of the progress after the shaper of the same modes [1/s^2]."""
+    shaped = ShapedMotion(motion, modes)
+    knots = shaped.knots()
+    bend = shaped.states(np.sort(np.concatenate([knots + 1e-12, knots - 1e-9])))[2]
+    return float(np.abs(bend @ motion.angle).max() / (motion.angle @ motion.angle))
 
 
 def leaves(motion, modes):
@@ -227,17 +253,40 @@ class Line:
 
     def left(self, progress, steps, parts):
         """What accelerations (k, p) in cells of durations `steps` leave of each mode, list of (factors, p) complex."""
-        frequencies, dampings = self.at(progress)
-        factors = np.linspace(1.0 - self._modes.spread, 1.0 + self._modes.spread, FACTORS)
+        sizes, turns = self._turning(progress, steps)
         found = []
-        for frequency, damping in zip(frequencies.T, dampings.T, strict=True):
-            w = 2.0 * np.pi * frequency
-            turn = w * (-damping + 1j * np.sqrt(1.0 - damping**2)) * steps
+        for size, turn in zip(sizes.T, turns.T, strict=True):
             phase = np.cumsum(turn)
             phase = phase[-1] - phase + 0.5 * turn
-            size = steps * np.sqrt(w[-1] / w)
-            found.append((size * np.exp(factors[:, None] * phase)) @ parts)
+            found.append((size * np.exp(self._factors(FACTORS)[:, None] * phase)) @ parts)
         return found
+
+    def coupled(self, progress, steps, parts):
+        """What the other modes hand to each mode, as of `left`: list of (others and factors, p) complex."""
+        sizes, turns = self._turning(progress, steps)
+        after, way = np.cumsum(turns, axis=0), np.gradient(progress)[:, None]
+        phases, count = after - 0.5 * turns, self.modes_count
+        found = [[] for _ in range(count)]
+        for factor in self._factors(COUPLED_FACTORS):
+            ahead = way * np.exp(factor * (after[-1] - phases))
+            for k in range(count):
+                turned = np.exp(factor * phases[:, k : k + 1])
+                each = sizes[:, k : k + 1] / turned * parts
+                swings = turned * (np.cumsum(each, axis=0) - 0.5 * each)
+                for m in range(count):
+                    if m != k:
+                        found[m].append(ahead[:, m] @ swings)
+        return [np.reshape(rows, (-1, parts.shape[1])) for rows in found]
+
+    def _factors(self, count):
+        return np.linspace(1.0 - self._modes.spread, 1.0 + self._modes.spread, count)
+
+    def _turning(self, progress, steps):
+        """In each cell of each mode, (k, m): what an acceleration of 1 counts at the end [s], and the turn, complex."""
+        frequencies, dampings = self.at(progress)
+        w = 2.0 * np.pi * frequencies
+        turns = w * (-dampings + 1j * np.sqrt(1.0 - dampings**2)) * steps[:, None]
+        return steps[:, None] * np.sqrt(w[-1] / w), turns
 
 
 class Law:
@@ -322,7 +371,7 @@ class Law:
         rise = 0.5 * self._step * before**2 / np.where(falls, before - after, np.inf)
         return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
 
-    def solution(self, norms, sigma):
+    def solution(self, norms, sigma, acceleration=np.inf):
         """The accelerations x that leave least; None: there are none within the limits.
 
         Parameters
@@ -331,28 +380,39 @@ class Law:
             In which what is left of each mode counts.
         sigma : (k,) ndarray
             Progress to begin with, at the middles.
+        acceleration : float
+            A limit of its own, beside `limits` [1/s^2].
         """
-        x = None
+        x, acceleration = None, min(acceleration, self.limits[1])
         for _ in range(ROUNDS):
-            left = self._line.left(np.append(self._past[0], sigma), self._steps, self._parts)
-            x = self._programme(left, norms)
+            along = np.append(self._past[0], sigma), self._steps, self._parts
+            x = self._programme(
+                self._line.left(*along), self._line.coupled(*along), norms, acceleration
+            )
             if x is None:
                 return None
             sigma = self._middle_progress(x)
         return x
 
-    def _programme(self, left, norms):
+    def worst(self, x, norms):
+        """The largest part of `norms` that accelerations x leave, over all modes and factors of their frequencies."""
+        along = np.append(self._past[0], self._middle_progress(x)), self._steps, self._parts
+        made = np.append(1.0, x)
+        left = (np.abs(values @ made) for values in self._line.left(*along))
+        return float(max((v / norm).max() for v, norm in zip(left, norms, strict=True)))
+
+    def _programme(self, left, coupled, norms, acceleration):
         """Solve one linear programme; its x, None where the limits contradict each other."""
         around = np.exp(-2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
-        rows = np.concatenate([
-            np.real(around[:, None, None] * (values / norm[:, None])).reshape(-1, self.count)
-            for values, norm in zip(left, norms, strict=True)
-        ])  # fmt: skip
-        wanted = np.ones(FACTORS)
-        wanted[FACTORS // 2] = AT_DESIGN
-        wanted = np.tile(wanted, DIRECTIONS * len(left))
+        parts = [v / norm[:, None] for v, norm in zip(left, norms, strict=True)]
+        handed = [COUPLED / np.median(n) * v for v, n in zip(coupled, norms, strict=True)]
+        every = np.concatenate([*parts, *handed])
+        rows = np.real(around[:, None, None] * every).reshape(-1, self.count)
+        wanted = np.ones(len(every))
+        wanted[FACTORS // 2 : FACTORS * len(left) : FACTORS] = AT_DESIGN
+        wanted = np.tile(wanted, DIRECTIONS)
         _, speed, bend = self._state
-        velocity, acceleration = self.limits
+        velocity = self.limits[0]
         inner, own = self.inner, speed + self._speeds[:, 0] * bend
         none = np.zeros((len(inner), 1))
         upper = [
@@ -375,7 +435,7 @@ class Law:
         made = linprog(
             cost, np.vstack(upper), np.concatenate(bounds), np.stack(ends), values,
             bounds=[(-acceleration, acceleration)] * (self.count - 1) + [(0.0, None)],
-            method="highs", options={"time_limit": PATIENCE},
+            method="highs", options={"maxiter": ITERATIONS},
         )  # fmt: skip
         return made.x[:-1] if made.success else None
 

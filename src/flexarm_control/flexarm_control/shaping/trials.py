@@ -29,7 +29,7 @@ from flexarm_dynamics.errors import DesignError, MessageError
 
 from . import time_law
 from .modes import Modes
-from .time_law import DIRECTIONS, FACTORS, SLACK
+from .time_law import DIRECTIONS, FACTORS, ITERATIONS, SLACK
 
 #: Periods of the lowest mode after the end that are looked at.
 PERIODS = 2.0
@@ -39,8 +39,6 @@ CHANGE = 0.3
 LEFT, LESS = 100.0, 0.5
 #: Cells in which a motion's z is integrated.
 CELLS = 2000
-#: A linear programme is given up after this time [s].
-PATIENCE = 2.0
 
 
 class Ringing:
@@ -217,6 +215,6 @@ class Trials:
         found = linprog(
             cost, upper, np.concatenate(limits), np.hstack([law.ends, np.zeros((2, 2))]), [0.0, 0.0],
             bounds=[*own, (0.0, None), (0.0, CHANGE * acceleration)],
-            method="highs", options={"time_limit": PATIENCE},
+            method="highs", options={"maxiter": ITERATIONS},
         )  # fmt: skip
         return found.x[:count] if found.success else None

@@ -56,6 +56,11 @@ def add_arguments(parser):
         action="store_true",
         help="what retimed leaves of the motions that it misses, corrected in trials; --out has the results",
     )
+    add(
+        "--limit",
+        action="store_true",
+        help="the least that any time law is found to leave of the motions that retimed misses; --out has the results",
+    )
     add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
 
 
@@ -76,8 +81,9 @@ def vibration(options):
     rows = run(
         options.seed, options.count, options.out, options.workers, options.scheduler, methods
     )
-    if options.more_time or options.trials:
-        made = _more_time if options.more_time else _in_trials
+    missed = {_more_time: options.more_time, _in_trials: options.trials, _limits: options.limit}
+    made = next((each for each, wanted in missed.items() if wanted), None)
+    if made is not None:
         lines, where = made(rows, options.count, options.seed)
         if options.write:
             write_between(options.write, *where, "\n".join(lines))
@@ -95,6 +101,13 @@ def _more_time(rows, count, seed):
         (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
     ]
     return report.time_table(found), report.TIME
+
+
+def _limits(rows, count, seed):
+    """The table of the least that a time law leaves of what `retimed` misses, and the markers around it."""
+    known, missed = _missed(rows, count, seed, ("retimed",))
+    found = [(row, study.at_least(known[row["arm"]], row["motion"])) for row in missed]
+    return report.limit_table(found), report.LIMIT
 
 
 def _in_trials(rows, count, seed):

@@ -10,6 +10,7 @@ BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
 #: Periods that a motion may get longer by, one as in the tables and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
+LIMIT = "<!-- limit: begin -->", "<!-- limit: end -->"
 TRIALS = "<!-- trials: begin -->", "<!-- trials: end -->"
 #: Corrections of a motion that is made again and again.
 CORRECTIONS = 5
@@ -99,6 +100,23 @@ def time_table(found):
     """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
     columns = ("motion", *(f"{times:g} period{'s' * (times != 1.0)}" for times in TIMES))
     named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
+    return table(columns, named)
+
+
+def limit_table(found):
+    """Lines of the table of the least that a time law leaves: of pairs of a row and `study.at_least` of its motion."""
+    columns = ("motion", "unshaped, mm", "retimed, mm", "retimed", "least, mm", "least")
+    named = (
+        (
+            f"{row['arm']}, motion {row['motion']}",
+            1e3 * unshaped,
+            1e3 * left,
+            left / unshaped,
+            1e3 * least,
+            least / unshaped,
+        )
+        for row, (unshaped, left, least) in found
+    )
     return table(columns, named)
 
 

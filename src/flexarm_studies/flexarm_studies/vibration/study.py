@@ -17,10 +17,12 @@ from flexarm_control.shaping import modes as modes_module
 from flexarm_control.shaping.modes import Modes
 from flexarm_control.shaping.shaped_motion import ShapedMotion
 from flexarm_control.shaping.trials import Ringing, Trials
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.parameters import check_all
 
 from ..resonance.fit import fit
+from . import limit
 from .position_arm import PositionArm
 from .time_laws import jerk_limited, resampled, trapezoid
 
@@ -351,6 +353,34 @@ def in_more_time(case, number, times):
     window = WINDOW * case.period
     given = (retimed(motion, along, periods=periods) for periods in times)
     return [arm.follow(each, window).residual(window) / unshaped for each in given]
+
+
+def at_least(case, number):
+    """What `retimed` leaves of a motion of a case, and the least that a time law as long is found to leave.
+
+    Parameters
+    ----------
+    case : cases.Case
+    number : int
+        Of the motion.
+
+    Returns
+    -------
+    unshaped, left, least : float
+        [m]
+
+    Raises
+    ------
+    DesignError
+        Where there is no new time law for the motion.
+    """
+    arm, motion, _, along, unshaped = _prepared(case, number)
+    found = time_law.solved(motion, _modes(motion, along, 1.0))
+    if found is None:
+        raise DesignError("has no time law for its modes", field=f"{case.name}, motion {number}")
+    law, _, x = found
+    left, least, _ = limit.least(arm, law, x, WINDOW * case.period)
+    return unshaped, left, least
 
 
 def _prepared(case, number, at_end=False):
