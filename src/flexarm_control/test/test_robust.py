@@ -16,7 +16,17 @@ from flexarm_control.robust import design as design_module
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles
 from flexarm_control.robust.decay import Gradients, Slowest, Wanted, eigenvalues
-from flexarm_control.robust.design import FASTEST, NOISIEST, Settings, design, units, what_limits
+from flexarm_control.robust.design import (
+    CANCELLED,
+    FASTEST,
+    KICK,
+    NOISIEST,
+    Settings,
+    cancelled,
+    design,
+    units,
+    what_limits,
+)
 from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
 from flexarm_control.robust.search import start
@@ -138,7 +148,7 @@ def test_friction_that_is_cancelled_damps_no_loop_that_sticks(two_link):
     q, h = np.array([0.0, 0.7]), 1e-5
 
     def poles(friction, sticking):
-        sampling = Sampling(h, 0.0, np.inf, 300.0, friction=friction)
+        sampling = Sampling(h, 0.0, np.inf, 300.0, friction=(friction,))
         F = sampled_loop(rough, rough, q, sampling, sticking=sticking).F
         z = np.linalg.eigvals(F)
         s = np.log(z[np.abs(z) > 0.9]) / h
@@ -153,12 +163,26 @@ def test_a_joint_that_sticks_is_as_stiff_as_its_return_makes_it(two_link):
     friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
     joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
     rough, q = build(replace(two_link.arm, joints=joints)), np.array([0.0, 0.7])
-    sampling = Sampling(2e-3, 2e-3, 300.0, 300.0, friction=0.8, return_rate=5.0)
+    sampling = Sampling(2e-3, 2e-3, 300.0, 300.0, friction=(0.8, 0.8), return_rate=5.0)
     stiff = sampled_loop(rough, rough, q, sampling, sticking=0.5)
     plain = sampled_loop(rough, rough, q, replace(sampling, return_rate=0.0), sticking=0.5)
     K = np.zeros((2, plain.N.shape[0]))
     K[:, :2] = 0.5 * 0.8 * 5.0 * 0.02 / 0.01 * np.eye(2)
     assert_allclose(stiff.F, plain.F - plain.G @ K @ plain.N, atol=1e-12)
+
+
+def test_less_friction_is_cancelled_of_a_joint_that_moves_far_until_the_torque_can_answer(
+    two_link,
+):
+    joints = tuple(
+        replace(j, friction=replace(j.friction, coulomb=c))
+        for j, c in zip(two_link.arm.joints, (0.0, 0.02), strict=True)
+    )
+    rough, at = build(replace(two_link.arm, joints=joints)), np.zeros((1, 2))
+    mobility = np.linalg.inv(rough.terms(at[0], at[0]).M)[1, 1]
+    late = np.sqrt(2.0 * KICK / (0.02 * mobility))  # twice as far as it may
+    assert_allclose(cancelled(rough, at, late), [0.0, 0.5 * CANCELLED])
+    assert_allclose(cancelled(rough, at, 0.5 * late), [0.0, CANCELLED])
 
 
 def test_an_arm_with_coulomb_friction_sticks_with_every_payload_and_for_movements_of_several_sizes(

@@ -751,12 +751,12 @@ def test_joint_pid_cancels_a_part_of_the_friction_that_its_motion_does_not_have(
     rough = replace(
         two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
     )
-    law = law_of("joint_pid", model.build(rough), friction=0.8, bandwidth=50.0)
+    law = law_of("joint_pid", model.build(rough), friction=[0.8, 0.4], bandwidth=50.0)
     still, ref = np.zeros(2), reference([0.0, 0.0], [0.3, -0.01])
     law.feedback(still, still, at_rest(still))
     law.advance(1e-3)  # the low pass is not on its way
     qd = np.array([0.01, -0.01])
-    wanted = 0.8 * 0.5 * (np.tanh(qd / 0.02) - np.tanh(ref.velocity / 0.02))
+    wanted = [0.4, 0.2] * (np.tanh(qd / 0.02) - np.tanh(ref.velocity / 0.02))
     assert_allclose(law.feedback(still, qd, ref), wanted, rtol=1e-12)
     assert_array_equal(law.feedback(still, ref.velocity, ref), [0.0, 0.0])
     with law.without_friction():
@@ -769,7 +769,7 @@ def test_joint_pid_pushes_a_joint_that_sticks_beside_its_place_back(two_link):
     rough = replace(
         two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
     )
-    law = law_of("joint_pid", model.build(rough), friction=0.8, return_rate=5.0)
+    law = law_of("joint_pid", model.build(rough), friction=[0.8], return_rate=5.0)
     q, still, ref = np.array([0.002, -10.0]), np.zeros(2), reference([0.0, 0.0], [0.0, 0.0])
     wanted = 0.8 * 0.5 * np.array([np.tanh(-0.01 / 0.02), 1.0])  # never more than is cancelled
     assert_allclose(law.feedback(q, still, ref), wanted, rtol=1e-12)

@@ -58,8 +58,9 @@ LITTLE = 0.05
 POOR, WORTH = 0.25, 1.3
 #: Of the progress, the part of the usual search.
 USUAL = 0.6
-#: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth.
-CANCELLED = 0.8
+#: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
+#: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
+CANCELLED, KICK = 0.8, np.radians(0.1)
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
 FASTEST, NOISIEST = 0.6, 0.03
 #: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
@@ -204,9 +205,9 @@ class Design:
         finite = np.isfinite(self.sampling.torque_corner)
         corner = numbers([self.sampling.torque_corner])[0] if finite else 0.0
         at = {"schedule": numbers(self.configurations)} if self.scheduled else {}
-        cancelled = self.sampling.friction
-        friction = {"slow.friction": cancelled} if cancelled else {}
-        if self.sampling.return_rate:
+        friction = {}
+        if any(self.sampling.friction):
+            friction["slow.friction"] = numbers(self.sampling.friction)
             friction["slow.return_rate"] = numbers([self.sampling.return_rate])[0]
         out = {
             "rate": self.settings.rate,
@@ -311,9 +312,31 @@ def sampling_for(nominal, at, settings):
     corner = min(settings.rate, FILTER * omega_c)
     omega_1 = lowest(nominal)
     corner = max(corner, min(PER_SAMPLE * settings.rate, FAST_ARM * omega_1))
-    rubs = any(joint.friction.coulomb for joint in nominal.arm.joints)
-    cancelled = {"friction": CANCELLED, "return_rate": RETURN * omega_1} if rubs else {}
-    return Sampling(h, settings.delay, corner, corner, **cancelled), omega_c
+    friction = cancelled(nominal, at, h + settings.delay)
+    samples = Sampling(h, settings.delay, corner, corner, np.inf, friction, RETURN * omega_1)
+    return samples, omega_c
+
+
+def cancelled(model, at, late):
+    r"""Part of each joint's Coulomb friction that a control may cancel, as a tuple; 0.0 where it has none.
+
+    .. math:: \gamma_i = 0.8\min\Bigl(1, \frac{0.1^\circ}{f_{c,i}\,H_{ii}\,\tau^2}\Bigr)
+
+    with H the inverse of the mass matrix: when a joint breaks loose only its hub moves at first, and the torque that
+    cancels turns around after :math:`\tau`.
+
+    Parameters
+    ----------
+    model : ArmModel
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    late : float
+        From a joint's turning around until the torque's [s].
+    """
+    n, coulomb = model.n_joints, model.friction_table()[:, 1]
+    H = np.max([np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n] for q in at], axis=0)
+    kick = np.maximum(coulomb * H * late**2, KICK)
+    return tuple((np.where(coulomb > 0.0, CANCELLED, 0.0) * KICK / kick).tolist())
 
 
 def design(arm, settings=None, uncertainty=None, progress=None, gains=None):

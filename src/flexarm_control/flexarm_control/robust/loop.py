@@ -36,7 +36,9 @@ class Sampling:
     joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
     modal_corner: float  # of that of modal amplitudes [rad/s]
     torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
-    friction: float = 0.0  # part of the file's Coulomb friction that is cancelled [-]
+    friction: tuple = (
+        0.0,
+    )  # part of each joint's Coulomb friction that is cancelled, or of all [-]
     return_rate: float = 0.0  # see `slow.joint_pid` [1/s]
 
 
@@ -122,7 +124,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
 
     if sticking:
         _, coulomb, smoothing = nominal.friction_table().T
-        cancelled = (sampling.friction * sticking) * coulomb / smoothing
+        cancelled = np.array(sampling.friction) * sticking * coulomb / smoothing
         out += cancelled[:, None] * rate[:n]
         out[:, :size] -= (sampling.return_rate * cancelled)[:, None] * C[:n]
 

@@ -69,7 +69,7 @@ class JointPid(SlowLaw):
         parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
-        parameter("friction", 0.0, "-", 0.0, 1.0).described(
+        parameter("friction", [0.0], "-", 0.0, 1.0, length="joints").described(
             "Part of the arm file's Coulomb friction that joint_pid cancels where a joint moves otherwise than its"
             " motion; a joint with less friction than that part may hunt."
         ),
@@ -93,7 +93,7 @@ class JointPid(SlowLaw):
         self._known = b"", np.zeros(n)
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
         _, coulomb, self._smoothing = model.friction_table().T.copy()
-        self._cancelled = self.parameters["friction"] * coulomb
+        self._cancelled = np.array(self.parameters["friction"]) * coulomb
         self._return_rate = self.parameters["return_rate"]
         self._cancels, self._slides, self._more = (
             some(self._cancelled),
