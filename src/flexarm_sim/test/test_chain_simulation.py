@@ -455,6 +455,24 @@ def test_prescribed_accelerations_move_the_joints_and_shake_the_links(level):
     assert np.abs(split(chain, free)[1] - delta).max() > 1e-3  # the links feel it
 
 
+def test_the_implicit_method_takes_a_prescribed_motion_with_order_two():
+    chain, T = Chain(spatial(friction=True)), 0.1
+    first, change = np.array([3.0, -2.0, 4.0]), np.array([-5.0, 1.0, -6.0])
+
+    def at_the_end(method, count):
+        state = swinging(chain)
+        chain.driven_stepper(METHODS[method])(state, first, T / count, count, None, change)
+        return split(chain, state)
+
+    exact = at_the_end("dop853", 3 * substeps(chain, T))
+    count = 2 * substeps(chain, T)
+    coarse, fine = at_the_end("implicit", count), at_the_end("implicit", 2 * count)
+    assert_allclose(fine[2], exact[2], atol=1e-12)
+    for k in (0, 1, 3):
+        errors = [np.abs(found[k] - exact[k]).max() for found in (coarse, fine)]
+        assert 3.5 < errors[0] / errors[1] < 4.5
+
+
 def test_prescribed_motion_knows_no_friction():
     chain = Chain(spatial(friction=True))
     state, start = swinging(chain), swinging(chain)

@@ -1778,7 +1778,9 @@ def implicit_step(state, torque, change, step, substeps, stages, net, extra, fri
                     else:
                         force[s] += 2.0 * joint_extra[i, 1] * k1[size + n + s]
                         force[s] -= g * stiff * (point[size + n + s] - 2.0 * k1[n + s])
-                if stage == 0:
+                if driven[i]:  # what is called torque is then its acceleration
+                    out[size + i] = net[i]
+                elif stage == 0:
                     slip = friction[i, 0]
                     if friction[i, 1] != 0.0:
                         # The secant, not the tangent: a joint that slips now may stick within the step.

@@ -642,21 +642,27 @@ class Chain(ArmModel):
         data = (self._data, self._new_work(), *none)
         if method is not None:
             return explicit_stepper(self.kernel, method, data, self, lock)
-        extra = (np.zeros_like(none[0]), np.zeros_like(none[1]))
-        arguments = (stages, np.zeros(n), extra)
+        return self._implicit(data, stages, lock)
+
+    def _implicit(self, data, stages, lock=None):
+        """A stepper of the linearly implicit method."""
+        extra = (np.zeros_like(self._none[0]), np.zeros_like(self._none[1]))
+        arguments = (stages, np.zeros(self.n_joints), extra)
         step, trajectory = self.kernel.implicit_step, self.kernel.implicit_trajectory
         return Stepper(self, step, trajectory, arguments, data, lock)
 
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
 
-        `method` is an explicit one. Of a joint with a transmission the motor's motion is prescribed; the link's
-        follows.
+        Of a joint with a transmission the motor's motion is prescribed; the link's follows.
         """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1
         data = (self._data, self._new_work(), *none)
-        stepper = explicit_stepper(self.kernel, method, data, self)
+        if method is None:
+            stepper = self._implicit(data, np.zeros((4, 2 * (self.n_joints + self.n_modes))))
+        else:
+            stepper = explicit_stepper(self.kernel, method, data, self)
         # Friction is part of the torque that it takes, not of the motion.
         stepper.friction[:, :2] = 0.0
         return stepper

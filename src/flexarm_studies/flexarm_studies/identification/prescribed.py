@@ -26,12 +26,11 @@ from flexarm_dynamics.models.chain import Chain
 
 from ..recordings.motion import CORNER, low_passed
 
-#: Explicit method of order four: with the highest mode's phase below `PHASE` a step, a strain is off by less than a
-#: tenth of a microstrain on arms like TUDOR (tested).
-METHOD, PHASE = "rk4", 1.2
-#: Largest product of a step and the rate of what is damped so strongly that it does not ring: the method is stable up
-#: to 2.8.
-STABLE = 2.7
+#: The linearly implicit method is stable however stiff and strongly damped a transmission is that the fit tries.
+METHOD = "implicit"
+#: Largest phase a step [rad] of a mode that the samples show, up to `SHOWN` periods of it a sample [-]: a strain is off by
+#: less than a tenth of a microstrain on arms like TUDOR (tested).
+PHASE, SHOWN = 0.06, 0.2
 #: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
 #: then off by some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
@@ -75,9 +74,9 @@ class MotionPredictor:
 
     def adapt(self, arm):
         """Take the `substeps` that the motion needs of this `arm`, and of others that are `MARGIN` faster."""
-        built, position = _chain(arm), self.position[0]
-        phase = MARGIN * float(np.max(driven_frequencies(built, position), initial=0.0))
-        stiff = MARGIN * fastest_rate(built, position)
+        frequencies = driven_frequencies(_chain(arm), self.position[0])
+        fastest = MARGIN * float(np.max(frequencies, initial=0.0))
+        rings = min(fastest, SHOWN * 2.0 * np.pi / self.period)
         flanks = FLANK_SPEED / min(
             (
                 ENGAGEMENT * 0.5 * t.play + t.rounding
@@ -86,7 +85,7 @@ class MotionPredictor:
             ),
             default=np.inf,
         )
-        rate = max(phase / PHASE, stiff / STABLE, flanks)
+        rate = max(rings / PHASE, flanks)
         self.substeps = max(1, int(np.ceil(rate * self.period)))
 
     def states(self, arm, offset=None, samples=None):
@@ -164,32 +163,6 @@ def shifted(values, slopes, delay, period):
         a * (1.0 + 2.0 * x) * (1.0 - x) ** 2 + da * x * (1.0 - x) ** 2
         + b * (3.0 - 2.0 * x) * x**2 + db * (x - 1.0) * x**2
     )  # fmt: skip
-
-
-def fastest_rate(built, position):
-    """Largest rate of what moves while the motors are held, damped or not [1/s]: size of the poles, play closed.
-
-    Parameters
-    ----------
-    built : Chain
-    position : ndarray, shape (n,)
-        [rad]
-    """
-    n, m, arm = built.n_joints, built.n_modes, built.arm
-    if not m:
-        return 0.0
-    M = built.mass_matrix(np.asarray(position, float))[n:, n:]
-    K, C = built.stiffness_matrix(), built.terms(position, np.zeros(n)).C2.copy()
-    rest = built.static_deflection(position)
-    for joint in arm.joints:
-        if (t := joint.transmission) is not None:
-            j = arm.mode_names.index(f"{joint.name}_transmission")
-            load = t.load_damping * t.stiffness * abs(rest[j])
-            C[j, j] += max(t.play_damping - t.damping, 0.0) + load
-    A = np.zeros((2 * m, 2 * m))
-    A[:m, m:] = np.eye(m)
-    A[m:, :m], A[m:, m:] = -np.linalg.solve(M, K), -np.linalg.solve(M, C)
-    return float(np.abs(np.linalg.eigvals(A)).max())
 
 
 def driven_frequencies(built, position, delta=None):
