@@ -26,7 +26,7 @@ DAMPING = (
     "transmission_play_damping",
 )
 #: Deviation of the logarithm of a damping ratio, s, and weight of the residuals, w.
-SPREAD, WEIGHT = 0.3, 4.0
+SPREAD, WEIGHT = 0.3, 6.0
 #: Smallest damping ratio that counts, and smallest and largest factor of a quantity.
 LEAST, LOW, HIGH = 1e-4, 0.01, 4.0
 #: Relative step of differences, and evaluations.
