@@ -28,8 +28,8 @@ from ..recordings.motion import CORNER, low_passed
 
 #: The linearly implicit method is stable however stiff and strongly damped a transmission is that the fit tries.
 METHOD = "implicit"
-#: Largest phase a step [rad] of a mode that the samples show, up to `SHOWN` periods of it a sample [-]: a strain is off by
-#: less than a tenth of a microstrain on arms like TUDOR (tested).
+#: Largest phase a step [rad] of a mode that the samples show, up to `SHOWN` periods of it a sample [-]: a strain is off
+#: by less than a tenth of a microstrain on arms like TUDOR (tested).
 PHASE, SHOWN = 0.06, 0.2
 #: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
 #: then off by some hundredths of a microstrain rms (tested).
