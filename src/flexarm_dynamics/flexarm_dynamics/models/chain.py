@@ -654,7 +654,8 @@ class Chain(ArmModel):
     def driven_stepper(self, method):
         """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
 
-        Of a joint with a transmission the motor's motion is prescribed; the link's follows.
+        By `method`, a value of `fixed_step.METHODS`. Of a joint with a transmission the motor's motion is prescribed;
+        the link's follows.
         """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1
