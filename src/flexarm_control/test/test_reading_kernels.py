@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is compiled for the checks of the readings gives what numpy gives, on random samples."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from flexarm_control import kernels
 from flexarm_control.kernels import readings, strains
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import observe
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models import model as models
 
 COMPILED = kernels.compiled()
 N, M, G = 2, 3, 4
@@ -257,3 +263,32 @@ def test_strains_at_an_end_of_their_range_are_not_picked_up():
     half[1] = 0.2
     assert not COMPILED.pick_up(2.0 * strain, position, np.zeros(2), half, 1, now)
     assert now[0] == 0.1
+
+
+@pytest.mark.parametrize("name", ["R", "long_reach"])
+def test_a_warm_up_loads_what_the_samples_of_a_moving_arm_call(name, monkeypatch):
+    """Nothing is compiled, or read from a file, on the control path."""
+    monkeypatch.delitem(sys.modules, COMPILED.__name__)  # of which other tests have loaded parts
+    own = kernels.compiled.__wrapped__()
+    monkeypatch.setattr(kernels, "compiled", lambda: own)
+    model = models.build(arm_file.load(name))
+    observe(model, "filtered_derivative", {}).warm_up()
+    loaded, observer = signatures(own), observe(model, "filtered_derivative", {})
+    n, g = model.n_joints, len(model.arm.gauges)
+    sample, draw = ArmSample(n, model.n_modes, g), np.random.default_rng(0)
+    for k in range(1500):
+        sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+        sample.position[:], sample.velocity[:] = 0.3 * np.sin(3e-3 * k), 0.9 * np.cos(3e-3 * k)
+        sample.torque[:], sample.rate = np.sin(0.1 * k), None
+        sample.strain = 1e-5 * draw.normal(size=g) * (k % 400 > 40)  # stands still now and then
+        sample.amplitude = None if k % 300 < 100 else np.zeros(model.n_modes)
+        sample.trust, sample.doubt, sample.velocity_known = ArmSample.TRUSTED, "", k % 500 > 50
+        observer.step(sample, later=True)
+        observer.look_ahead()
+    assert signatures(own) == loaded
+
+
+def signatures(module):
+    """Number of argument types that each compiled function has been loaded for."""
+    found = {k: getattr(v, "signatures", None) for k, v in vars(module).items()}
+    return {name: len(types) for name, types in found.items() if types is not None}

@@ -223,13 +223,21 @@ class ArmObserver:
         return expected if by_number < JUMP_FITS * by_stamp else dt
 
     def warm_up(self):
-        """Take three samples of an arm at rest, so that compiled code is loaded; discard the observer afterwards."""
+        """Take samples so that all compiled code is loaded; discard the observer afterwards.
+
+        First three of an arm at rest, then of one that swings a little, until the strains are compared with the motion.
+        """
         arm = self.model.arm
         sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
         sample.velocity_known, sample.rate = False, np.zeros(self.model.n_modes)
         sample.torque[:] = 0.0
-        for k in range(3):
-            sample.stamp_ns, sample.sequence = 1_000_000 * (k + 1), k
+        for k in range(WARM_UP):
+            sample.stamp_ns, sample.sequence = WARM_UP_NS * (k + 1), k
+            if k >= 3:
+                for values in (sample.position, sample.velocity, sample.strain, sample.amplitude):
+                    if values is not None:
+                        values[:] = 1e-6 * np.sin(k + np.arange(values.size))
+            sample.trust, sample.doubt = ArmSample.TRUSTED, ""
             self.step(sample)
 
     def _map_strain(self, sample, restart):
@@ -342,6 +350,8 @@ class ArmObserver:
         return difference + (self._derivative - difference) * np.exp(-bandwidth * dt)
 
 
+#: Samples of a warm-up, and the time between them [ns]: together longer than a filter of the strains settles.
+WARM_UP, WARM_UP_NS = 250, 4_000_000
 #: A step by the stamps this many times as long as by the numbers may be a jump of the clock, and is one where the
 #: numbers fit the positions this much better [-].
 JUMP_PERIODS, JUMP_FITS = 20.0, 0.25
