@@ -207,7 +207,8 @@ def goal(node, msg, **tolerances):
         ("canceled", GoalStatus.STATUS_CANCELED),
     ):
         setattr(handle, name, lambda status=status: ends.append(status))
-    handle.publish_feedback = lambda _: None
+    handle.feedback = []
+    handle.publish_feedback = handle.feedback.append
     server = SimpleNamespace(action_type=Follow, finish=lambda h, end: ends.append(end(h)))
     node._goals.take(server, handle)
     return handle, ends
@@ -219,9 +220,16 @@ def test_a_goal_that_is_cancelled_while_it_is_worked_on_ends_and_the_one_before_
     shaper.stand(0.6, -0.3)
     shaper.settle()
     first, ends = goal(shaper.node, straight((0.0, 0.6), (1.0, 0.1)))
-    assert not ends
+    assert not ends and not first.feedback
     shaper.made()
+    told, state = first.feedback[0], shaper.states.newest
+    seconds = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec  # noqa: E731
+    assert told.header.stamp == state.start
+    assert list(told.desired.positions) == [0.1, -0.05]
+    lasts = seconds(told.desired.time_from_start)
+    assert lasts == pytest.approx(seconds(state.end) - seconds(state.start), abs=1e-6)
     shaper.go_on(0.1)
+    assert 0.0 < seconds(first.feedback[-1].desired.time_from_start) < 0.2
     second, refused = goal(shaper.node, straight((0.5, 0.4), (1.0, 0.1)))
     assert shaper.node._goals.may_cancel(second) == CancelResponse.ACCEPT
     second.is_cancel_requested = True

@@ -93,6 +93,8 @@ class ShaperNode(ArmNode):
         names = self.joint_names = joint_names(self.parameters["joint_names"])
         self.parameters.resolve({"joints": len(names)})
         self._bypass = self._wanted = self._changed = False
+        #: When the last shaped motion began, or begins [ns].
+        self.started_ns = 0
         own = self._make_shapers()
         self.core = self._shapers[False]
         self.job = self._keep(lambda job: job.close(), ShapingJob(self))
@@ -238,6 +240,7 @@ class ShaperNode(ArmNode):
         state.trajectory_id += 1
         state.rejected_reason = state.stopped = ""
         state.added_time, state.stretch = float(shaped.added), float(shaped.stretch)
+        self.started_ns = shaped.start_ns
         set_stamp(state.start, shaped.start_ns)
         self._moves_until(shaped)
         if shaped.stretch > 1.0:

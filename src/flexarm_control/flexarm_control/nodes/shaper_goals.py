@@ -133,11 +133,20 @@ class ShaperGoals:
         before, self._current = self._current, goal
         if before is not None:
             self._end(before, Code.INVALID_GOAL, "replaced by a newer goal")
+        if shaped.points:
+            self._announce(goal, shaped.points[-1])
         goal.handle.request.trajectory = shaped
         if self._node.plays:
             goal.check = GoalCheck(self._node.joint_names, goal.tolerances, 0, 0.0)
         else:
             self._send(goal, goal.handle.request)
+
+    def _announce(self, goal, last):
+        """The first feedback: its stamp is the start of the shaped motion, `desired` the end, with the time to it."""
+        feedback = goal.server.action_type.Feedback(joint_names=self._node.joint_names)
+        set_stamp(feedback.header.stamp, self._node.started_ns)
+        feedback.desired = last
+        goal.handle.publish_feedback(feedback)
 
     def may_cancel(self, handle):
         """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
@@ -211,8 +220,9 @@ class ShaperGoals:
         if goal is None:
             return
         feedback = goal.server.action_type.Feedback(joint_names=self._node.joint_names)
-        set_stamp(feedback.header.stamp, self._node.now_ns())
-        point = feedback.desired
+        now, point = self._node.now_ns(), feedback.desired
+        set_stamp(feedback.header.stamp, now)
+        set_stamp(point.time_from_start, max(now - self._node.started_ns, 0))
         point.positions, point.velocities, point.accelerations = state.tolist()
         if measured is not None:
             feedback.actual.positions = measured[0].tolist()
