@@ -222,11 +222,11 @@ def test_a_goal_that_is_cancelled_while_it_is_worked_on_ends_and_the_one_before_
     first, ends = goal(shaper.node, straight((0.0, 0.6), (1.0, 0.1)))
     assert not ends and not first.feedback
     shaper.made()
-    told, state = first.feedback[0], shaper.states.newest
+    first_one, state = first.feedback[0], shaper.states.newest
     seconds = lambda stamp: stamp.sec + 1e-9 * stamp.nanosec  # noqa: E731
-    assert told.header.stamp == state.start
-    assert list(told.desired.positions) == [0.1, -0.05]
-    lasts = seconds(told.desired.time_from_start)
+    assert first_one.header.stamp == state.start
+    assert list(first_one.desired.positions) == [0.1, -0.05]
+    lasts = seconds(first_one.desired.time_from_start)
     assert lasts == pytest.approx(seconds(state.end) - seconds(state.start), abs=1e-6)
     shaper.go_on(0.1)
     assert 0.0 < seconds(first.feedback[-1].desired.time_from_start) < 0.2
