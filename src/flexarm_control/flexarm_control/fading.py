@@ -48,11 +48,6 @@ class Fading:
         self._c, self._active = np.zeros((3, size)), False
 
     @property
-    def active(self):
-        """Whether anything is left."""
-        return self._active
-
-    @property
     def left(self):
         """What is left of all jumps, shape (size,)."""
         return self._c[0]

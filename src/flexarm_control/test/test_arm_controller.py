@@ -410,28 +410,6 @@ def test_torque_returns_in_a_ramp_and_less_than_a_tenth_of_it_within_20_ms(arm_r
     assert not core.saturated
 
 
-@pytest.mark.parametrize(("lost", "step"), [(3, 1.0), (20, 0.11)])
-def test_the_torque_goes_on_without_a_jump_after_many_lost_samples(arm_r, lost, step):
-    authority = Authority(arm_r, check_all(PARAMETERS, {}, {"joints": 1, "modes": 2}))
-    authority.rate[:] = np.inf
-    torques = []
-    for k in range(200):
-        if 100 <= k < 100 + lost:
-            continue
-        gap = k == 100 + lost
-        u = np.array([1.0 if k < 100 else 2.0])
-        authority.send(u, 1e-3 * (lost + 1 if gap else 1), 1e-3)
-        torques.append(authority.torque[0])
-    assert torques[:100] == [1.0] * 100
-    assert np.abs(np.diff(torques)).max() <= step
-    assert torques[-1] == pytest.approx(2.0, abs=1e-3)
-    assert torques[100 + lost + 2] == pytest.approx(2.0, abs=0.011)
-    if lost > 5:
-        authority.begin(np.zeros(1), True)
-        authority.send(np.zeros(1), 1e-3, 1e-3)
-        assert authority.torque[0] == 0.0
-
-
 def test_an_arm_under_gravity_is_held_from_the_first_sample_on(long_reach):
     sizes = {"joints": 4, "modes": long_reach.n_modes}
     authority = Authority(long_reach, check_all(PARAMETERS, {}, sizes))
@@ -720,7 +698,7 @@ def test_the_torque_changes_no_faster_than_its_rate_limit_from_the_last_one_sent
     law = Scripted(0.0, 8.0, 8.0, 8.0, 8.0, -8.0, 0.0)
     core = controller(arm_r, law, torque_rate_limit=[2000.0])
     found = answers(
-        core, (0, 1, 2, 4, 5, 6, 11)
+        core, (0, 1, 2, 4, 5, 6, 13)
     )  # after a gap of n periods no farther: an estimate is worst then
     wanted = [(0, False), (2, True), (4, True), (6, True), (8, False), (6, True), (4, True)]
     assert_allclose(found, wanted, atol=1e-12)

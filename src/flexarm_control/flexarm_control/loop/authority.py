@@ -10,9 +10,6 @@ so that torque and stiffness grow together; u - u_g is bounded by the torque lim
 is below a tenth for the first 20 ms.
 Without gravity u_g is zero. Where u begins within `SMALL` of u_g, at rest, there is nothing to return from: no ramp.
 
-A gap of more than `LOST` samples, in which the last torque went on, is no time without torque. What the law's torque
-has jumped by after it fades within as long as the gap took (module `fading`).
-
 The rate is bounded in any case; lost samples add nothing to what the next one may change, since an estimate is at its
 worst after them. The budget of an arm that states none is :math:`8\,\omega_1` times its torque limit
 per second, with omega_1 its lowest bending frequency with the joints locked: a torque that swings between its limits
@@ -27,14 +24,9 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 
 from .. import kernels
 from ..arrays import clip
-from ..fading import Fading
 
 #: Of the torque limit: an arm that is taken over with less than this needs no ramp.
 SMALL = 0.02
-#: After more lost samples in a row the jump of the torque fades.
-LOST = 5
-#: A jump has faded to a hundredth after this, over its rate [-].
-FADED = 8.4
 #: A rate that is none [N m/s].
 NO_RATE = 1e9
 #: Budget of an arm that states none, over its torque limit and lowest bending frequency.
@@ -88,7 +80,6 @@ class Authority:
         self._rates = torque_rates(model)
         self.torque, self._weight = np.zeros((2, model.n_joints))
         self._elapsed, self._first = np.inf, False
-        self._jump = Fading(model.n_joints, 1.0)
         self._kernels = kernels.compiled()
         self.configure(settings)
 
@@ -114,7 +105,6 @@ class Authority:
     def begin(self, q, rests):
         """Torque returns, to an arm at q (n,) [rad] that `rests` or not: first what holds its weight there."""
         self._elapsed, self._first = 0.0, rests
-        self._jump.clear()
         self._weight[:] = self._holding(q)
         clip(self._weight, -self.limit, self.limit)
         self.torque[:] = self._weight
@@ -158,16 +148,4 @@ class Authority:
         if self._elapsed < self._time:
             self._elapsed += dt
             part = min(1.0, (self._elapsed / self._time) ** 2)
-        else:
-            u = self._continued(u, dt, dt > (LOST + 0.5) * period)
         return self._kernels.sent(u, self._weight, part, self.rate, period, self.limit, torque)
-
-    def _continued(self, u, dt, gap):
-        """A torque u (n,) and what is left of a jump of it, after a time dt [s], at whose end a `gap` may be."""
-        jump = self._jump
-        jump.advance(dt)
-        if gap:
-            jump.clear()
-            jump.rate = FADED / dt
-            jump.jump(self.torque - u)
-        return u + jump.left if jump.active else u
