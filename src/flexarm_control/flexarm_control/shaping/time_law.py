@@ -123,13 +123,15 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
     return None if found is None else found[0].motion(found[2])
 
 
-def solved(motion, modes, velocity=np.inf, acceleration=np.inf):
+def solved(motion, modes, velocity=np.inf, acceleration=np.inf, plain=False):
     """What `retimed` finds: the programme, what the given motion leaves (as of `Line.norms`), and the accelerations.
 
     Parameters
     ----------
     motion, modes, velocity, acceleration
         As of `retimed`.
+    plain : bool
+        By the modes alone: whatever they hand to each other, with accelerations up to the limits.
 
     Returns
     -------
@@ -148,9 +150,11 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf):
     ]
     law = Law(line, motion.duration + modes.periods / line.lowest, limits)
     sigma = progress(0, np.linspace(*motion.knots[[0, -1]], law.middles.size))
-    x = law.solution(norms, sigma, _gentle(motion, modes))
-    if x is None:
-        x = law.solution(norms, sigma)
+    if plain:
+        x = law.solution(norms, sigma, coupled=False)
+    else:
+        x = law.solution(norms, sigma, _gentle(motion, modes))
+        x = law.solution(norms, sigma) if x is None else x
     return None if x is None or law.worst(x, norms) > 1.0 else (law, norms, x)
 
 
@@ -371,7 +375,7 @@ class Law:
         rise = 0.5 * self._step * before**2 / np.where(falls, before - after, np.inf)
         return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
 
-    def solution(self, norms, sigma, acceleration=np.inf):
+    def solution(self, norms, sigma, acceleration=np.inf, coupled=True):
         """The accelerations x that leave least; None: there are none within the limits.
 
         Parameters
@@ -382,13 +386,14 @@ class Law:
             Progress to begin with, at the middles.
         acceleration : float
             A limit of its own, beside `limits` [1/s^2].
+        coupled : bool
+            Whether to keep small what modes hand to each other.
         """
         x, acceleration = None, min(acceleration, self.limits[1])
         for _ in range(ROUNDS):
             along = np.append(self._past[0], sigma), self._steps, self._parts
-            x = self._programme(
-                self._line.left(*along), self._line.coupled(*along), norms, acceleration
-            )
+            handed = self._line.coupled(*along) if coupled else []
+            x = self._programme(self._line.left(*along), handed, norms, acceleration)
             if x is None:
                 return None
             sigma = self._middle_progress(x)
@@ -405,7 +410,7 @@ class Law:
         """Solve one linear programme; its x, None where the limits contradict each other."""
         around = np.exp(-2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
         parts = [v / norm[:, None] for v, norm in zip(left, norms, strict=True)]
-        handed = [COUPLED / np.median(n) * v for v, n in zip(coupled, norms, strict=True)]
+        handed = [COUPLED / np.median(n) * v for v, n in zip(coupled, norms, strict=False)]
         every = np.concatenate([*parts, *handed])
         rows = np.real(around[:, None, None] * every).reshape(-1, self.count)
         wanted = np.ones(len(every))

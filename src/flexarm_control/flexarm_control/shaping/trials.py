@@ -124,7 +124,7 @@ class Trials:
     motion : PiecewiseMotion
         To be made next.
     best : PiecewiseMotion
-        The one that has swung least; at first that of `time_law.retimed`.
+        The one that has swung least; at first that of `time_law.solved`, by the modes alone: a trial shows the rest.
     least : float
         What it has swung; inf at first.
 
@@ -141,7 +141,7 @@ class Trials:
                 field="ringing",
                 value=ringing.poles.size,
             )
-        found = time_law.solved(motion, modes, velocity, acceleration)
+        found = time_law.solved(motion, modes, velocity, acceleration, plain=True)
         if found is None:
             hint = "give a straight motion from rest to rest, with velocities"
             raise DesignError("has no time law for its modes", field="motion", hint=hint)
