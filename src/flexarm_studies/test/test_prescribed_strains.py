@@ -97,6 +97,14 @@ def test_sharp_flanks_take_shorter_steps(arm):
     assert np.sqrt(np.mean(error**2)) < 1e-7
 
 
+def test_a_fit_may_try_a_play_of_nearly_nothing(arm):
+    tiny = replace(arm.joints[0].transmission, play=1e-9, rounding=0.0)
+    arm = replace(arm, joints=(replace(arm.joints[0], transmission=tiny), arm.joints[1]))
+    predictor = MotionPredictor(arm, moved())
+    assert 20 < predictor.substeps < 200
+    assert np.isfinite(predictor.strains(arm, *predictor.states(arm))).all()
+
+
 def test_delay_drift_bias_and_offset_do_what_they_say(arm):
     measured = moved()
     predictor = MotionPredictor(arm, measured)

@@ -34,6 +34,8 @@ PHASE, SHOWN = 0.06, 0.2
 #: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
 #: then off by some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
+#: Flanks that meet within less [rad] take no shorter steps: a fit may try any play, and so small a one does little.
+LEAST_FLANK = 1e-4
 #: Modes of arms that the fit tries may be this much faster than the file's [-].
 MARGIN = 1.4
 
@@ -77,15 +79,12 @@ class MotionPredictor:
         frequencies = driven_frequencies(_chain(arm), self.position[0])
         fastest = MARGIN * float(np.max(frequencies, initial=0.0))
         rings = min(fastest, SHOWN * 2.0 * np.pi / self.period)
-        flanks = FLANK_SPEED / min(
-            (
-                ENGAGEMENT * 0.5 * t.play + t.rounding
-                for j in arm.joints
-                if (t := j.transmission) and t.play
-            ),
-            default=np.inf,
-        )
-        rate = max(rings / PHASE, flanks)
+        ways = [
+            max(ENGAGEMENT * 0.5 * t.play + t.rounding, LEAST_FLANK)
+            for j in arm.joints
+            if (t := j.transmission) and t.play
+        ]
+        rate = max(rings / PHASE, FLANK_SPEED / min(ways, default=np.inf))
         self.substeps = max(1, int(np.ceil(rate * self.period)))
 
     def states(self, arm, offset=None, samples=None):
