@@ -35,7 +35,7 @@ PHASE, SHOWN = 0.06, 0.2
 #: then off by some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
 #: Flanks that meet within less [rad] take no shorter steps: a fit may try any play, and so small a one does little.
-LEAST_FLANK = 1e-4
+MIN_FLANK = 1e-4
 #: Modes of arms that the fit tries may be this much faster than the file's [-].
 MARGIN = 1.4
 
@@ -80,7 +80,7 @@ class MotionPredictor:
         fastest = MARGIN * float(np.max(frequencies, initial=0.0))
         rings = min(fastest, SHOWN * 2.0 * np.pi / self.period)
         ways = [
-            max(ENGAGEMENT * 0.5 * t.play + t.rounding, LEAST_FLANK)
+            max(ENGAGEMENT * 0.5 * t.play + t.rounding, MIN_FLANK)
             for j in arm.joints
             if (t := j.transmission) and t.play
         ]
