@@ -18,7 +18,7 @@ from flexarm_dynamics.arm.description import (
     scaled,
 )
 from flexarm_dynamics.arm.encoders import encoder_rows, motors_at_rest
-from flexarm_dynamics.kernels import chain as kernel
+from flexarm_dynamics.kernels import transmissions as kernel
 from flexarm_dynamics.linear import linear_plant
 from flexarm_dynamics.models.chain import Chain
 from flexarm_dynamics.models.fixed_step import METHODS, substeps

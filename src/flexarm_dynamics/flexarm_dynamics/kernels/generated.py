@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 
-from . import chain, integrators, load, native, symbols
+from . import chain, chain_data, integrators, load, native, symbols
 
 DERIVATIVE = '''"""Equations of motion of one structure of arm, written by flexarm_dynamics.kernels.generated."""
 
@@ -48,7 +48,7 @@ def low_storage(
 
 
 #: How what is summed at the nodes of foreshortened links gets into the code: there are no sums; as polynomials of the
-#: state, whose coefficients are in a vector; from `chain.sums_at_nodes`, at every evaluation.
+#: state, whose coefficients are in a vector; from `bodies.sums_at_nodes`, at every evaluation.
 NONE, POLYNOMIALS, AT_NODES = "none", "polynomials", "at nodes"
 #: Longer code takes too long to compile; arms for which there is none use the recursion in loops. Eight links in space
 #: with two modes in each direction have 17 000 operations at the first order, which take four seconds to compile, once,
@@ -60,9 +60,9 @@ UNPACK = {NONE: "m = c", POLYNOMIALS: "c, m = c", AT_NODES: "c, data, scratch, m
 
 def ways(data):
     """How the sums of an arm of this level may get into its code, the fastest first."""
-    if data.level == chain.FIRST_ORDER:
+    if data.level == chain_data.FIRST_ORDER:
         return (NONE,)
-    return (POLYNOMIALS, AT_NODES) if data.level == chain.FORESHORTENING else (AT_NODES,)
+    return (POLYNOMIALS, AT_NODES) if data.level == chain_data.FORESHORTENING else (AT_NODES,)
 
 
 def right_hand_side(data, work, way):
@@ -70,8 +70,8 @@ def right_hand_side(data, work, way):
 
     Parameters
     ----------
-    data : chain.Data
-    work : chain.Work
+    data : chain_data.Data
+    work : chain_data.Work
         Of dtype object.
     way : str
         One of `ways`.
@@ -122,13 +122,13 @@ def modes(data):
 def sources(program, data, way):
     """What `load.joined` makes ``derivative(state, net torque, constants, out)`` and its integrators of.
 
-    With `chain.sums_at_nodes` where sums come from there.
+    With `bodies.sums_at_nodes` where sums come from there.
 
     Parameters
     ----------
     program : str
         Of `right_hand_side`, whose other arguments these are.
-    data : chain.Data
+    data : chain_data.Data
     way : str
     """
     n = data.links
@@ -141,7 +141,7 @@ def sources(program, data, way):
 
 
 class Polynomials:
-    r"""What `chain.at_nodes` sums, of second order in the slopes, as polynomials put into the work space.
+    r"""What `bodies.at_nodes` sums, of second order in the slopes, as polynomials put into the work space.
 
     The foreshortening is a form in the amplitudes, :math:`s = \sum_{jk}a_{jk}\delta_j\delta_k` with
     :math:`a_{jk} = \frac12\int_0^x\varphi_j'\varphi_k'`, and so are the integrals over the mass that hold it,
@@ -153,9 +153,9 @@ class Polynomials:
 
     Parameters
     ----------
-    data : chain.Data
+    data : chain_data.Data
         Of level FORESHORTENING.
-    work : chain.Work
+    work : chain_data.Work
         Of dtype object.
     state : ndarray of Symbol, shape (2 (n + m),)
     graph : symbols.Graph
@@ -188,7 +188,7 @@ class Polynomials:
         K, G, kinds = delta.size, data.nodes, data.direction[i, : delta.size]
         link, mode, modes = work.of_link[i], work.of_mode[i, :K], work.of_modes[i]
         link[:], mode[:], modes[:], work.draws[i], work.bent[i] = 0.0, 0.0, 0.0, 0.0, 0.0
-        bends = kinds != chain.TWIST
+        bends = kinds != chain_data.TWIST
         forms = self._forms = _Forms(kinds, delta, rate)
         if not forms.pairs:
             return
@@ -196,16 +196,20 @@ class Polynomials:
         products = np.array([slope[:G, j] * slope[:G, k] for j, k in forms.pairs])
         a = 0.5 * products @ data.cumulate[i]  # (pairs, G + 1)
         mass, at = data.node_mass[i, :G], a[:, :G]
-        work.draws[i, :K], link[chain.SHORT_TIP], link[chain.SHORT_TIP_DD] = self._drawn(a[:, G])
+        work.draws[i, :K], link[chain_data.SHORT_TIP], link[chain_data.SHORT_TIP_DD] = self._drawn(
+            a[:, G]
+        )
         for b in np.flatnonzero(data.host[: data.bodies] == i):
             found = self._drawn(a[:, data.body_node[b]])
             work.body_draws[b, :K], work.of_body[b, 0], work.of_body[b, 1] = found
-        mode[:, chain.P], link[chain.SHORT], link[chain.SHORT_DD] = self._drawn(at @ mass)
+        mode[:, chain_data.P], link[chain_data.SHORT], link[chain_data.SHORT_DD] = self._drawn(
+            at @ mass
+        )
         xp = self._drawn(at @ (mass * data.node_x[i, :G]))[0]
-        modes[:K, :K], mode[:, chain.SDDP] = self._squares((at * mass) @ at.T)
+        modes[:K, :K], mode[:, chain_data.SDDP] = self._squares((at * mass) @ at.T)
         sp = 0.5 * (modes[:K, :K] @ delta)
-        mode[:, chain.XP] = xp - sp
-        link[chain.XX] = 0.5 * ((sp - 2.0 * xp) @ delta)
+        mode[:, chain_data.XP] = xp - sp
+        link[chain_data.XX] = 0.5 * ((sp - 2.0 * xp) @ delta)
         self._with_shapes((at * mass) @ phi[:G], kinds, mode)
         mode[~bends] = 0.0
 
@@ -234,14 +238,14 @@ class Polynomials:
         delta, rate = forms.delta, forms.rate
         across = np.stack([forms.matrix(row) @ delta for row in values], axis=1)  # of P_j phi_l
         for kind, still, moving in (
-            (chain.Y, chain.YP, chain.YDP),
-            (chain.Z, chain.ZP, chain.ZDP),
+            (chain_data.Y, chain_data.YP, chain_data.YDP),
+            (chain_data.Z, chain_data.ZP, chain_data.ZDP),
         ):
             mode[:, still] = across[:, kinds == kind] @ delta[kinds == kind]
             mode[:, moving] = across[:, kinds == kind] @ rate[kinds == kind]
-        mode[:, chain.SPHI] = 0.5 * (delta @ across)
-        mode[:, chain.SDPHI] = rate @ across
-        mode[:, chain.SDDPHI] = values @ forms.squares
+        mode[:, chain_data.SPHI] = 0.5 * (delta @ across)
+        mode[:, chain_data.SDPHI] = rate @ across
+        mode[:, chain_data.SDDPHI] = values @ forms.squares
 
 
 class _Forms:
@@ -257,7 +261,7 @@ class _Forms:
 
     def __init__(self, kinds, delta, rate):
         same = [(j, k) for j, kind in enumerate(kinds) for k in range(j + 1) if kind == kinds[k]]
-        self.pairs = [(j, k) for j, k in same if kinds[j] != chain.TWIST]
+        self.pairs = [(j, k) for j, k in same if kinds[j] != chain_data.TWIST]
         self.delta, self.rate = delta, rate
         self.squares = np.array(
             [rate[j] * rate[k] * (1.0 if j == k else 2.0) for j, k in self.pairs], dtype=object
@@ -272,7 +276,7 @@ class _Forms:
 
 
 def given_sums(data, work, graph):
-    """Put symbols ``m[0]``, ``m[1]`` ... for what `chain.sums_at_nodes` gives into the work space.
+    """Put symbols ``m[0]``, ``m[1]`` ... for what `bodies.sums_at_nodes` gives into the work space.
 
     Symbols are of the `graph`; `data` has the structure.
     What is zero for any deflection stays so: integrals of y where no mode bends along y, and so on.
@@ -290,33 +294,33 @@ def given_sums(data, work, graph):
         kinds = data.direction[i, : data.count[i]]
         if not kinds.size:
             continue
-        straight = (kinds == chain.TWIST).all()
+        straight = (kinds == chain_data.TWIST).all()
         missing = set()
-        if chain.Y not in kinds:
-            missing |= {chain.YP, chain.YDP}
-        if chain.Z not in kinds:
-            missing |= {chain.ZP, chain.ZDP}
+        if chain_data.Y not in kinds:
+            missing |= {chain_data.YP, chain_data.YDP}
+        if chain_data.Z not in kinds:
+            missing |= {chain_data.ZP, chain_data.ZDP}
         for c in range(5):
             put(work.of_link, (i, c), straight)
         for j, kind in enumerate(kinds):
-            twists = kind == chain.TWIST
+            twists = kind == chain_data.TWIST
             for c in range(10):
                 put(work.of_mode, (i, j, c), twists or c in missing)
             for k in range(j + 1):
-                put(work.of_modes, (i, j, k), twists or kinds[k] == chain.TWIST)
+                put(work.of_modes, (i, j, k), twists or kinds[k] == chain_data.TWIST)
             put(work.draws, (i, j), twists)
-            put(work.bent, (i, j), twists or data.level != chain.FINITE_SLOPE)
+            put(work.bent, (i, j), twists or data.level != chain_data.FINITE_SLOPE)
         for b in range(data.bodies):
             if data.host[b] == i:
                 put(work.of_body, (b, 0), straight)
                 put(work.of_body, (b, 1), straight)
                 for j, kind in enumerate(kinds):
-                    put(work.body_draws, (b, j), kind == chain.TWIST)
+                    put(work.body_draws, (b, j), kind == chain_data.TWIST)
     return place
 
 
 def room_for_sums(data):
-    """Number of values that `chain.sums_at_nodes` gives."""
+    """Number of values that `bodies.sums_at_nodes` gives."""
     count = np.where(data.reduced[: data.links] < 0, data.count[: data.links], 0).tolist()
     links = sum(5 + k * 12 + k * (k + 1) // 2 for k in count if k)
     hosts = (count[i] for i in data.host[: data.bodies])

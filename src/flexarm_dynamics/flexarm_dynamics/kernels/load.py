@@ -14,6 +14,7 @@ import hashlib
 import importlib.util
 import inspect
 import os
+import re
 import sys
 import tempfile
 import types
@@ -23,6 +24,8 @@ from pathlib import Path
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 
+#: Imports from modules beside one.
+BESIDE = re.compile(r"^from \.\w+ import (\([^)]*\)|.*)\n", re.MULTILINE)
 #: Part of each module's name: what numba made under other symbols is not read again.
 SYMBOLS = "by layout"
 
@@ -120,5 +123,5 @@ def joined(name, sources, compiled=True, inline=(), given=None):
 
 
 def source(module):
-    """Source text of a module."""
-    return inspect.getsource(module)
+    """Source text of a module, without imports from modules beside it: in a joined one their sources come before it."""
+    return BESIDE.sub("", inspect.getsource(module))

@@ -61,7 +61,7 @@ class Tape:
 
     Parameters
     ----------
-    data : chain.Data
+    data : chain_data.Data
         At the first order.
     work : callable
         Makes work space of a dtype.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an arm to the constants of `kernels.chain`: mode shapes, loads, modal integrals, work space."""
+"""From an arm to the constants in `kernels.chain_data`: mode shapes, loads, modal integrals, work space."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -10,7 +10,7 @@ from numpy.polynomial import legendre
 from ..arm.description import DIRECTIONS, REDUCED
 from ..arm.reduced import Shapes
 from ..errors import ModelError
-from ..kernels import chain as kernel
+from ..kernels import chain_data as kernel
 from . import beam, varied_beam
 from .model import damping_matrix, rotation
 
@@ -319,7 +319,7 @@ def bishop_integrals(data, index, weights):
 
 
 def assemble(arm, shapes, loads):
-    """`kernels.chain.Data` of an arm."""
+    """`kernels.chain_data.Data` of an arm."""
     N = len(arm.links)
     modes = [modes_of(link, shapes) for link in arm.links]
     K = max(1, *(len(m) for m in modes)) if N > 1 else max(1, len(modes[0]))

@@ -23,8 +23,21 @@ import numpy as np
 
 from ..arm.description import REDUCED, scaled
 from ..errors import ModelError, check_shape
-from ..kernels import chain as plain
-from ..kernels import generated, integrators, load, straight_arm
+from ..kernels import (
+    bodies,
+    chain,
+    chain_data,
+    generated,
+    implicit_steps,
+    integrators,
+    load,
+    placing,
+    recursions,
+    sections,
+    straight_arm,
+    transmissions,
+    vectors,
+)
 from .assembly import (
     assemble,
     bishop_integrals,
@@ -38,11 +51,15 @@ from .assembly import (
 )
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
-CHAIN_SOURCES = (load.source(plain), load.source(integrators))
+#: Each after those whose functions it calls.
+_MODULES = (
+    chain_data, vectors, sections, bodies, placing, transmissions, recursions, chain, implicit_steps, integrators,
+)  # fmt: skip
+CHAIN_SOURCES = tuple(load.source(module) for module in _MODULES)
 #: For arms without transmissions and housings, and with Coulomb's friction at most.
 PLAIN_SOURCES = (
     CHAIN_SOURCES[0].replace("JOINT_PARTS = True", "JOINT_PARTS = False"),
-    CHAIN_SOURCES[1],
+    *CHAIN_SOURCES[1:],
 )
 
 #: Short enough to be written out in the integrators' loops.
@@ -103,12 +120,12 @@ class Chain(ArmModel):
         return roomy(self.data)
 
     def _packed(self, data):
-        return packed(data, plain.DATA, self._room) if self._compiled else (data,)
+        return packed(data, chain_data.DATA, self._room) if self._compiled else (data,)
 
     def _new_work(self, dtype=float):
         if not self._compiled:
             return (work_space(self.data, dtype),)
-        return packed(work_space(self.data, dtype, self._room), plain.WORK, self._room)
+        return packed(work_space(self.data, dtype, self._room), chain_data.WORK, self._room)
 
     @cached_property
     def _data(self):
@@ -175,7 +192,7 @@ class Chain(ArmModel):
             self._joint(qd, "qd"), delta_d, np.zeros(n), np.zeros(m), out,
         )  # fmt: skip
         for j, constants in self._transmissions:
-            out[n + j] += plain.spring_torque(constants, delta[j], delta_d[j])
+            out[n + j] += transmissions.spring_torque(constants, delta[j], delta_d[j])
         return out
 
     @cached_property
@@ -192,7 +209,7 @@ class Chain(ArmModel):
         out = np.full((len(delta), self.n_joints), np.nan)
         for i in np.flatnonzero(self.data.spring >= 0):
             j, constants = self.data.spring[i], self.data.transmission[i]
-            out[:, i] = plain.spring_torque(constants, delta[:, j], delta_d[:, j])
+            out[:, i] = transmissions.spring_torque(constants, delta[:, j], delta_d[:, j])
         return out
 
     def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
@@ -243,10 +260,10 @@ class Chain(ArmModel):
         """Add derivatives of the transmissions' torque, play and all."""
         for j, c in self._transmissions:
             stiffness, damping, half, load, rounding, within = c
-            s, row = plain.dead_zone(delta[j], half, rounding), self.n_joints + j
-            C[row, j] += plain.spring_damping(c, s)
-            slope = plain.dead_zone_slope(delta[j], half, rounding)
-            width2 = (plain.ENGAGEMENT * half + rounding) ** 2
+            s, row = transmissions.dead_zone(delta[j], half, rounding), self.n_joints + j
+            C[row, j] += transmissions.spring_damping(c, s)
+            slope = transmissions.dead_zone_slope(delta[j], half, rounding)
+            width2 = (chain_data.ENGAGEMENT * half + rounding) ** 2
             rise = 2.0 * s * width2 / (s * s + width2) ** 2 if half else 0.0
             rate = (damping - within) * rise + load * stiffness * np.sign(s)
             K[row, j] += slope * (stiffness + rate * delta_d[j])
@@ -286,7 +303,7 @@ class Chain(ArmModel):
     @cached_property
     def _tape(self):
         """Terms of the straight arm, recorded: control laws ask for them at every sample; None where there is none."""
-        if not self._compiled or self.data.level != plain.FIRST_ORDER:
+        if not self._compiled or self.data.level != chain_data.FIRST_ORDER:
             return None
         return straight_arm.Tape(
             self.data, lambda dtype: work_space(self.data, dtype), self.friction_table()
@@ -316,7 +333,7 @@ class Chain(ArmModel):
     def _slip_torque(self, i, rate, delta=None, delta_d=None):
         """Friction of joint i beyond Coulomb's [N m]."""
         delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
-        level = plain.slip_level(self.data, i, delta, delta_d, rate)
+        level = transmissions.slip_level(self.data, i, delta, delta_d, rate)
         return level * np.tanh(rate / self.data.slip[i, 3])
 
     def stiffness_matrix(self):
@@ -358,7 +375,7 @@ class Chain(ArmModel):
 
         def soften(delta, force, K2):
             for j, c in rounded:
-                K2[j, j] -= c[0] * (1.0 - plain.dead_zone_slope(delta[j], c[2], c[4]))
+                K2[j, j] -= c[0] * (1.0 - transmissions.dead_zone_slope(delta[j], c[2], c[4]))
 
         return self._rest(q, soften, sharp) if rounded else sharp
 
@@ -374,7 +391,7 @@ class Chain(ArmModel):
 
         def replace_forces(delta, force, K2):
             for j, c in play:
-                force[j] -= plain.spring_torque(c, delta[j], 0.0)
+                force[j] -= transmissions.spring_torque(c, delta[j], 0.0)
                 if j in hangs:
                     K2[j, j] -= c[0]
                 else:
@@ -492,7 +509,9 @@ class Chain(ArmModel):
                 1.0 if direction == "twist" else link.length
             )
         piece = d._replace(links=index + 1, tip=tip, slope=slope, length=length)
-        return piece if d.level == plain.FIRST_ORDER else self._with_nodes_up_to(piece, index, xi)
+        return (
+            piece if d.level == chain_data.FIRST_ORDER else self._with_nodes_up_to(piece, index, xi)
+        )
 
     def _cut_reduced(self, index, position):
         """The same of a link given by reduced matrices, between whose stations sections are linear."""
@@ -549,7 +568,7 @@ class Chain(ArmModel):
                 "jka,j,k->a", d.red_T2[r, :m, :m, 1:], own, own
             )
         for j in range(d.count[i]):
-            if d.direction[i, j] != plain.TWIST:
+            if d.direction[i, j] != chain_data.TWIST:
                 out[d.direction[i, j] - 1] += d.tip[i, j] * delta[d.first[i] + j]
         return out
 

@@ -15,7 +15,7 @@ from .model import Tableau
 _STAGES = DOP853.n_stages
 
 #: Two explicit Runge-Kutta methods, of order 8 and 4, and a linearly implicit one of order 2
-#: (`kernels.chain.implicit_step`), which stays stable however stiff the highest modes are.
+#: (`kernels.implicit_steps.implicit_step`), which stays stable however stiff the highest modes are.
 METHODS = {
     "dop853": Tableau(
         np.ascontiguousarray(DOP853.A[:_STAGES, :_STAGES]),

@@ -19,7 +19,7 @@ from scipy.linalg import eigh
 
 from .. import registry
 from ..errors import ModelError, check_shape
-from ..kernels import chain as kernel
+from ..kernels import vectors
 
 
 class Terms(NamedTuple):
@@ -452,7 +452,7 @@ def rotation(rpy):
 def about_axis(axis, angle):
     """Rotation about a unit vector, shape (3, 3)."""
     out = np.zeros((3, 3))
-    kernel.about_axis(np.asarray(axis, float), angle, out)
+    vectors.about_axis(np.asarray(axis, float), angle, out)
     return out
 
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from ..kernels import chain as kernel
+from ..kernels import chain_data as kernel
 from .assembly import modes_of
 
 

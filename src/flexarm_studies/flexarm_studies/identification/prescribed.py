@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError
-from flexarm_dynamics.kernels.chain import ENGAGEMENT
+from flexarm_dynamics.kernels.chain_data import ENGAGEMENT
 from flexarm_dynamics.models import fixed_step, model
 from flexarm_dynamics.models.chain import Chain
 
