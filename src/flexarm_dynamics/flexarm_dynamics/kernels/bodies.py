@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bent link is as a body: integrals over its mass, and its elastic forces; see `kernels.chain`."""
+"""What a bent link is as a body: integrals over its mass, and its elastic forces; see `kernels.chain`.
+
+Throughout, d is the arm's `chain_data.Data`, w its `chain_data.Work`, and i the number of a link.
+"""
 
 import numpy as np
 

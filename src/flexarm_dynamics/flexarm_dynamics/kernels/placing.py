@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places all links, joints and the payload, and what inertia they have; see `kernels.chain`."""
+"""Places all links, joints and the payload, and what inertia they have; see `kernels.chain`.
+
+Throughout, d is the arm's `chain_data.Data`, w its `chain_data.Work`, and i the number of a link.
+"""
 
 from .bodies import at_nodes, body_first_order, body_foreshortened, body_reduced, elastic_force
 from .chain_data import FIRST_ORDER, JOINT_PARTS

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse and forward dynamics, from link to link; see `kernels.chain`."""
+"""Inverse and forward dynamics, from link to link; see `kernels.chain`.
+
+Throughout, d is the arm's `chain_data.Data`, w its `chain_data.Work`, and i the number of a link.
+"""
 
 from .chain_data import JOINT_PARTS
 from .placing import add_housing_spin, payload

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames along a link, of its tip and of what sits on it, at finite slopes as well; see `kernels.chain`."""
+"""Frames along a link, of its tip and of what sits on it, at finite slopes as well; see `kernels.chain`.
+
+Throughout, d is the arm's `chain_data.Data`, w its `chain_data.Work`, and i the number of a link.
+"""
 
 import numpy as np
 
