@@ -36,9 +36,7 @@ class Sampling:
     joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
     modal_corner: float  # of that of modal amplitudes [rad/s]
     torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
-    friction: tuple = (
-        0.0,
-    )  # part of each joint's Coulomb friction that is cancelled, or of all [-]
+    friction: tuple = (0.0,)  # part of each joint's Coulomb friction that is cancelled [-]
     return_rate: float = 0.0  # see `slow.joint_pid` [1/s]
 
 
