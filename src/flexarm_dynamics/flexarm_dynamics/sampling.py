@@ -111,9 +111,9 @@ class Sampling:
 
     def _short(self, rest):
         """The step over a `rest` that is no longer than the short period [s], by the series."""
-        N = len(self._A)
-        parts = (rest**self._powers @ self._terms).reshape(-1, N, N)
-        return Step(rest, self._A, parts[0], parts[1], parts[2] if len(parts) == 3 else None)
+        N, kinds = len(self._A), 2 if self._density is None else 3
+        parts = (rest**self._powers @ self._terms).reshape(kinds, N, N)
+        return Step(rest, self._A, parts[0], parts[1], None if kinds == 2 else parts[2])
 
     def step(self, length):
         """The `Step` over a `length` [s] that is not negative."""

@@ -63,3 +63,10 @@ def test_a_stiff_system_has_a_shorter_grid_and_the_same_error():
 def test_no_noise_and_no_period():
     step = Sampling(np.array([[-3.0]])).step(0.0)
     assert step.Q is None and step.Phi == 1.0 and step.Gamma == 0.0
+
+
+def test_a_system_without_states_has_steps_too():
+    """As a rigid arm's modes are."""
+    none = np.zeros((0, 0))
+    assert Sampling(none).step(0.0023).Phi.shape == (0, 0)
+    assert Sampling(none, none).step(0.0023).Q.shape == (0, 0)
