@@ -163,7 +163,7 @@ def test_a_violated_path_tolerance_stops_the_arm(line):
 def test_a_cancelled_goal_is_canceled_once_the_arm_has_stopped(line):
     home(line)
     bench, arm, client = line
-    handle, _ = client.send(trajectory((6.0, 0.8)))
+    handle, _ = client.send(trajectory((60.0, 0.8)))
     bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
     handle.cancel_goal_async()
     status, result = client.result(handle)
@@ -176,7 +176,7 @@ def test_a_cancelled_goal_is_canceled_once_the_arm_has_stopped(line):
 def test_a_goal_that_is_replaced_has_a_result(line):
     home(line)
     bench, arm, client = line
-    first, _ = client.send(trajectory((6.0, 0.8)))
+    first, _ = client.send(trajectory((60.0, 0.8)))
     bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
     second, _ = client.send(trajectory((2.0, 0.1)))
     status, result = client.result(first)
@@ -194,14 +194,14 @@ def test_a_goal_that_is_replaced_has_a_result(line):
 def test_a_stop_and_a_fault_abort_with_the_controllers_own_reason(line):
     home(line)
     bench, arm, client = line
-    handle, _ = client.send(trajectory((6.0, 0.8)))
+    handle, _ = client.send(trajectory((60.0, 0.8)))
     bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
     assert bench.call(Trigger, "controller/stop").success
     status, result = client.result(handle)
     assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.PATH_TOLERANCE_VIOLATED)
     assert result.error_string == "~/stop was called"
     home(line)
-    handle, _ = client.send(trajectory((6.0, 0.8)))
+    handle, _ = client.send(trajectory((60.0, 0.8)))
     bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
     assert bench.call(Trigger, "simulator/reset").success
     status, result = client.result(handle)
