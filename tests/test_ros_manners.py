@@ -118,16 +118,12 @@ def test_one_arm_whose_observer_is_killed_stands_and_the_other_goes_on(arms):
     )
     stands = standing.newest.sequence
     b.pause(False)
-    # Both topics: a busy reader may be far behind on one of them.
+    # In lockstep no sample follows without the torque of the one before. A busy reader may have lost messages of either topic.
     newest = (b.measured, b.torques)
     bench.wait_for("arm b to go on", lambda: all(tap.newest.sequence > 300 for tap in newest))
     assert standing.newest.sequence == stands
     assert {m.mode for m in b.torques.messages if m.sequence >= 100} == {JointTorque.ENABLED}
     assert len({m.session for m in b.measured.messages}) == 1
-    numbers = [m.sequence for m in b.torques.messages]
-    assert set(range(b.pauses_at, 300)) <= set(
-        numbers
-    )  # those before, this reader may not have found in time
 
 
 def test_one_simulator_of_two_publishes_the_clock_until_another_node_does(tmp_path):
