@@ -118,7 +118,7 @@ def test_one_arm_whose_observer_is_killed_stands_and_the_other_goes_on(arms):
     )
     stands = standing.newest.sequence
     b.pause(False)
-    # In lockstep no sample follows without the torque of the one before. A busy reader may have lost messages of either topic.
+    # In lockstep no sample follows without the torque of the one before. A busy reader loses messages of either topic.
     newest = (b.measured, b.torques)
     bench.wait_for("arm b to go on", lambda: all(tap.newest.sequence > 300 for tap in newest))
     assert standing.newest.sequence == stands

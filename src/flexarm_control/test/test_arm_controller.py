@@ -461,6 +461,36 @@ def test_a_stamp_far_ahead_of_its_number_is_named(arm_r):
     )
 
 
+def test_where_the_joints_go_on_a_clock_has_jumped_and_the_arm_rests_on_its_path(arm_r):
+    core, other = started(arm_r), started(arm_r)
+    for each in (core, other):
+        feed(each, range(1, 100))
+        each.offer(motion(duration=1.0))
+
+    def follow(each, k, jumped_ns=0):
+        new = sample(k, each.reference.position[0], velocity=each.reference.velocity.copy())
+        new.stamp_ns += jumped_ns
+        assert each.step(new) is True
+
+    for k in range(100, 500):
+        follow(core, k)
+        follow(other, k)
+    follow(core, 500, 300_000_000)
+    follow(other, 500)
+    other.brake("asked for")
+    assert (core.state, core.interruptions) == (State.STOPPING, 0)
+    assert core.reason.startswith(
+        "header.stamp: 0.301 s after the last state, and 0 states are missing: its clock"
+    )
+    for k in range(501, 2500):  # as if it had been asked to stop
+        follow(core, k, 300_000_000)
+        follow(other, k)
+        assert_array_equal(core.reference.position, other.reference.position)
+        assert_array_equal(core.torque, other.torque)
+    assert core.state == State.HOLDING
+    assert core.reference.stamp_ns == sample(2499).stamp_ns + 300_000_000  # the source's time again
+
+
 def test_a_moving_arm_is_taken_over_as_it_moves_and_brought_to_rest(arm_r):
     core = controller(arm_r, return_time=0.065)
     for k in range(10):  # it is seen for 10 ms first

@@ -14,7 +14,7 @@ from ..trajectory.reference import GENTLE
 from . import applied, authority, supervisor
 from .applied import Applied
 from .authority import Authority
-from .samples import ArmSample, SampleOrder
+from .samples import ArmSample, SampleOrder, clock_jumped
 from .supervisor import State, Supervisor, longest_period
 from .torque_delay import TorqueDelay
 
@@ -127,6 +127,7 @@ class ArmController:
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
         self._last_ns, self._period = 0, 0.0  # [ns], [s]
+        self._jumped_ns = 0  # so far the source's clock went ahead of the reference's own [ns]
         self._count = 1  # states since the last one, with those that were missed
         self._doubt = ""  # of the last sample
         self._foreign = self.interruptions = 0
@@ -417,15 +418,7 @@ class ArmController:
         gap, away = dt, self._applied.back_after(sample, self.controller_id)
         known, self._period = self._period, dt / self._count
         if gap > self._resume_gap and gap > PERIODS_OF_GAP * known:
-            what, since = f"no state for {gap:.3g} s", (self._last_ns, self._position)
-            if gap > PERIODS_OF_GAP * known * self._count > 0.0:
-                what = (
-                    f"header.stamp: {gap:.3g} s after the last state, and {self._count - 1} states are missing: the"
-                    " source stood still, or its clock jumped"
-                )
-                since = None
-            self._interrupted(sample, what, since)
-            dt = 0.0
+            dt = self._after_gap(sample, gap, known)
         elif away > self._resume_gap:
             self._interrupted(sample, f"the driver has applied no torque for {away:.3g} s")
             dt = 0.0
@@ -436,7 +429,9 @@ class ArmController:
         law, reference, supervisor = self.law, self.reference, self.supervisor
         if self.payload is not None:
             self._note(sample, dt)
-        reference.sample(sample.stamp_ns)
+        if self._jumped_ns and reference.resting is not None:
+            self._rest_on(reference.position, sample.stamp_ns)
+        reference.sample(sample.stamp_ns - self._jumped_ns)
         if reference.path is not self._expected:
             self._expect(reference.path)
         q, qd = sample.position, sample.velocity
@@ -515,7 +510,9 @@ class ArmController:
             return False
         try:
             self.reference.stop(
-                self._last_ns, self.supervisor.deceleration, self.supervisor.deceleration_given
+                self.reference.stamp_ns,
+                self.supervisor.deceleration,
+                self.supervisor.deceleration_given,
             )
         except FlexarmError as error:
             self.fail(f"{reason}; and no smooth stop: {error}")
@@ -619,7 +616,7 @@ class ArmController:
             return
         self._waiting = True
         if not waiting:
-            self.reference.start(sample.position, sample.stamp_ns)
+            self._rest_on(sample.position, sample.stamp_ns)
             self._seen = [(sample.stamp_ns, sample.position.copy())]
         elif 1e-9 * (sample.stamp_ns - self._seen[-1][0]) >= SEEN:
             self._seen = [self._seen[-1], (sample.stamp_ns, sample.position.copy())]
@@ -654,10 +651,16 @@ class ArmController:
         if _moves(sample):
             velocity = sample.velocity if since is None else _steady_velocity(sample, *since)
         deceleration = np.minimum(GENTLE, self.supervisor.deceleration)
+        self._jumped_ns = 0
         try:
             self.reference.start(position, stamp, velocity, deceleration)
         except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
             self.reference.start(position, stamp)
+
+    def _rest_on(self, position, stamp_ns):
+        """The reference holds a position (n,) [rad], by the source's clock as it is at a stamp [ns]."""
+        self._jumped_ns = 0
+        self.reference.start(position.copy(), stamp_ns)
 
     def _seen_for(self, sample, verdict):
         """For how long positions have been seen while the controller waited, `SEEN` or a little more [s]."""
@@ -672,6 +675,24 @@ class ArmController:
             ", the motion was given up: send it again" if moved else ""
         )
         self._return(sample, since)
+
+    def _after_gap(self, sample, gap, period):
+        """Time that the control takes to have passed over a gap between two stamps [s], 0 where torque was lost.
+
+        Where the joints show that it was the source's clock which jumped, the reference goes on by its own time, and
+        the arm comes to rest on its path.
+        """
+        by_number = period * self._count
+        if not gap > PERIODS_OF_GAP * by_number > 0.0:
+            self._interrupted(sample, f"no state for {gap:.3g} s", (self._last_ns, self._position))
+            return 0.0
+        what = f"header.stamp: {gap:.3g} s after the last state, and {self._count - 1} states are missing"
+        if not clock_jumped(sample.position - self._position, sample.velocity, by_number, gap):
+            self._interrupted(sample, f"{what}: the source stood still, or its clock jumped")
+            return 0.0
+        self._jumped_ns += round(1e9 * (gap - by_number))
+        self._period, self._doubt = period, f"{what}: its clock jumped, for the joints went on"
+        return by_number
 
     def _restarted(self, sample):
         """Why a new session of the source is a fault; empty for an arm that rests where it did."""

@@ -103,6 +103,27 @@ class ArmSample:
 WRAP = 2**32
 
 
+#: A clock has jumped where the time by the numbers fits the positions this much better than that of the stamps [-].
+JUMP_FITS = 0.25
+
+
+def clock_jumped(moved, velocity, by_number, by_stamp):
+    """Whether a stamp that is too late for its number tells of a clock that jumped, not of a source that stood still.
+
+    Which of them shows in the positions: whether the joints have moved as far as in the one time or in the other. A
+    joint at rest shows neither: then False.
+
+    Parameters
+    ----------
+    moved, velocity : ndarray, shape (n,)
+        Since the last sample [rad], [rad/s].
+    by_number, by_stamp : float
+        Time since the last sample, by the numbers of the samples and by their stamps [s].
+    """
+    short = np.abs(moved - by_number * velocity).max()
+    return bool(short < JUMP_FITS * np.abs(moved - by_stamp * velocity).max())
+
+
 class SampleOrder:
     """Compares each sample with the last one, by number and stamp, never by a clock.
 

@@ -9,7 +9,7 @@ from flexarm_dynamics.parameters import check_all, parameter
 
 from .. import kernels
 from ..component import make
-from ..loop.samples import WRAP, ArmSample, SampleOrder
+from ..loop.samples import WRAP, ArmSample, SampleOrder, clock_jumped
 from . import gauge_health
 from .base import need_torque
 from .motion import Motion
@@ -208,9 +208,7 @@ class ArmObserver:
     def _step_of(self, sample):
         """Time since the last sample [s]: that of the stamps, or of the numbers where the source's clock has jumped.
 
-        A sample whose stamp is far later than its number says may follow a pause of the source, or a jump of its
-        clock. Which of them shows in the positions: whether the joints have moved as far as in the one time or in the
-        other. Over a jump the old estimate goes on; over a pause nothing is known of the torque.
+        Over a jump the old estimate goes on; over a pause of the source nothing is known of the torque.
         """
         order = self._order
         dt = 1e-9 * (sample.stamp_ns - order.stamp_ns)
@@ -218,9 +216,7 @@ class ArmObserver:
         if not (self._judges and 0.0 < JUMP_PERIODS * expected < dt):
             return dt
         moved = sample.position - self._measured
-        by_number = np.abs(moved - expected * self._derivative).max()
-        by_stamp = np.abs(moved - dt * self._derivative).max()
-        return expected if by_number < JUMP_FITS * by_stamp else dt
+        return expected if clock_jumped(moved, self._derivative, expected, dt) else dt
 
     def warm_up(self):
         """Take samples so that all compiled code is loaded; discard the observer afterwards.
@@ -352,9 +348,8 @@ class ArmObserver:
 
 #: Samples of a warm-up, and the time between them [ns]: together longer than a filter of the strains settles.
 WARM_UP, WARM_UP_NS = 250, 4_000_000
-#: A step by the stamps this many times as long as by the numbers may be a jump of the clock, and is one where the
-#: numbers fit the positions this much better [-].
-JUMP_PERIODS, JUMP_FITS = 20.0, 0.25
+#: A step by the stamps this many times as long as by the numbers may be a jump of the clock [-].
+JUMP_PERIODS = 20.0
 #: After a longer silence an observer starts afresh [ns].
 MAX_GAP_NS = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].
