@@ -691,7 +691,8 @@ class ArmController:
             self._interrupted(sample, f"{what}: the source stood still, or its clock jumped")
             return 0.0
         self._jumped_ns += round(1e9 * (gap - by_number))
-        self._period, self._doubt = period, f"{what}: its clock jumped, for the joints went on"
+        self._period = period
+        self._trajectory_reason = self._doubt = f"{what}: its clock jumped, for the joints went on"
         return by_number
 
     def _restarted(self, sample):
