@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random arms: what is drawn, how a run is judged, what the baselines are tuned for, and the table."""
 
+import argparse
 import json
 from dataclasses import replace
 
@@ -15,7 +16,7 @@ from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
-from flexarm_studies.random_arms import generator, report, study
+from flexarm_studies.random_arms import command, generator, report, study
 from flexarm_studies.uncertain import baselines, plants, trial
 from flexarm_studies.uncertain.controllers import CONTROLLERS
 
@@ -241,7 +242,7 @@ def test_runs_are_kept_and_not_run_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(trial, "run", run)
     path = tmp_path / "runs.jsonl"
-    args = (5, 2, ["default"], ["exact", "noisy"], path, 1)
+    args = (5, [0, 3], ["default"], ["exact", "noisy"], path, 1)
     rows = study.run(*args)
     assert len(calls) == 4 and len(path.read_text().splitlines()) == 5
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
@@ -277,11 +278,36 @@ def test_the_table_counts():
         row(1, "lqr", 2.0),
     ]
     table = dict(zip(("default", "lqr", "pid_ei"), report.rows_of(rows), strict=True))
-    # works, refused, lost, settled, within 3 periods, at rest, no later than the best baseline
-    assert table["default"][2:9] == (2, 1, 1, 2, 1, 2, 1)
-    assert table["default"][9] == "1.5° (2°)"
-    assert table["lqr"][8] is None
+    # works, refused, lost, settled, within 3 periods, periods until settled, at rest, no later than the best baseline
+    assert table["default"][2:10] == (2, 1, 1, 2, 1, "4", 2, 1)
+    assert table["default"][10] == "1.5° (2°)"
+    assert table["lqr"][9] is None
     assert any("lost in 1 runs: joint is … rad off" in line for line in report.reasons(rows))
+
+
+def test_arms_that_miss_are_listed_with_what_they_miss():
+    rows = [
+        row(n, "designed", settling, arm=f"planar1_0_{n}", decay=0.3, **more)
+        for n, settling, more in (
+            (0, 1.0, {}),
+            (1, 4.0, {}),
+            (2, None, {"lost": "joint1 is too fast"}),
+            (3, 1.0, {"at_rest": False, "rest_joint_deg": 0.0312}),
+        )
+    ]
+    found = {arm: cells for arm, _, _, *cells in report.missed(rows)}
+    assert found == {"planar1_0_1": ["4"], "planar1_0_2": ["lost"], "planar1_0_3": ["1 (0.031°)"]}
+
+
+def test_arms_are_chosen_by_their_numbers(tmp_path, capsys):
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    chosen = ["--seed", "5", "--arms", "8,0-1"]
+    command.arms(parser.parse_args([*chosen, "--files", str(tmp_path)]))
+    assert {p.stem for p in tmp_path.iterdir()} == {generator.arm(n, 5).name for n in (0, 1, 8)}
+    for wrong in ("4-2", "x", "1,", "-1"):
+        with pytest.raises(FlexarmError, match="is no list of numbers"):
+            command.arms(parser.parse_args(["--arms=" + wrong, "--files", str(tmp_path)]))
 
 
 def test_the_table_of_designs_has_the_decay_of_every_arm_once():

@@ -162,6 +162,19 @@ def new_path(path, option):
     return path
 
 
+def whole_numbers(option, text):
+    """The whole numbers of a list such as ``0-4,8``, each once, in order; `FlexarmError` for anything else."""
+    found = set()
+    for part in text.split(","):
+        first, _, last = part.strip().partition("-")
+        last = last or first
+        if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+            limit = "numbers and ranges of them, as 0-4,8"
+            raise FlexarmError("is no list of numbers", field=option, value=text, limit=limit)
+        found.update(range(int(first), int(last) + 1))
+    return sorted(found)
+
+
 def chosen(option, text, known):
     """The names in an option's text, each of which must be `known`."""
     names = [name.strip() for name in text.split(",")]

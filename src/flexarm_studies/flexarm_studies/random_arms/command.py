@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from .. import workers
-from ..commands.options import chosen
+from ..commands.options import at_least, chosen, whole_numbers
 from ..progress import Progress
 from ..uncertain.controllers import CONTROLLERS
 from ..uncertain.plants import VARIANTS
@@ -33,10 +33,13 @@ def add_arguments(parser):
     parser.epilog = (
         "examples:\n"
         "  flexarm arms --count 8 --controllers default,pid_zvd --variants 'exact,payload x1.3'\n"
-        "  flexarm arms --count 16 --files results/arms"
+        "  flexarm arms --count 16 --files results/arms\n"
+        "  flexarm arms --arms 0-4,8 --controllers designed_preview --out results/arms.jsonl"
     )
     add = parser.add_argument
-    add("--count", type=int, default=100, help="arms (100)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--count", type=int, default=100, help="arms (100)")
+    which.add_argument("--arms", metavar="NUMBERS", help="these arms of the seed alone: 0-4,8")
     add("--seed", type=int, default=0, help="of the arms and of the noise (0)")
     workers.add_arguments(add)
     usual, names = ",".join(USUAL), ", ".join(CONTROLLERS)
@@ -53,7 +56,9 @@ def add_arguments(parser):
         help="write every run; runs that are in it are not run again, so an interrupted command goes on",
     )
     add("--fresh", action="store_true", help="remove that file first: after a change of the code")
-    add("--write", metavar="FILE.md", help="write the table between the markers of this file")
+    add(
+        "--write", metavar="FILE.md", help="write the table between the seed's markers of this file"
+    )
     add(
         "--files",
         metavar="FOLDER",
@@ -63,8 +68,11 @@ def add_arguments(parser):
 
 def arms(options):
     """Run the sub-command."""
+    at_least("--seed", options.seed, 0)
+    at_least("--count", options.count, 1)
+    numbers = whole_numbers("--arms", options.arms) if options.arms else range(options.count)
     if options.files:
-        _write_files(options)
+        _write_files(options.seed, numbers, Path(options.files))
         return
     controllers = chosen("--controllers", options.controllers, CONTROLLERS)
     variants = chosen("--variants", options.variants, VARIANTS)
@@ -73,7 +81,7 @@ def arms(options):
     progress = Progress()
     rows = study.run(
         options.seed,
-        options.count,
+        numbers,
         controllers,
         variants,
         options.out,
@@ -87,10 +95,10 @@ def arms(options):
     print(report.text(rows, options.seed))
 
 
-def _write_files(options):
-    folder = Path(options.files)
+def _write_files(seed, numbers, folder):
     folder.mkdir(parents=True, exist_ok=True)
-    for arm in generator.arms(options.count, options.seed):
+    for number in numbers:
+        arm = generator.arm(number, seed)
         path = folder / f"{arm.name}.yaml"
         path.write_text(f"# --trajectory {arm.motion}\n{arm.text}", encoding="utf-8")
         print(path)

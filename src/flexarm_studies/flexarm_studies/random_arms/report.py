@@ -9,15 +9,22 @@ import numpy as np
 from .. import markdown
 from ..uncertain.controllers import BASELINES
 
-BEGIN, END = "<!-- random arms: begin -->", "<!-- random arms: end -->"
+#: Markers of a seed's table.
+BEGIN, END = "<!-- random arms, seed {}: begin -->", "<!-- random arms, seed {}: end -->"
 COLUMNS = (
-    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "joints at rest",
-    "no later than the best baseline", "peak joint error, median (worst)", "residual, median [1e-3 reach]",
+    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "periods until settled, median",
+    "joints at rest", "no later than the best baseline", "peak joint error, median (worst)",
+    "residual, median [1e-3 reach]",
 )  # fmt: skip
 DECAYS = (
     "designs", "arms", "worst-case decay, median of one link (wanted: 0.3)", "median of all (0.15)", "the least (0.05)",
     "below 0.05",
 )  # fmt: skip
+MISSES = (
+    "Arms that do not settle within three periods on every plant, or do not rest: periods until settled, and the"
+    " largest joint error at rest where it is more than wanted."
+)
+MISSED = "arm", "design", "decay"  # and the plants
 #: Least decay that is wanted of every design, over the first locked frequency [-].
 LEAST = 0.05
 #: Settling times closer than this are equal [s].
@@ -74,11 +81,49 @@ def _cells(group, best):
         count["lost"],
         len(settled),
         in_time,
+        _median_periods(group),
         sum(row["at_rest"] for row in works),
         no_later,
         f"{np.median(peaks):.2g}° ({max(peaks):.2g}°)" if peaks else None,
         f"{np.median(residual):.2g}" if residual else None,
     )
+
+
+def _median_periods(group):
+    """Locked periods until settled, in the median of all runs that were not refused, in words."""
+    periods = [_periods(row) for row in group if outcome(row) != "refused"]
+    if not periods:
+        return None
+    median = np.median(periods)
+    return f"{median:.2g}" if np.isfinite(median) else "never"
+
+
+def _periods(row):
+    """Locked periods until the tip of a run settled; infinite: it never did."""
+    return row["settling_periods"] if row.get("settled") else np.inf
+
+
+def missed(rows):
+    """Cells of the table of designs that did not settle in time everywhere: a row per arm and controller.
+
+    Of each variant the locked periods until settled; behind them the largest joint error at rest, where it is more than
+    is wanted.
+    """
+    designed = {row["controller"] for row in rows if "decay" in row}
+    groups = {}
+    for row in rows:
+        if row["controller"] in designed:
+            groups.setdefault((row["arm"], row["controller"]), []).append(row)
+    for (arm, controller), group in groups.items():
+        if any(_periods(row) > IN_TIME or not row.get("at_rest") for row in group):
+            yield arm, controller, group[0].get("decay"), *map(_in_words, group)
+
+
+def _in_words(row):
+    if outcome(row) != "works":
+        return outcome(row)
+    settled = f"{_periods(row):.2g}" if row["settled"] else "never"
+    return settled if row["at_rest"] else f"{settled} ({row['rest_joint_deg']:.2g}°)"
 
 
 def reasons(rows):
@@ -120,9 +165,12 @@ def text(rows, seed):
     designs = list(decays(rows))
     if designs:
         lines += ["", *markdown.table(DECAYS, designs)]
+        variants = dict.fromkeys(row["variant"] for row in rows)
+        lines += ["", MISSES, "", *markdown.table((*MISSED, *variants), missed(rows))]
     return "\n".join([*lines, "", *reasons(rows)])
 
 
 def write(rows, seed, file):
     """Put the table between the markers of a Markdown `file`."""
-    markdown.write_between(file, BEGIN, END, f"\n{text(rows, seed)}\n")
+    begin, end = (marker.format(seed) for marker in (BEGIN, END))
+    markdown.write_between(file, begin, end, f"\n{text(rows, seed)}\n")

@@ -8,7 +8,6 @@ line is older than the code.
 
 from dataclasses import dataclass
 
-from ..commands.options import at_least
 from ..store import Store, gather
 from ..uncertain.controllers import CONTROLLERS
 from ..uncertain.runs import key, rows
@@ -35,12 +34,16 @@ def job(seed, number, controller, variants):
     return [row | {"number": number} for row in found]
 
 
-def run(seed, count, controllers, variants, path=None, workers=None, progress=None, scheduler=None):
-    """Run arms 0 to count - 1 under all `controllers` in all `variants`.
+def run(
+    seed, numbers, controllers, variants, path=None, workers=None, progress=None, scheduler=None
+):
+    """Run the arms with these `numbers` under all `controllers` in all `variants`.
 
     Parameters
     ----------
-    seed, count : int
+    seed : int
+        0 or more.
+    numbers : sequence of int
     controllers, variants : sequence of str
     path : str or Path, optional
         File of rows, JSON lines; runs that are in it are not run again.
@@ -53,10 +56,8 @@ def run(seed, count, controllers, variants, path=None, workers=None, progress=No
     list of dict
         Rows by arm, controller and variant.
     """
-    for name, value, least in (("seed", seed, 0), ("count", count, 1)):
-        at_least(f"--{name}", value, least)
     keep, jobs = Store(path, Specification(seed)), []
-    for number in range(count):
+    for number in numbers:
         for controller in controllers:
             left = [v for v in variants if key(number, controller, v) not in keep.results]
             if left:
@@ -64,4 +65,4 @@ def run(seed, count, controllers, variants, path=None, workers=None, progress=No
     for done, (i, _) in enumerate(gather(keep, job, jobs, workers, scheduler), 1):
         if progress is not None:
             progress.step(f"arm {jobs[i][1]}: {jobs[i][2]}", done, len(jobs))
-    return [keep.results[key(n, c, v)] for n in range(count) for c in controllers for v in variants]
+    return [keep.results[key(n, c, v)] for n in numbers for c in controllers for v in variants]
