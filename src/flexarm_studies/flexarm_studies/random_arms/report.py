@@ -104,7 +104,7 @@ def _periods(row):
 
 
 def missed(rows):
-    """Cells of the table of designs that did not settle in time everywhere: a row per arm and controller.
+    """Cells of the table of the designs in `rows` that did not settle in time everywhere, per arm and controller.
 
     Of each variant the locked periods until settled; behind them the largest joint error at rest, where it is more than
     is wanted.
