@@ -133,7 +133,7 @@ class StrainFit:
     held, undetermined : tuple of str
         Kept on request or by default; not determined by the strains (those with a half-width have fitted values).
     alike : tuple of tuple of str
-        Combinations, of all quantities, held ones too, along which no strain changes.
+        Combinations along which no strain changes: of all quantities, held ones too, but where all of the arm is held.
     starts : tuple of float
         Sum of squares that each start ended with; the smallest went on.
     warnings : tuple of str
@@ -325,6 +325,8 @@ class StrainProblem:
 
     def jacobian(self, values, which):
         """Derivative of `residuals` by the quantities with the indices `which`, scaled, shape (s, g, len(which))."""
+        if not which.size:
+            return np.zeros((*self.measured.shape, 0))
         return self.of_derivatives(self.derivatives(values, which))
 
     def of_derivatives(self, D):
@@ -528,12 +530,13 @@ class StrainProblem:
 
     def leave_out_alike(self):
         """Name combinations along which no strain changes; of free ones one quantity keeps the file's value."""
-        everything = np.arange(len(self.found))
-        J = self.jacobian(self.values, everything).reshape(-1, everything.size)
+        looked_at = self._looked_at()
+        J = np.zeros((self.measured.size, len(self.found)))
+        J[:, looked_at] = self.jacobian(self.values, looked_at).reshape(-1, looked_at.size)
         size = np.linalg.norm(J, axis=0)
         self.alike = tuple(
             tuple(self.found[j].name for j in involved)
-            for involved in _null(J, size, everything)
+            for involved in _null(J[:, looked_at], size[looked_at], looked_at)
         )  # fmt: skip
         while self.free.any():
             which = np.flatnonzero(self.free)
@@ -544,6 +547,13 @@ class StrainProblem:
             names = ", ".join(self.found[j].name for j in combinations[0])
             alone = len(combinations[0]) == 1
             self.leave_out(least, "it changes no strain" if alone else f"{names} act alike")
+
+    def _looked_at(self):
+        """Indices of the quantities whose combinations are named: all of them, or the free ones of an arm that is held."""
+        held_by_user = held(self.found, self.options.hold)
+        parts = ("joints[", "links[", "payload.")
+        whole = all(q.name in held_by_user for q in self.found if q.name.startswith(parts))
+        return np.flatnonzero(self.free) if whole else np.arange(len(self.found))
 
     def leave_out(self, index, why):
         """Keep the file's value of a quantity, `why` in words."""
@@ -662,7 +672,7 @@ def _any(found, pattern):
 def _null(J, size, indices):
     """Combinations of columns of J, lists of `indices`, along which it does not change; `size` (p,) is of columns."""
     silent = size <= 1e-9 * max(size.max(initial=0.0), 1e-300)
-    if silent.any():
+    if silent.any() or not size.size:
         return [[int(j)] for j in indices[silent]]
     _, values, directions = np.linalg.svd(J / size, full_matrices=False)
     null = directions[values < SINGULAR * values[0]]
