@@ -549,7 +549,7 @@ class StrainProblem:
             self.leave_out(least, "it changes no strain" if alone else f"{names} act alike")
 
     def _looked_at(self):
-        """Indices of the quantities whose combinations are named: all, or the free ones where all of the arm is held."""
+        """Indices of the quantities whose combinations are named: all, or the free ones where the whole arm is held."""
         held_by_user = held(self.found, self.options.hold)
         parts = ("joints[", "links[", "payload.")
         whole = all(q.name in held_by_user for q in self.found if q.name.startswith(parts))
