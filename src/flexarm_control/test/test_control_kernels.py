@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, interp1d
 
 from flexarm_control import kernels
 from flexarm_control.manifold import expansion
@@ -21,6 +21,24 @@ def test_a_cubic_is_scipys_within_and_beyond_its_ends(t):
     out = np.empty(3)
     COMPILED.cubic(spline.c, spline.x, t, out)
     np.testing.assert_allclose(out, spline(t), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("t", [-1.0, 0.0, 0.3, 1.0, 1.7, 2.0, 5.0])
+def test_between_times_gains_are_linear_and_held_beyond_the_ends(t):
+    times, gains, out = np.array([0.0, 1.0, 2.0]), RNG.normal(size=(3, 2, 4)), np.zeros((2, 4))
+    COMPILED.between(times, gains, t, out)
+    wanted = interp1d(times, gains, axis=0)(np.clip(t, 0.0, 2.0))
+    np.testing.assert_allclose(out, wanted, rtol=1e-14, atol=1e-15)
+    COMPILED.between(times[:1], gains[:1], t, out)
+    np.testing.assert_array_equal(out, gains[0])
+
+
+@pytest.mark.parametrize("x", [0.0, 0.4, 1.0, 1.9, 2.0, 3.5])
+def test_between_rows_values_are_linear_and_the_last_one_is_held(x):
+    values, out = RNG.normal(size=(3, 2)), np.zeros(2)
+    COMPILED.evenly_between(values, x, out)
+    wanted = interp1d(np.arange(3.0), values, axis=0)(min(x, 2.0))
+    np.testing.assert_allclose(out, wanted, rtol=1e-14, atol=1e-15)
 
 
 def test_polynomials_are_numpys():

@@ -126,6 +126,17 @@ def test_on_its_reference_every_law_asks_for_the_references_acceleration(name, e
         assert_allclose(u, law.nominal(arm.terms(q, qd), ref.acceleration), atol=1e-7)
 
 
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_gives_the_same_torque_with_and_without_given_terms(name, every_size):
+    for arm in every_size:
+        q, qd, ref = some_state(arm.n_joints)
+        law, terms = law_of(name, arm), arm.terms(q, qd)
+        wanted, size = np.array(law.torque(q, qd, ref, terms)), 1e-12 * arm.terms(q, qd).M.max()
+        assert_allclose(law_of(name, arm).torque_at(q, qd, ref), wanted, rtol=1e-12, atol=size)
+        nominal = np.array(law.nominal(terms, ref.acceleration))
+        assert_allclose(law.nominal_at(q, qd, ref.acceleration), nominal, rtol=1e-12, atol=size)
+
+
 def test_a_parameter_of_one_name_is_declared_alike_in_all_slow_laws():
     seen = {}
     for law in registry.importable(SLOW).values():

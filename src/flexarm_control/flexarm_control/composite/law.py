@@ -229,8 +229,7 @@ class CompositeControl:
         if self.slow.separate:
             u[:], nominal = self.slow.feedback(q, qd, motion), self._no_torque
         else:
-            terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
-            u[:] = self.slow.torque(q, qd, motion, terms)
+            u[:] = self.slow.torque_at(q, qd, motion)
             nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
         kernels.compiled().about_motion(
             q, qd, motion.position, motion.velocity, motion.torque, nominal, self._response, motion.amplitude,
@@ -267,6 +266,6 @@ class CompositeControl:
         """The slow law's torque on a motion, (n,); what was asked for last is remembered."""
         motion = position.tobytes() + velocity.tobytes() + acceleration.tobytes()
         if motion != self._nominal[0]:
-            terms = self.model.terms(position, velocity)
-            self._nominal = motion, np.array(self.slow.nominal(terms, acceleration))
+            torque = self.slow.nominal_at(position, velocity, acceleration)
+            self._nominal = motion, np.array(torque)
         return self._nominal[1]

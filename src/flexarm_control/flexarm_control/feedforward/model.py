@@ -128,13 +128,9 @@ class Gains:
 
     def at(self, elapsed):
         """Gain at a time since the start [s]; held beyond either end."""
-        i = int(np.searchsorted(self.times, elapsed, side="right")) - 1
-        if i < 0:
-            return self.gains[0]
-        if i >= len(self.times) - 1:
-            return self.gains[-1]
-        f = (elapsed - self.times[i]) / (self.times[i + 1] - self.times[i])
-        return (1.0 - f) * self.gains[i] + f * self.gains[i + 1]
+        out = np.empty(self.gains.shape[1:])
+        kernels.compiled().between(self.times, self.gains, elapsed, out)
+        return out
 
 
 @dataclass(eq=False)
@@ -301,12 +297,17 @@ class ModelFeedforward(Feedforward):
         self._prepared, self._first = None, True
         self._ahead = None  # the result of `look_ahead`
         self._held = None  # position, and the result of `wanted` there, while the reference rests
+        self._begins = (
+            None,
+            False,
+        )  # a state that a path begins from, and whether the preparation's is that
 
     def _make_stepper(self):
         n, m = self.model.n_joints, self.model.n_modes
         self._advance = self.model.stepper(METHODS[METHOD])
         # Compiled code is loaded at its first call: not on the control path.
         self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
+        Gains(np.zeros(1), np.zeros((1, n, 2 * (n + m)))).at(0.0)
 
     def _name_parts(self):
         n, m = self.model.n_joints, self.model.n_modes
@@ -360,7 +361,7 @@ class ModelFeedforward(Feedforward):
     def take(self, plan, trajectory_id):
         if plan is not None:
             plan.trajectory_id = trajectory_id
-        self._prepared, self._ahead = plan, None
+        self._prepared, self._ahead, self._begins = plan, None, (None, False)
 
     def reset(self):
         self._first, self._ahead = True, None
@@ -368,7 +369,7 @@ class ModelFeedforward(Feedforward):
     def resume(self, other):
         if isinstance(other, ModelFeedforward):
             self._first, self._prepared = other._first, other._prepared
-            self._ahead = None
+            self._ahead, self._begins = None, (None, False)
             before = other._run.source
             if self._other_payload(other) and before is not None and before.rests:
                 self._first = (
@@ -388,7 +389,10 @@ class ModelFeedforward(Feedforward):
         followed = path.followed
         if followed.trajectory_id != prepared.trajectory_id:
             return None, 0.0
-        if np.abs(followed.begin_state - prepared.start).max() > SAME_START:
+        begin = followed.begin_state  # a path that begins anew has another array
+        if self._begins[0] is not begin:
+            self._begins = begin, np.abs(begin - prepared.start).max() <= SAME_START
+        if not self._begins[1]:
             return None, 0.0
         return prepared, path.elapsed(reference.stamp_ns)
 

@@ -81,16 +81,23 @@ class Plan:
 
     def torque_at(self, elapsed):
         """Torque (n,) at a time since the start [s]."""
-        x = elapsed / self.step
-        i = min(int(x), len(self.torque) - 2)
-        f = min(x - i, 1.0)
-        return (1.0 - f) * self.torque[i] + f * self.torque[i + 1]
+        out = np.empty(self.torque.shape[1])
+        kernels.compiled().evenly_between(self.torque, elapsed / self.step, out)
+        return out
 
 
 class Preview(ModelFeedforward):
     """The planned motion, while there is one; `model` otherwise. See the module."""
 
     plans = True
+
+    def _make_stepper(self):
+        super()._make_stepper()
+        n, size = self.model.n_joints, 2 * (self.model.n_joints + self.model.n_modes)
+        none = Plan(
+            1.0, CubicHermiteSpline([0.0, 1.0], *np.zeros((2, 2, size))), np.zeros((2, n)), 1.0
+        )
+        none.state_at(0.0), none.torque_at(0.0)
 
     def _plan(self, model, path, start):
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results

@@ -37,6 +37,13 @@ def about_motion(q, qd, position, velocity, torque, nominal, response, amplitude
         slow[i] += torque[i] - nominal[i] + value
 
 
+def wanted_acceleration(q, qd, position, velocity, acceleration, Lambda0, Lambda1, out):
+    """Fill `out` with v of (13) and (14): what the slow subsystem is to have; all (n,)."""
+    for i in range(q.size):
+        pull = Lambda0[i] * (q[i] - position[i]) + Lambda1[i] * (qd[i] - velocity[i])
+        out[i] = acceleration[i] + pull
+
+
 def deviation(delta, delta_d, delta_bar, rate_bar, quasi_steady, z_f):
     """Fill z_f = z - z_bar, (2m,), and `quasi_steady` with the deflections of z_bar, all (m,)."""
     m = quasi_steady.size
@@ -68,6 +75,31 @@ def cubic(coefficients, knots, t, out):
     for i in range(out.size):
         c = coefficients[:, low, i]
         out[i] = ((c[0] * s + c[1]) * s + c[2]) * s + c[3]
+
+
+def between(times, values, t, out):
+    """Fill `out`, (p, n), with `values`, (k, p, n), of `times`, (k,): linear between them, held beyond either end."""
+    low, high = 0, times.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if t < times[middle]:
+            high = middle
+        else:
+            low = middle
+    f = 0.0
+    if high > low:
+        f = min(max((t - times[low]) / (times[high] - times[low]), 0.0), 1.0)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = (1.0 - f) * values[low, i, j] + f * values[high, i, j]
+
+
+def evenly_between(values, x, out):
+    """Fill `out`, (n,), with `values`, (k, n), at a place x among the rows; linear between, the last one held."""
+    i = min(int(x), values.shape[0] - 2)
+    f = min(x - i, 1.0)
+    for j in range(out.size):
+        out[j] = (1.0 - f) * values[i, j] + f * values[i + 1, j]
 
 
 def off(state, left, own, error):

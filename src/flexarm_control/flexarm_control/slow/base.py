@@ -57,6 +57,14 @@ class SlowLaw(Law, ABC):
         """
         return slow_torque(terms, acceleration)
 
+    def nominal_at(self, q, qd, acceleration):
+        """As `nominal`, at joint positions and velocities, (n,) [rad], [rad/s], without their terms."""
+        return self.nominal(self.model.terms(q, qd), acceleration)
+
+    def torque_at(self, q, qd, reference):
+        """As `torque`, without the terms; a law that needs few of them takes less time for it."""
+        return self.torque(q, qd, reference, self.model.terms(q, qd))
+
     def feedback(self, q, qd, motion):
         """Torque beyond the `nominal` one on a `motion`, shape (n,) [N m]; of a `separate` law."""
         raise NotImplementedError

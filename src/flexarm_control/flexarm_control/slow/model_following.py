@@ -17,6 +17,7 @@ import numpy as np
 
 from flexarm_dynamics.singular_perturbation import slow_torque
 
+from .. import kernels
 from .base import KP, KV, SlowLaw
 
 
@@ -29,15 +30,23 @@ class ModelFollowing(SlowLaw):
         super().__init__(model, parameters)
         self.Lambda0 = -np.array(self.parameters["kp"])
         self.Lambda1 = -np.array(self.parameters["kv"])
+        self._v = np.zeros(model.n_joints)
 
     def error_gains(self):
         return -self.Lambda0, -self.Lambda1
 
     def torque(self, q, qd, reference, terms):
-        u_hat = (
-            reference.acceleration
-            - self.Lambda0 * reference.position
-            - self.Lambda1 * reference.velocity
-        )
-        v = self.Lambda0 * q + self.Lambda1 * qd + u_hat
-        return slow_torque(terms, v)
+        return slow_torque(terms, self._wanted(q, qd, reference))
+
+    def torque_at(self, q, qd, reference):
+        return self.model.slow_torque(q, qd, self._wanted(q, qd, reference))
+
+    def nominal_at(self, q, qd, acceleration):
+        return self.model.slow_torque(q, qd, acceleration)
+
+    def _wanted(self, q, qd, reference):
+        """v, the acceleration that the slow subsystem is to have, (n,) [rad/s^2]; overwritten by the next call."""
+        kernels.compiled().wanted_acceleration(
+            q, qd, reference.position, reference.velocity, reference.acceleration, self.Lambda0, self.Lambda1, self._v
+        )  # fmt: skip
+        return self._v

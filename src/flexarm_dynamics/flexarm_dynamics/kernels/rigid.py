@@ -34,23 +34,28 @@ def solve(A, b):
 
 def slow_torque(M, f1, f2, K1, K2, acceleration):
     """Torque that gives the slow subsystem an acceleration, (n,), from the terms of (2)."""
+    torque = np.empty(f1.size)
+    fill_slow_torque(M, f1, f2, K1, K2.copy(), acceleration, torque)
+    return torque
+
+
+def fill_slow_torque(M, f1, f2, K1, K2, acceleration, torque):
+    """As `slow_torque`, into `torque`, (n,); K2 is overwritten, and of M the first n columns are taken."""
     n, m = f1.size, f2.size
-    torque = np.empty(n)
     for i in range(n):
         value = f1[i]
         for j in range(n):
             value += M[i, j] * acceleration[j]
         torque[i] = value
     if not K1.any():
-        return torque
-    bent, stiffness = np.empty(m), K2.copy()
+        return
+    bent = np.empty(m)
     for i in range(m):
         value = f2[i]
         for j in range(n):
             value += M[n + i, j] * acceleration[j]
         bent[i] = value
-    solve(stiffness, bent)
+    solve(K2, bent)
     for i in range(n):
         for j in range(m):
             torque[i] -= K1[i, j] * bent[j]
-    return torque

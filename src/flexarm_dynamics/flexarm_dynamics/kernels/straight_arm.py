@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import chain, load, symbols, tape
+from . import chain, load, rigid, symbols, tape
 from .duals import Dual
 
 #: Constants that the forces of a straight arm at the first order do not depend on.
@@ -53,11 +53,11 @@ class Record(NamedTuple):
 @cache
 def kernel():
     """The compiled `tape`."""
-    return load.joined("tape", (load.source(tape),), inline=("run",))
+    return load.joined("tape", (load.source(rigid), load.source(tape)), inline=("run", "solve"))
 
 
-class Tape:
-    """Terms of one arm.
+class _Tape:
+    """A record with the constants of one arm in its work space.
 
     Parameters
     ----------
@@ -68,9 +68,12 @@ class Tape:
     friction : ndarray, shape (n, 3)
     """
 
+    #: Names of `_outputs` that are recorded.
+    WANTED = ()
+
     def __init__(self, data, work, friction):
         pattern, constants = _pattern(data)
-        record = self._record = _record(pattern, _Structure(data, work))
+        record = self._record = _record(pattern, _Structure(data, work), self.WANTED)
         self._run, self._friction = kernel(), friction
         v = self._v = np.zeros(record.size)
         v[2 : 2 + len(constants)] = constants
@@ -80,6 +83,12 @@ class Tape:
         self._run.run(v, first, record.places[:known], record.signs[:known])
         self._n = data.links
         self._m = int(data.count.sum()) + int((data.spring >= 0).sum())
+
+
+class Terms(_Tape):
+    """Terms of one arm; parameters as of `_Tape`."""
+
+    WANTED = ("forces", "K", "C", "M")
 
     def __call__(self, q, qd):
         """Forces (n + m,), K and C (n + m, m), M (n + m, n + m) at q, qd (n,); each call has arrays of its own."""
@@ -96,6 +105,24 @@ class Tape:
             out[C:M].reshape(size, m),
             out[M:].reshape(size, size),
         )
+
+
+class SlowTorque(_Tape):
+    """Torque of the slow subsystem of one arm; parameters as of `_Tape`."""
+
+    WANTED = ("forces", "K", "M1")
+
+    def __init__(self, data, work, friction):
+        super().__init__(data, work, friction)
+        self._values = np.empty(self._record.outputs.size)
+
+    def __call__(self, q, qd, acceleration):
+        """Torque (n,) for an acceleration at q, qd, (n,) each."""
+        r = self._record
+        return self._run.slow_torque_at(
+            self._v, r.inputs, r.counts, r.places, r.signs, r.functions, r.outputs, self._friction, q, qd, acceleration,
+            self._m, self._values,
+        )  # fmt: skip
 
 
 class _Structure:
@@ -143,8 +170,8 @@ def _pattern(data):
 
 
 @lru_cache(64)
-def _record(pattern, structure):
-    """The `Record` of a structure."""
+def _record(pattern, structure, wanted):
+    """The `Record` of a structure for the `wanted` names of `_outputs`."""
     data, graph, fields, first, place = structure.data, symbols.Graph(), {}, {}, 0
     for name in _floats(data):
         shape = getattr(data, name).shape
@@ -156,11 +183,12 @@ def _record(pattern, structure):
             field[i], place = number, place + 1
         fields[name] = field.reshape(shape)
     outputs = _outputs(data._replace(**fields), fields, structure.work, graph)
-    return _assembled(graph, outputs, place, data.links)
+    chosen = [value for name in wanted for value in outputs[name]]
+    return _assembled(graph, chosen, place, data.links)
 
 
 def _outputs(data, fields, work, graph):
-    """Forces, K, C and M, one after the other, as symbols; `fields` are the names of the constants in `data`."""
+    """Forces, K, C, M and M1, its first n columns, as lists of symbols; `fields` names the constants in `data`."""
     n = data.links
     m = int(data.count.sum()) + int((data.spring >= 0).sum())
     q, qd = graph.inputs("q", n), graph.inputs("v", n)
@@ -177,7 +205,13 @@ def _outputs(data, fields, work, graph):
     for i in range(n + m):
         M[i, :i] = M[:i, i]
     K, C = ([f.slopes.get(j + k, 0.0) for f in forces for j in range(m)] for k in (0, m))
-    return [f.value for f in forces] + K + C + M.ravel().tolist()
+    return {
+        "forces": [f.value for f in forces],
+        "K": K,
+        "C": C,
+        "M": M.ravel().tolist(),
+        "M1": M[:, :n].ravel().tolist(),
+    }
 
 
 def _duals(array):
@@ -197,13 +231,17 @@ def _assembled(graph, outputs, constants, joints):
     """The `Record` that computes `outputs` of a graph with so many constants and joints."""
     layout = _Layout(graph, outputs, constants, joints)
     work, angles, place = layout.work, layout.angles, layout.place
+    size = layout.first + len(work)
+    small = np.min_scalar_type(
+        max(size, 256)
+    )  # a sample reads all of it: what is half as long is read sooner
     return Record(
-        size=layout.first + len(work),
+        size=size,
         inputs=layout.inputs,
         numbers=tuple((place, number) for number, place in layout.numbers.items()),
         counts=np.array([*layout.counts, layout.first], np.int64),
-        places=np.array([[place(o) for o in parts[:3]] for _, parts in work], np.int32).reshape(-1, 3),
-        signs=np.array([parts[3:] for _, parts in work], float).reshape(-1, 2),
+        places=np.array([[place(o) for o in parts[:3]] for _, parts in work], small).reshape(-1, 3),
+        signs=np.array([parts[3:] for _, parts in work], np.int8).reshape(-1, 2),
         functions=np.array([[place(a), place(o), kind] for o, a, kind in angles], np.int32).reshape(-1, 3),
         outputs=np.array([place(o) for o in outputs], np.int32),
     )  # fmt: skip

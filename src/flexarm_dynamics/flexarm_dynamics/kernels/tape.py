@@ -2,7 +2,7 @@
 r"""Evaluates recorded operations one after the other: close to compiled straight-line code, and nothing to compile.
 
 Each operation is one of the same kind, :math:`v_i = s\,v_a v_b + t\,v_c`, so that there is no branch to be
-mispredicted. See `straight_arm`, which records them.
+mispredicted. See `straight_arm`, which records them; `fill_slow_torque` is that of `rigid`.
 """
 
 import numpy as np
@@ -65,3 +65,40 @@ def evaluate(v, inputs, counts, places, signs, functions, outputs, friction, q, 
         out[i] += friction[i, 0] * qd[i]
         if friction[i, 1] != 0.0:
             out[i] += friction[i, 1] * np.tanh(qd[i] / friction[i, 2])
+
+
+def slow_torque_at(
+    v,
+    inputs,
+    counts,
+    places,
+    signs,
+    functions,
+    outputs,
+    friction,
+    q,
+    qd,
+    acceleration,
+    modes,
+    values,
+):
+    """Torque that gives the slow subsystem an acceleration at joint positions and velocities, (n,).
+
+    Parameters
+    ----------
+    v, inputs, counts, places, signs, functions, outputs, friction, q, qd
+        As of `evaluate`.
+    acceleration : ndarray, shape (n,)
+    modes : int
+        m.
+    values : ndarray, shape ((n + m) (1 + m + n),)
+        Overwritten by what the tape gives: forces, K, and the first n columns of M.
+    """
+    evaluate(v, inputs, counts, places, signs, functions, outputs, friction, q, qd, values)
+    n = q.size
+    size = n + modes
+    K = values[size : size * (1 + modes)].reshape(size, modes)
+    M = values[size * (1 + modes) :].reshape(size, n)
+    torque = np.empty(n)
+    fill_slow_torque(M, values[:n], values[n:size], K[:n], K[n:], acceleration, torque)  # noqa: F821
+    return torque

@@ -305,9 +305,23 @@ class Chain(ArmModel):
         """Terms of the straight arm, recorded: control laws ask for them at every sample; None where there is none."""
         if not self._compiled or self.data.level != chain_data.FIRST_ORDER:
             return None
-        return straight_arm.Tape(
-            self.data, lambda dtype: work_space(self.data, dtype), self.friction_table()
-        )
+        return self._recorded(straight_arm.Terms)
+
+    def _recorded(self, kind):
+        return kind(self.data, lambda dtype: work_space(self.data, dtype), self.friction_table())
+
+    @cached_property
+    def _slow_tape(self):
+        """The torque of the slow subsystem, recorded; None where there are no recorded terms, or others are added."""
+        if self._tape is None or self._transmissions or self._slips:
+            return None
+        return self._recorded(straight_arm.SlowTorque)
+
+    def slow_torque(self, q, qd, acceleration):
+        if self._slow_tape is None:
+            return super().slow_torque(q, qd, acceleration)
+        q, qd = self._joint(q, "q"), self._joint(qd, "qd")
+        return self._slow_tape(q, qd, self._joint(acceleration, "acceleration"))
 
     def derivative(self, state, torque):
         n, m = self.n_joints, self.n_modes

@@ -20,6 +20,7 @@ from scipy.linalg import eigh
 from .. import registry
 from ..errors import ModelError, check_shape
 from ..kernels import vectors
+from ..singular_perturbation import slow_torque
 
 
 class Terms(NamedTuple):
@@ -96,6 +97,13 @@ class ArmModel(ABC):
         -------
         Terms
         """
+
+    def slow_torque(self, q, qd, acceleration):
+        """Torque (n,) that gives the slow subsystem (10) an acceleration at q, qd, (n,) each [N m].
+
+        As `singular_perturbation.slow_torque` of the `terms` there, without those that it does not need.
+        """
+        return slow_torque(self.terms(q, qd), acceleration)
 
     @abstractmethod
     def kinetic_energy(self, q, qd, delta, delta_d):
