@@ -285,8 +285,8 @@ LAWS = [
         (
             "model_following",
             "(13): a sign",
-            "v = self.Lambda0 * q + self.Lambda1 * qd + u_hat",
-            "v = self.Lambda0 * q - self.Lambda1 * qd + u_hat",
+            "self.Lambda1 = -np.array(",
+            "self.Lambda1 = np.array(",
         ),
         (
             "computed_torque",
