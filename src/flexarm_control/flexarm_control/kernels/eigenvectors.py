@@ -23,7 +23,7 @@ def eigenvectors(H, z):
     Parameters
     ----------
     H : ndarray, shape (N, N)
-        Zero below its first subdiagonal.
+        What is below its first subdiagonal counts as zero.
     z : complex
 
     Returns
@@ -67,3 +67,42 @@ def eigenvectors(H, z):
                 y[k], y[k + 1] = y[k + 1], y[k]
         y = unit(y)
     return x, y
+
+
+def pole_gradients(H, G, N, z, period, out):
+    r"""Fill `out` with the derivatives of the real parts of poles :math:`s = \ln(z)/h` by gains; see `robust.decay`.
+
+    Parameters
+    ----------
+    H : ndarray, shape (N, N)
+        Hessenberg form of F - G K N.
+    G : ndarray, shape (N, n)
+    N : ndarray, shape (k, N)
+        Both in its coordinates.
+    z : ndarray, shape (p,)
+        Eigenvalues.
+    period : float
+        h [s]
+    out : ndarray, shape (p, n, k)
+        Not finite where the matrix is singular to the last bit.
+    """
+    size, n, k = H.shape[0], G.shape[1], N.shape[0]
+    by_torque, by_measurement = np.zeros(n, np.complex128), np.zeros(k, np.complex128)
+    for p in range(z.size):
+        x, y = eigenvectors(H, z[p])
+        across = 0.0j
+        by_torque[:] = 0.0
+        for i in range(size):
+            left = np.conj(y[i])
+            across += left * x[i]
+            for j in range(n):
+                by_torque[j] += left * G[i, j]
+        for b in range(k):
+            total = 0.0j
+            for i in range(size):
+                total += N[b, i] * x[i]
+            by_measurement[b] = total
+        by_torque /= -period * z[p] * across
+        for a in range(n):
+            for b in range(k):
+                out[p, a, b] = (by_torque[a] * by_measurement[b]).real

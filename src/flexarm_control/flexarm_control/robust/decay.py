@@ -20,11 +20,10 @@ see.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import eigvals, hessenberg
+from scipy.linalg.lapack import dgehrd, dgehrd_lwork, dorghr, dorghr_lwork
 
 from ..kernels import compiled
 
@@ -58,49 +57,106 @@ class Wanted:
 def eigenvalues(loop, K):
     """The closed loop's matrix, and its eigenvalues in the upper half plane but for those of delays."""
     closed = loop.F - loop.G @ (K @ loop.N)
-    z = eigvals(closed, check_finite=False)
-    return closed, z[(np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)]
+    z = np.linalg.eigvals(closed)
+    return closed, z[_counted(z)]
 
 
-class Gradients:
-    """Derivatives of the real parts of a closed loop's poles by the gains.
+def _counted(z):
+    return (np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)
 
-    The eigenvectors are found by inverse iteration on the loop's Hessenberg form, made once for all of its poles.
+
+@lru_cache(maxsize=256)
+def _work(size):
+    """Sizes of LAPACK's work space for a matrix."""
+    return [int(query(size, 0, size - 1)[0]) for query in (dgehrd_lwork, dorghr_lwork)]
+
+
+def hessenberg(matrix):
+    """H and Q of a square matrix Q H Q^T, without the checks of scipy.linalg's: these cost more than the work.
+
+    What stands below H's first subdiagonal is not zero, and means nothing.
+    """
+    size = len(matrix)
+    reduced, own = _work(size)
+    H, tau, _ = dgehrd(matrix, 0, size - 1, lwork=reduced)
+    Q, _ = dorghr(H, tau, 0, size - 1, lwork=own)
+    return np.ascontiguousarray(H), Q
+
+
+class Poles:
+    """Poles of one closed loop, the largest v first.
 
     Parameters
     ----------
     loop : Loop
     closed : ndarray, shape (N, N)
         F - G K N.
+    z, s, asked : ndarray, shape (k,)
+        [-], [1/s], and d [1/s].
+    v : list of float
+        [-]
     """
 
-    def __init__(self, loop, closed):
-        self._loop, self._closed = loop, closed
+    def __init__(self, loop, closed, z, s=None, asked=None, v=None):
+        self.loop, self.z, self.s, self.asked, self.v = loop, z, s, asked, v
+        self._closed, self._known = closed, ()
 
     @cached_property
     def _reduced(self):
         """The Hessenberg form, and G and N in its coordinates."""
-        H, Q = hessenberg(self._closed, calc_q=True, check_finite=False)
-        return np.ascontiguousarray(H), Q.T @ self._loop.G, self._loop.N @ Q
+        H, Q = hessenberg(self._closed)
+        return H, Q.T @ self.loop.G, self.loop.N @ Q
 
-    def __call__(self, z):
-        """That of a pole z, shape of K; not finite where the matrix is singular to the last bit."""
-        H, G, N = self._reduced
-        right, left = compiled().eigenvectors(H, complex(z))
-        left = left.conj()
-        across = self._loop.period * complex(z) * (left @ right)
-        return np.outer(left @ G, (N @ right) * (-1.0 / across)).real
+    def gradients(self, count):
+        """Derivatives of the real part of the first `count` poles s by the gains, (count, n, 3n + 2m).
+
+        The eigenvectors are found by inverse iteration on the loop's Hessenberg form, made once for all of its poles.
+        Zero where the matrix is singular to the last bit.
+        """
+        if len(self._known) < count:
+            H, G, N = self._reduced
+            found = np.empty((count, G.shape[1], N.shape[0]))
+            compiled().pole_gradients(H, G, N, self.z[:count], self.loop.period, found)
+            finite = np.isfinite(found).all(axis=(1, 2))
+            self._known = found if finite.all() else np.where(finite[:, None, None], found, 0.0)
+        return self._known[:count]
 
 
-class Poles(NamedTuple):
-    """Poles of one loop, the largest v first."""
+class _Batch:
+    """Loops with equally many states, as stacks of matrices: one call finds the eigenvalues of all."""
 
-    loop: object
-    gradients: Gradients
-    z: np.ndarray  # (k,)
-    s: np.ndarray  # (k,) [1/s]
-    asked: np.ndarray  # d, (k,) [1/s]
-    v: np.ndarray  # (k,) [-]
+    def __init__(self, loops, at):
+        self.at = at  # their numbers
+        self.loops = [loops[k] for k in at]
+        self._F, self._G, self._N = (
+            np.array([getattr(loop, name) for loop in self.loops]) for name in "FGN"
+        )
+        self._period = np.array([loop.period for loop in self.loops])
+        self._fraction = np.array([loop.fraction for loop in self.loops])
+
+    def poles(self, K, wanted):
+        """`Poles` of each loop with its gains K (k, n, 3n + 2m)."""
+        closed = self._F - self._G @ (K @ self._N)
+        z = np.linalg.eigvals(closed)
+        counted = _counted(z)
+        row, z = np.nonzero(counted)[0], z[counted]
+        s = np.log(z) / self._period[row]
+        asked = wanted.decay(s, self._fraction[row])
+        v = s.real / asked
+        order = np.lexsort((-v, row))
+        z, s, asked, v = z[order], s[order], asked[order], v[order].tolist()
+        ends = np.cumsum(counted.sum(axis=1)).tolist()
+        for loop, matrix, a, b in zip(self.loops, closed, [0, *ends], ends, strict=False):
+            yield Poles(loop, matrix, z[a:b], s[a:b], asked[a:b], v[a:b])
+
+
+def _batches(loops):
+    """The `_Batch`es of some loops."""
+    sizes = [len(loop.F) for loop in loops]
+    return [
+        _Batch(loops, [k for k, size in enumerate(sizes) if size == one])
+        for one in sorted(set(sizes))
+    ]
 
 
 class Slowest:
@@ -134,39 +190,64 @@ class Slowest:
         """K that a loop has under scaled gains x."""
         return self.gains(x)
 
-    def values(self, x, loops=None):
-        """The `Poles` of each loop, or of these loops, under scaled gains x."""
-        found = []
-        for loop in self.loops if loops is None else loops:
-            closed, z = eigenvalues(loop, self.gains_of(loop, x))
-            s = np.log(z) / loop.period
-            asked = self.wanted.decay(s, loop.fraction)
-            v = s.real / asked
-            order = np.argsort(-v)
-            gradients = Gradients(loop, closed)
-            found.append(Poles(loop, gradients, z[order], s[order], asked[order], v[order]))
+    @cached_property
+    def _all(self):
+        return _batches(self.loops)
+
+    def values(self, x):
+        """The `Poles` of each loop under scaled gains x."""
+        return self._values(x, self._all, len(self.loops))
+
+    def _values(self, x, batches, count):
+        found = [None] * count
+        for batch in batches:
+            K = np.array([self.gains_of(loop, x) for loop in batch.loops])
+            for k, poles in zip(batch.at, batch.poles(K, self.wanted), strict=True):
+                found[k] = poles
         return found
 
-    def _slope(self, poles, i):
-        """Gradient of the v of pole i by the scaled gains; zero where none is found."""
-        with np.errstate(all="ignore"):
-            slope = poles.gradients(poles.z[i])[self.free] * (self._unit / poles.asked[i])
-        return slope if np.isfinite(slope).all() else np.zeros_like(slope)
+    def _slopes(self, poles, count):
+        """Gradients of the v of the first `count` poles by the scaled gains of the loop, (count, gains)."""
+        found = poles.gradients(count)[:, self.free]
+        return found * (self._unit / poles.asked[:count, None])
+
+    def _of_all(self, loop, slope):
+        """Gradient by x from that by a loop's own scaled gains."""
+        return slope
+
+    def _length(self, loop, slopes):
+        """Lengths of the gradients by x from those by a loop's own scaled gains, (..., gains)."""
+        return np.sqrt((slopes**2).sum(axis=-1))
 
     def worst(self, found):
         """The largest v of poles that gains move, with loop, s and the gradient by x; unmoved ones are passed over.
 
         `found` as `values` returns it. Returns v, gradient, loop, s, and the poles that were passed over.
         """
-        candidates = [(v, k, i) for k, one in enumerate(found) for i, v in enumerate(one.v[:MOST])]
-        candidates.sort(reverse=True)
-        unmoved = []
-        for v, k, i in candidates:
-            loop, s, slope = found[k].loop, found[k].s[i], self._slope(found[k], i)
-            if v > 1e-9 or np.linalg.norm(slope) > UNMOVED:
-                return v, slope, loop, s, unmoved
-            unmoved.append((loop, s))
-        return -np.inf, np.zeros(self.size), None, 0.0, unmoved
+        k, i, slope, unmoved = self._first_moved(found)
+        passed = [(found[k].loop, found[k].s[i]) for k, i in unmoved]
+        if slope is None:
+            return -np.inf, np.zeros(self.size), None, 0.0, passed
+        poles = found[k]
+        return poles.v[i], self._of_all(poles.loop, slope), poles.loop, poles.s[i], passed
+
+    def _first_moved(self, found):
+        """Numbers of loop and pole of the largest v that gains move, its gradient, and the numbers passed over."""
+        unmoved, at = [], [0] * len(found)
+        while True:
+            left = [
+                (poles.v[i], k)
+                for k, (poles, i) in enumerate(zip(found, at, strict=True))
+                if i < min(MOST, len(poles.v))
+            ]
+            if not left:
+                return None, None, None, unmoved
+            v, k = max(left)
+            i, at[k] = at[k], at[k] + 1
+            slope = self._slopes(found[k], i + 1)[i]
+            if v > 1e-9 or self._length(found[k].loop, slope) > UNMOVED:
+                return k, i, slope, unmoved
+            unmoved.append((k, i))
 
     def smooth(self, loops, width):
         r"""A smooth function of x above the largest v of some loops, and its gradient.
@@ -175,26 +256,24 @@ class Slowest:
 
         over all poles that gains move, of a `width` w: all that are near the largest have a say.
         """
+        batches = _batches(loops)
 
         def function(x):
             try:
-                found = self.values(x, loops)
-                worst, _, _, _, unmoved = self.worst(found)
+                found = self._values(x, batches, len(loops))
+                k, i, _, _ = self._first_moved(found)
+                worst = -np.inf if k is None else found[k].v[i]
                 w = width * max(1.0, abs(worst))
-                out = {(id(loop), s) for loop, s in unmoved}
                 total, slope = 0.0, np.zeros(x.size)
                 for poles in found:
-                    for i, value in enumerate(poles.v):
-                        if value < worst - 6.0 * w:
-                            break
-                        if (id(poles.loop), poles.s[i]) in out:
-                            continue
-                        g = self._slope(poles, i)
-                        if value < 0.0 and np.linalg.norm(g) < UNMOVED:
-                            continue
-                        weight = np.exp((value - worst) / w)
-                        total += weight
-                        slope += weight * g
+                    count = sum(value >= worst - 6.0 * w for value in poles.v)
+                    if not count:
+                        continue
+                    v, slopes = np.array(poles.v[:count]), self._slopes(poles, count)
+                    stays = (v < 0.0) & (self._length(poles.loop, slopes) < UNMOVED)
+                    weight = np.where(stays, 0.0, np.exp((v - worst) / w))
+                    total += weight.sum()
+                    slope += self._of_all(poles.loop, weight @ slopes)
             except (np.linalg.LinAlgError, ValueError):
                 return np.inf, np.zeros(x.size)
             return worst + w * np.log(total), slope / total
@@ -231,5 +310,8 @@ class SlowestScheduled(Slowest):
     def _split(self, x):
         return x.reshape(-1, self._unit.size)
 
-    def _slope(self, poles, i):
-        return np.outer(self._weights[id(poles.loop)], super()._slope(poles, i)).ravel()
+    def _of_all(self, loop, slope):
+        return np.outer(self._weights[id(loop)], slope).ravel()
+
+    def _length(self, loop, slopes):
+        return np.linalg.norm(self._weights[id(loop)]) * super()._length(loop, slopes)

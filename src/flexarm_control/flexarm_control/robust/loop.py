@@ -7,11 +7,16 @@ beyond the file's leak into them. Rates are filtered derivatives with the corner
 `observer.joint_velocity_bandwidth`, as the observer computes them,
 
 .. math::
-    r_k = d_k + (r_{k-1} - d_k)\,e^{-\omega_c h}, \qquad d_k = (y_k - y_{k-1})/h,
+    r_k = d_k + (r_{k-1} - d_k)\,\kappa, \qquad d_k = (y_k - y_{k-1})/h, \qquad \kappa = e^{-\omega_c h} .
 
-the integral is that of the slow law, :math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. The
-feedback's torque passes two filters of first order with the corner of `slow.bandwidth` and `fast.bandwidth`
-(`flexarm_control.low_pass`). With the state X of all of this, and the control :math:`u = -K\,m`,
+Each is a filter of first order, with one state f in place of the two of the last sample,
+
+.. math:: r_k = f_{k-1} + \sigma y_k, \qquad f_k = \kappa r_k - \sigma y_k, \qquad \sigma = (1 - \kappa)/h :
+
+the poles are the same but for those at z = 0, and fewer states cost less. The integral is that of the slow law,
+:math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. The feedback's torque passes two filters of
+first order with the corner of `slow.bandwidth` and `fast.bandwidth` (`flexarm_control.low_pass`). With the state X of
+all of this, and the control :math:`u = -K\,m`,
 
 .. math:: X_{k+1} = F X_k + G u_k, \qquad m = N X = (q, r_q, -w, \hat\delta, r_\delta) .
 """
@@ -91,27 +96,25 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
     split = late > 1e-12
     under_way = whole + split
     poles = 0 if np.isinf(sampling.torque_corner) else POLES
-    # X = (s, y of the last sample, r of the last sample, -w of the last sample, the low pass, torques under way,
-    # newest last)
-    at_y, at_r, at_w, at_v = size, size + p, size + 2 * p, size + 2 * p + n
+    # X = (s, f of the last sample, -w, the low pass, torques under way, newest last); no filter for measured speeds.
+    measured = n if np.isinf(sampling.joint_corner) else 0
+    at_w = size + p - measured
+    at_v = at_w + n
     at_u = at_v + n * poles
     total = at_u + n * under_way
     rate = np.zeros((p, total))  # r_k
     slope = (1.0 - keep) / h
     rate[:, :size] = slope[:, None] * C
-    rate[:, at_y : at_y + p] = -np.diag(slope)
-    rate[:, at_r : at_r + p] = np.diag(keep)
-    if np.isinf(sampling.joint_corner):
-        rate[:n] = 0.0
-        rate[:n, n + mp : size] = encoder_rows(plant)
-    integral = np.zeros((n, total))  # -w_k
-    integral[:, at_w : at_w + n] = np.eye(n)
-    integral[:, at_y : at_y + n] = h * np.eye(n)
+    rate[measured:, size:at_w] = np.eye(p - measured)
     F, G = np.zeros((total, total)), np.zeros((total, n))
     F[:size, :size] = sampled(A, B, h)[0]
-    F[at_y : at_y + p, :size] = C
-    F[at_r : at_r + p] = rate
-    F[at_w : at_w + n] = integral
+    F[size:at_w] = (keep[:, None] * rate)[measured:]
+    F[size:at_w, :size] -= (slope[:, None] * C)[measured:]
+    F[at_w:at_v, at_w:at_v] = np.eye(n)
+    F[at_w:at_v, :size] = h * C[:n]
+    if measured:
+        rate[:n] = 0.0
+        rate[:n, n + mp : size] = encoder_rows(plant)
     later, end = sampled(A, B, h - late)
     # What the low pass gives now, of the state and of u.
     out, through = np.zeros((n, total)), np.eye(n)
@@ -146,7 +149,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
     N = np.zeros((3 * n + 2 * m, total))
     N[:n, :size] = C[:n]
     N[n : 2 * n] = rate[:n]
-    N[2 * n : 3 * n] = integral
+    N[2 * n : 3 * n, at_w:at_v] = np.eye(n)
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
     return Loop(name, F, G, N, h, fraction)

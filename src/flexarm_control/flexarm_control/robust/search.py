@@ -22,7 +22,7 @@ FIRST, MIDDLE, LAST = 80, 120, 320
 #: decay is within this factor of the least are asked this part from then on.
 TOGETHER, ROUNDS, NEAR, RELAXED = 120, 3, 1.15, 0.4
 #: Loops with more states get fewer evaluations.
-SIZE = 80
+SIZE = 65
 #: A width goes on for as long as it gains this fraction.
 GAIN = 0.02
 
