@@ -395,11 +395,17 @@ LAWS = [
         (
             "loop",
             "the integral",
-            "integral[:, at_y : at_y + n] = h",
-            "integral[:, at_y : at_y + n] = -h",
+            "F[at_w:at_v, :size] = h",
+            "F[at_w:at_v, :size] = -h",
         ),
         ("loop", "a late torque acts at once", "add(end, whole)", "add(end, 0)"),
-        ("decay", "the gradient's sign", "(-1.0 / across)", "(1.0 / across)"),
+        (
+            "decay",
+            "every set has all of the gradient",
+            "np.outer(self._weights[id(loop)], slope)",
+            "np.outer(np.ones(len(self._weights[id(loop)])), slope)",
+            TESTS + "test_schedule.py",
+        ),
         ("search", "the worst loops are not chosen", "if value > most and", "if value < most and"),
         (
             "decay",
@@ -417,6 +423,12 @@ LAWS = [
         ("tip", "the gains' sign", "np.linalg.solve(A - B @ K", "np.linalg.solve(A + B @ K"),
         ("trade", "each speed starts anew", "say, gains))", "say, None))"),
         ("tip", "settling looked for to 20 %", "SETTLED = 0.02", "SETTLED = 0.2"),
+    ),
+    *of(
+        "flexarm_control",
+        "kernels",
+        TESTS + "test_robust.py",
+        ("eigenvectors", "the gradient's sign", "by_torque /= -period", "by_torque /= period"),
     ),
     *of(
         "flexarm_control",
