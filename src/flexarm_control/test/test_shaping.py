@@ -207,6 +207,21 @@ def test_a_stop_in_the_middle_ends_on_the_way_without_ringing_and_no_harder_than
     assert own.stop(NOW + int((end + 0.1) * S)) is None
 
 
+@pytest.mark.parametrize("when", [0.1, 0.5, 0.9, 1.4])
+@pytest.mark.parametrize("settings", [{}, {"type": "retimed"}])
+def test_a_stop_keeps_limits_that_only_the_shaped_motion_keeps(when, settings):
+    own = shaper({"acceleration": [4.2]}, **settings)
+    assert np.abs(joined_given(there(3)).acceleration(np.linspace(0.0, 1.0, 500))).max() > 6.0
+    first = own.offer(there(3), NOW)
+    assert first.stretch == 1.0
+    stop = own.stop(NOW + round(when * S))
+    _, whole, end = commanded(own, first, when, stop)
+    t = np.linspace(0.0, end - when - 1e-9, 2000)
+    assert np.abs(whole.acceleration(t)).max() < 4.2 * (1.0 + 1e-2)
+    assert end < first.times_ns[-1] / S + 1e-6
+    assert when > 0.5 or whole.end[0] < 0.95
+
+
 def test_a_stop_of_lines_slows_down_as_well():
     own = shaper(type="zv")
     own.offer(there(1), NOW)
@@ -291,6 +306,12 @@ def test_the_robust_shaper_takes_out_two_modes_within_a_period_of_the_lower_one(
     assert found.residual(off, 0.01).max() < 0.12
     one = shapers.zvd(w[0], 0.01)
     assert one.residual(off, 0.01).max() > found.residual(off, 0.01).max()
+
+
+def test_without_a_type_a_motion_gets_longer_by_a_period_whatever_the_number_of_modes():
+    own = shaper(frequencies=[2.0, 7.0, 11.0])
+    assert own.modes.kind == "robust"
+    assert own.offer(there(3), NOW).added == pytest.approx(0.5, abs=1e-6)
 
 
 def test_a_stream_is_shaped_as_a_trajectory_is():

@@ -27,7 +27,7 @@ KINDS = (*SHAPERS, ROBUST, RETIMED, NONE)
 ALIKE = 0.02
 
 PARAMETERS = (
-    parameter("type", "zvd", choices=KINDS).described(
+    parameter("type", ROBUST, choices=KINDS).described(
         "Shaper: robust is optimal for the spread of all modes in shaper.periods; retimed gives straight motions from "
         "rest to rest a new time law, else it is robust; none passes motions as they are."
     ),

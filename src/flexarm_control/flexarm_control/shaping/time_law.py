@@ -61,6 +61,8 @@ ROUNDS = 3
 STRAIGHT = 1e-4
 #: A stop is given so many times what the largest acceleration needs, and `modes.periods`; longer by so much if needed.
 STOP, LONGER = 1.3, 1.3
+#: Within the limits a stop may accelerate so many times as much as the motion does [-].
+HARDER = 1.3
 #: Rounding of the speeds [-].
 SLACK = 1e-9
 #: A linear programme is given up after so many iterations, some 100 are usual: a count, so that a busy computer finds
@@ -145,7 +147,7 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf, plain=False):
     if not min(norm.min() for norm in norms) > 0.0:
         return None
     limits = [
-        min(own, float((np.asarray(limit) / np.maximum(np.abs(motion.angle), 1e-300)).min()))
+        min(own, _of_progress(motion, limit))
         for own, limit in zip(line.own, (velocity, acceleration), strict=True)
     ]
     law = Law(line, motion.duration + modes.periods / line.lowest, limits)
@@ -156,6 +158,11 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf, plain=False):
         x = law.solution(norms, sigma, _gentle(motion, modes))
         x = law.solution(norms, sigma) if x is None else x
     return None if x is None or law.worst(x, norms) > 1.0 else (law, norms, x)
+
+
+def _of_progress(motion, limits):
+    """Limits of the joints (n,) as one of the progress."""
+    return float((np.asarray(limits) / np.maximum(np.abs(motion.angle), 1e-300)).min())
 
 
 def _gentle(motion, modes):
@@ -183,7 +190,7 @@ def leaves(motion, modes):
     return Line(motion, modes, _progress(motion)).remains()
 
 
-def stopped(motion, modes, time):
+def stopped(motion, modes, time, acceleration=np.inf):
     """A motion of `retimed` up to a time, then to rest on its line: the stop takes out what was excited before.
 
     Parameters
@@ -192,6 +199,8 @@ def stopped(motion, modes, time):
     modes : Modes
     time : float
         [s]
+    acceleration : (n,) array_like
+        Limits [rad/s^2].
 
     Returns
     -------
@@ -204,9 +213,10 @@ def stopped(motion, modes, time):
     line = Line(motion, modes, progress)
     state = [float(progress(order, np.array([time]))[0]) for order in range(3)]
     norms = [np.full(FACTORS, line.own[1] / (2.0 * np.pi * line.lowest))] * line.modes_count
-    duration = STOP * state[1] / line.own[1] + modes.periods / line.lowest
+    bend = max(min(HARDER * line.own[1], _of_progress(motion, acceleration)), line.own[1])
+    duration = STOP * state[1] / bend + modes.periods / line.lowest
     while time + duration < motion.knots[-1]:
-        law = Law(line, duration, line.own, state, time)
+        law = Law(line, duration, (line.own[0], bend), state, time)
         x = law.solution(norms, np.full(law.middles.size, state[0]))
         if x is not None:
             states = law.states(x)

@@ -263,7 +263,7 @@ class TrajectoryShaper:
         """The motion that leaves no vibration, where another one takes over at `start` [s]; None: there is none."""
         if quick or self._quiet is None or self._quiet is not self._motion:
             return self._quiet
-        return time_laws.stopped(self._quiet, self.modes, start)
+        return time_laws.stopped(self._quiet, self.modes, start, self._acceleration)
 
     def _begin(self, before, start, times, fields, measured):
         """State (3, n) at which the trajectory begins."""
@@ -421,27 +421,34 @@ class TrajectoryShaper:
             return None
         start, motion, quiet = self._seconds(now_ns), self._motion, self._quiet
         if quiet is motion and quiet is not None and not quick:
-            quiet = stopped = time_laws.stopped(quiet, self.modes, start)
+            quiet = stopped = time_laws.stopped(quiet, self.modes, start, self._acceleration)
         elif start >= motion.knots[-1]:  # only the shaper's own delay is left
             stopped = motion
         else:
-            stopped = self._slowed(motion, start)
+            stopped = self._slowed(motion, quiet, start)
         last = stopped.knots[-1]
         return self._planned(stopped, quiet, self._epoch_ns, start, last, 1.0, fresh=False)
 
-    def _slowed(self, motion, start):
-        """The motion up to `start` [s], then along its own way to rest, no harder than allowed."""
+    def _slowed(self, motion, quiet, start):
+        """The motion up to `start` [s], then along its own way to rest, no harder than allowed.
+
+        Where the shaped motion can't stop earlier within its limits than it ends, it goes on as it is.
+        """
         ahead = np.linspace(start, motion.knots[-1], 200)
         speed, acceleration = (np.abs(motion.derivative(k, ahead)).max(axis=0) for k in (1, 2))
         own = np.maximum(STOP_ACCELERATION * acceleration, STOP_RATE * speed)
-        allowed = np.where(np.isfinite(self._acceleration), self._acceleration, own)
+        allowed = np.where(np.isfinite(self._acceleration), np.inf, own)
         duration = MIN_STOP
-        while True:
+        while start + duration < motion.knots[-1]:
             elapsed, states = _along(motion, start, duration)
             if (np.abs(states[2]) <= allowed * (1.0 + 1e-3) + 1e-9).all():
-                break
+                stopped = motion.then(
+                    PiecewiseMotion.through(start + elapsed, states[: motion.fields])
+                )
+                if self._excess(stopped, quiet, start) <= 1.0 + SPEED_ROUNDING:
+                    return stopped
             duration *= LONGER
-        return motion.then(PiecewiseMotion.through(start + elapsed, states[: motion.fields]))
+        return motion
 
     def _planned(self, motion, quiet, epoch_ns, begin, last, stretch, fresh):
         """Shape a whole motion, and write what is left of it from a time on."""
