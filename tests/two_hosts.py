@@ -23,7 +23,7 @@ from pathlib import Path
 
 from pyroute2 import IPRoute
 
-from flexarm_control.loop.supervisor import RUNNING, State
+from flexarm_control.loop.supervisor import State
 from flexarm_msgs.msg import JointTorque
 from flexarm_tools.running.processes import (
     NODES,
@@ -298,7 +298,7 @@ class Loop:
             if self.state == State.FAULT and time.monotonic() > again:
                 again = time.monotonic() + 1.0
                 self.desk.tell("recover")
-            return self.state in RUNNING
+            return State.READY <= self.state <= State.STOPPING
 
         self.wait_for("torque", running)
 

@@ -279,8 +279,8 @@ LAWS = [
         (
             "linear_model_following",
             "the inertia: factor",
-            "return self.B_inverse(terms) @ v\n",
-            "return 0.98 * self.B_inverse(terms) @ v\n",
+            "return self.B_inverse(terms) @ self._wanted(",
+            "return 0.98 * self.B_inverse(terms) @ self._wanted(",
         ),
         (
             "model_following",

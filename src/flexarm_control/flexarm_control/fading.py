@@ -13,6 +13,8 @@ hundredth is left after 8.4 / lambda: with lambda = `FADING` omega_1, after a ni
 
 import numpy as np
 
+from . import kernels
+
 #: lambda over the lowest bending frequency with locked joints.
 FADING = 12.0
 #: A jump is gone when this is left of it, in any coordinate and torque.
@@ -64,11 +66,7 @@ class Fading:
         """Go on by a time [s]."""
         if not self._active:
             return
-        c0, c1, c2 = self._c
-        c0 += dt * (c1 + dt * c2)
-        c1 += 2.0 * dt * c2
-        self._c *= np.exp(-self.rate * dt)
-        if np.abs(self._c).max() < GONE:
+        if kernels.compiled().faded(self._c, self.rate, dt) < GONE:
             self.clear()
 
     def jump(self, by):

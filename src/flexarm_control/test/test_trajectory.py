@@ -795,6 +795,25 @@ def test_near_is_the_stops_own_derivative():
         assert_allclose((later - earlier)[:2] / (2 * h), here[1:], atol=1e-5)
 
 
+def test_states_around_a_stamp_are_those_near_it():
+    held_still, moves, stops = (
+        held(),
+        following([(1, 1.0, 0.0, 0.0), (2, 0.0, 0.0, 0.0)], 0, 0.5),
+        moved(3, S),
+    )
+    for generator, stamps in (
+        (held_still, (S,)),
+        (moves, (S // 2, S, 3 * S)),
+        (stops, (S * 11 // 10,)),
+    ):
+        for stamp in stamps:
+            generator.sample(stamp)
+            found = np.empty((5, 3, generator.position.size))
+            generator.around(1e-3, found)
+            for i, state in enumerate(found):
+                assert_allclose(state, generator.near((i - 2) * 1e-3), rtol=1e-12, atol=1e-13)
+
+
 def test_the_stops_jerk_and_snap_are_continuous():
     generator = moved(3, S * 3 // 10, period=0.4)
     h, begin, end = 1e-3, S * 3 // 10, S * 3 // 10 + generator.path.duration_ns

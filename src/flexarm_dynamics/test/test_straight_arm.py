@@ -10,6 +10,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Transmission, scaled
 from flexarm_dynamics.kernels import straight_arm, symbols
 from flexarm_dynamics.kernels.duals import Dual
+from flexarm_dynamics.models import model
 from flexarm_dynamics.models.chain import Chain
 from flexarm_dynamics.singular_perturbation import slow_torque
 
@@ -118,3 +119,16 @@ def test_products_that_one_sum_needs_are_one_operation_with_it():
     run.evaluate(v_, record.inputs, *parts, np.array([0.3]), np.array([0.8]), out)
     wanted = [0.24 - 5 * np.cos(0.3), 0.8 - 0.3 * 24, -0.24 + 25, 4.0]
     np.testing.assert_allclose(out, wanted, rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", [*ARMS, "R", "one_link", "swung"])
+def test_terms_at_several_states_are_those_of_each(name):
+    swung = replace(arm_file.load("one_link"), gravity=(0.3, -9.81, 0.0))
+    own = {"swung": lambda: swung, **ARMS}
+    arm = model.build(own[name]() if name in own else arm_file.load(name))
+    motions = np.random.default_rng(5).uniform(-2.0, 2.0, (3, 3, arm.n_joints))
+    found = arm.terms_along(motions)
+    for i, (q, qd, _) in enumerate(motions):
+        for mine, its in zip(found, arm.terms(q, qd), strict=True):
+            assert mine[i].shape == its.shape
+            np.testing.assert_allclose(mine[i], its, rtol=1e-12, atol=1e-13)

@@ -43,7 +43,7 @@ from ..arrays import some
 from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..fast.pole_placement import PolePlacement, reaches
-from ..trajectory.path import Path
+from ..trajectory.path import Path, around
 from ..trajectory.values import SECOND
 from .base import Feedforward
 
@@ -252,15 +252,19 @@ class At:
 
     def __init__(self, path, stamp_ns, offset=0.0):
         self.path, self.stamp_ns, self._offset = path, stamp_ns, offset
-        state = np.zeros((3, path.begin_state.shape[1]))
+        state = self._state = np.empty((3, path.begin_state.shape[1]))
         path.near(stamp_ns, offset, state)
         self.position, self.velocity, self.acceleration = state
-        self._near = np.zeros_like(state)
 
     def near(self, offset):
-        """State (position, velocity, acceleration), (3, n), at an `offset` [s] from there; overwritten by the next."""
-        self.path.near(self.stamp_ns, self._offset + offset, self._near)
-        return self._near
+        """State (position, velocity, acceleration), (3, n), at an `offset` [s] from there."""
+        state = np.empty_like(self._state)
+        self.path.near(self.stamp_ns, self._offset + offset, state)
+        return state
+
+    def around(self, step, out):
+        """Fill `out` (p, 3, n) with states at offsets `step` [s] apart; the middle one is from there, as of `near`."""
+        around(self.path, self.stamp_ns, self._offset, step, out)
 
 
 class _Ahead(At):

@@ -102,6 +102,21 @@ def evenly_between(values, x, out):
         out[j] = (1.0 - f) * values[i, j] + f * values[i + 1, j]
 
 
+def faded(c, rate, dt):
+    """Advance (c0 + c1 t + c2 t^2) e^(-rate t), coefficients c (3, n), by a time; their largest magnitude then."""
+    decay, largest = np.exp(-rate * dt), 0.0
+    for i in range(c.shape[1]):
+        c0, c1, c2 = c[0, i], c[1, i], c[2, i]
+        c[0, i] = decay * (c0 + dt * (c1 + dt * c2))
+        c[1, i] = decay * (c1 + 2.0 * dt * c2)
+        c[2, i] = decay * c2
+        for k in range(3):
+            size = abs(c[k, i])
+            if size > largest or size != size:  # NaN stays
+                largest = size
+    return largest
+
+
 def off(state, left, own, error):
     """Fill `error`, (N,), with what a simulated arm's state lacks to the one wanted, its fading jump included.
 
@@ -151,6 +166,12 @@ def horner(coefficients, x, out):
             for k in range(coefficients.shape[0] - 2, -1, -1):
                 value = value * x + coefficients[k, i, j]
             out[i, j] = value
+
+
+def horners(coefficients, x, step, out):
+    """Fill `out`, (k, p, n), with polynomials as of `horner` at k places, `step` apart; the middle one is x."""
+    for i in range(out.shape[0]):
+        horner(coefficients, x + (i - out.shape[0] // 2) * step, out[i])
 
 
 def weights_between(q, at, joints, weights):

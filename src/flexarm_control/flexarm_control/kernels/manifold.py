@@ -13,7 +13,7 @@ def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1, out, torque):
         From one point to the next [s].
     order : int
         In mu.
-    M, f2, C2, K2 : tuple of p ndarray, shapes (n + m, n + m), (m,), (m, m), (m, m)
+    M, f2, C2, K2 : ndarray, shapes (p, n + m, n + m), (p, m), (p, m, m), (p, m, m)
         Of (2) at each point, without deflections.
     acceleration : ndarray, shape (p, n)
         Of the joints [rad/s^2].
@@ -24,15 +24,15 @@ def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1, out, torque):
     torque : ndarray, shape (2, n)
         Filled with the torque of the whole motion, and with the bending's beyond order 0 [N m].
     """
-    points, n, m = len(M), f1.size, out.shape[1]
+    points, n, m = M.shape[0], f1.size, out.shape[1]
     centre = points // 2
     zero, higher = np.zeros((points, m)), np.zeros((points, m))
     speed, bend = np.zeros(m), np.zeros(m)
     for i in range(points):
         for a in range(m):
-            zero[i, a] = f2[i][a]
+            zero[i, a] = f2[i, a]
             for j in range(n):
-                zero[i, a] += M[i][n + a, j] * acceleration[i, j]
+                zero[i, a] += M[i, n + a, j] * acceleration[i, j]
         solve(K2[i].copy(), zero[i])  # noqa: F821
         for a in range(m):
             zero[i, a] = -zero[i, a]
@@ -51,7 +51,7 @@ def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1, out, torque):
             for a in range(m):
                 higher[i, a] = 0.0
                 for b in range(m):
-                    higher[i, a] += M[i][n + a, n + b] * bend[b] + C2[i][a, b] * speed[b]
+                    higher[i, a] += M[i, n + a, n + b] * bend[b] + C2[i, a, b] * speed[b]
             solve(K2[i].copy(), higher[i])  # noqa: F821
             for a in range(m):
                 higher[i, a] = zero[i, a] - higher[i, a]
@@ -64,9 +64,9 @@ def expanded(step, order, M, f2, C2, K2, acceleration, f1, C1, K1, out, torque):
     for j in range(n):
         whole, beyond = f1[j], 0.0
         for i in range(n):
-            whole += M[centre][j, i] * acceleration[centre, i]
+            whole += M[centre, j, i] * acceleration[centre, i]
         for a in range(m):
-            inertia = M[centre][j, n + a] * out[2, a] + C1[j, a] * out[1, a]
+            inertia = M[centre, j, n + a] * out[2, a] + C1[j, a] * out[1, a]
             whole += inertia + K1[j, a] * out[0, a]
             beyond += inertia + K1[j, a] * (out[0, a] - zero[centre, a])
         torque[0, j], torque[1, j] = whole, beyond

@@ -6,7 +6,7 @@ import numpy as np
 from flexarm_dynamics.errors import DesignError, FlexarmError, MessageError, TrajectoryError
 from flexarm_dynamics.parameters import parameter
 
-from ..arrays import finite
+from ..arrays import finite, some
 from ..payload import estimator
 from ..payload.estimator import PayloadEstimator
 from ..trajectory import ReferenceGenerator, Streaming, Verdict, refuse_torque, streams, validate
@@ -435,15 +435,15 @@ class ArmController:
         if reference.path is not self._expected:
             self._expect(reference.path)
         q, qd = sample.position, sample.velocity
-        np.subtract(reference.position, q, out=self.position_error)
-        np.subtract(reference.velocity, qd, out=self.velocity_error)
+        np.subtract(reference.position, q, self.position_error)
+        np.subtract(reference.velocity, qd, self.velocity_error)
         law.fast_fraction = self._fast_fraction(law.fast_fraction, dt)
         try:
             u = law.step(q, qd, sample.amplitude, sample.rate, reference, dt)
         except Exception as error:  # a user's law may raise anything: no torque then
             self.fail(f"the control law failed: {type(error).__name__}: {error}")
             return False
-        if reference.effort.any():
+        if some(reference.effort):
             u = u + reference.effort
         if not (u.dot(u) < np.inf or np.isfinite(u).all()):
             i = int(np.argmin(np.isfinite(u)))
@@ -480,6 +480,8 @@ class ArmController:
 
     def _fast_fraction(self, fraction, dt):
         """Fraction of the fast torque that is applied: it follows `enable_fast` in a ramp."""
+        if fraction == self.fast_enabled:
+            return fraction
         goal, step = float(self.fast_enabled), dt / FAST_RAMP
         return min(max(goal, fraction - step), fraction + step)
 

@@ -91,8 +91,8 @@ class State(IntEnum):
     FAULT = 5
 
 
-#: With torque.
-RUNNING = frozenset((State.READY, State.TRACKING, State.HOLDING, State.STOPPING))
+#: With torque: from the first to the last of these.
+FIRST_RUNNING, LAST_RUNNING = State.READY, State.STOPPING
 
 
 class Supervisor:
@@ -208,7 +208,7 @@ class Supervisor:
     @property
     def running(self):
         """Whether there is torque."""
-        return self.state in RUNNING
+        return FIRST_RUNNING <= self.state <= LAST_RUNNING
 
     def wait(self, reason):
         """No torque, until the next valid state; a fault stays one."""

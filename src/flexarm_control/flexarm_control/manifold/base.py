@@ -14,6 +14,16 @@ from .expansion import expand, reach, step
 SMALL = 1e-5
 
 
+def around(reference, step, out):
+    """Fill `out`, (p, 3, n), with a reference's states at p offsets, `step` [s] apart; that of the middle one is 0."""
+    if hasattr(reference, "around"):
+        reference.around(step, out)
+        return
+    centre = len(out) // 2
+    for i, state in enumerate(out):
+        state[:] = reference.near((i - centre) * step)
+
+
 class Manifold(Component, ABC):
     """Deflections z_bar that go with the slow motion, and the torque that goes with them beyond the slow law's.
 
@@ -74,12 +84,9 @@ class Manifold(Component, ABC):
 
     def _of_reference(self, reference):
         """The `Expansion` of the reference at present."""
-        far, h = reach(self.order), step(self.order)
-        terms, accelerations = [], np.empty((2 * far + 1, self.model.n_joints))
-        for i in range(2 * far + 1):
-            position, velocity, accelerations[i] = reference.near((i - far) * h)
-            terms.append(self.model.terms(position, velocity))
-        return expand(terms, accelerations, self.order)
+        motions = np.empty((2 * reach(self.order) + 1, 3, self.model.n_joints))
+        around(reference, step(self.order), motions)
+        return expand(self.model.terms_along(motions), motions[:, 2], self.order)
 
     def error_response(self, q):
         """How a tracking error moves the manifold and its feed-forward, linearised at rest in q.

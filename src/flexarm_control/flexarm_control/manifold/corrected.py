@@ -63,17 +63,16 @@ class CorrectedManifold(Manifold):
     def update(self, q, qd, reference, terms, slow_torque):
         here = slow_acceleration(terms, slow_torque)
         error = np.concatenate([reference.position - q, reference.velocity - qd])
-        extra, points = here - reference.acceleration, []
-        accelerations = np.empty((2 * self._reach + 1, here.size))
-        for i in range(len(accelerations)):
+        extra, motions = (
+            here - reference.acceleration,
+            np.empty((2 * self._reach + 1, 3, here.size)),
+        )
+        for i, motion in enumerate(motions):
             if i == self._reach:
-                points.append(terms)
-                accelerations[i] = here
-                continue
-            motion = self._motion(i - self._reach, reference, error, extra)
-            points.append(self.model.terms(motion[0], motion[1]))
-            accelerations[i] = motion[2]
-        found = expand(points, accelerations, self.order)
+                motion[:] = q, qd, here
+            else:
+                motion[:] = self._motion(i - self._reach, reference, error, extra)
+        found = expand(self.model.terms_along(motions), motions[:, 2], self.order)
         self.amplitude[:], self.rate[:] = found.delta, found.rate
         self.feedforward[:] = found.beyond
 

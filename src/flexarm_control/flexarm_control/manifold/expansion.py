@@ -47,17 +47,17 @@ def expand(terms, accelerations, order):
 
     Parameters
     ----------
-    terms : sequence of Terms
-        Of (2) without deflections, at the points of the slow motion, `step` apart; `reach` on either side.
-    accelerations : ndarray, shape (len(terms), n)
+    terms : Terms
+        Of (2) without deflections, at the points of the slow motion, `step` apart, with a leading axis; `reach` on
+        either side.
+    accelerations : ndarray, shape (p, n)
         Of the joints [rad/s^2].
     order : int
         In mu.
     """
-    here = terms[len(terms) // 2]
-    out, torque = np.empty((3, here.f2.size)), np.empty((2, here.n))
-    M, _, f2, _, C2, _, K2 = zip(*terms, strict=True)
+    t, centre = terms, len(terms.M) // 2
+    out, torque = np.empty((3, t.f2.shape[1])), np.empty((2, t.f1.shape[1]))
     kernels.compiled().expanded(
-        step(order), order, M, f2, C2, K2, accelerations, here.f1, here.C1, here.K1, out, torque
-    )
+        step(order), order, t.M, t.f2, t.C2, t.K2, accelerations, t.f1[centre], t.C1[centre], t.K1[centre], out, torque
+    )  # fmt: skip
     return Expansion(*out, *torque)

@@ -16,6 +16,7 @@ import numpy as np
 from flexarm_dynamics.parameters import parameter
 from flexarm_dynamics.singular_perturbation import slow_subsystem
 
+from .. import kernels
 from .base import KP, KV, SlowLaw
 
 
@@ -34,6 +35,7 @@ class LinearModelFollowing(SlowLaw):
         super().__init__(model, parameters)
         self.kp = np.array(self.parameters["kp"])
         self.kv = np.array(self.parameters["kv"])
+        self._pull, self._damp, self._v = -self.kp, -self.kv, np.zeros(model.n_joints)
         self.printed = self.parameters["gain"] == "h11"
         self._cached = (None, None, None)
 
@@ -62,9 +64,24 @@ class LinearModelFollowing(SlowLaw):
     def error_gains(self):
         return None if self.printed else (self.kp, self.kv)
 
+    def nominal_at(self, q, qd, acceleration):
+        return self._inverse_at(q, qd) @ acceleration
+
     def torque(self, q, qd, reference, terms):
-        v = reference.position - q
-        v *= self.kp
-        v += self.kv * (reference.velocity - qd)
-        v += reference.acceleration
-        return self.B_inverse(terms) @ v
+        return self.B_inverse(terms) @ self._wanted(q, qd, reference)
+
+    def torque_at(self, q, qd, reference):
+        return self._inverse_at(q, qd) @ self._wanted(q, qd, reference)
+
+    def _inverse_at(self, q, qd):
+        """`B_inverse` at joint positions and velocities; terms are made where it may change with them."""
+        if self.model.same_inertia and self._cached[2] is not None:
+            return self._cached[2]
+        return self.B_inverse(self.model.terms(q, qd))
+
+    def _wanted(self, q, qd, reference):
+        """The bracket of (17), (n,) [rad/s^2]; overwritten by the next call."""
+        kernels.compiled().wanted_acceleration(
+            q, qd, reference.position, reference.velocity, reference.acceleration, self._pull, self._damp, self._v
+        )  # fmt: skip
+        return self._v

@@ -33,11 +33,18 @@ class PayloadModel:
 
     def terms(self, q, qd):
         """Terms of (2) without deflections, as `ArmModel.terms`."""
-        one, more = self._one.terms(q, qd), self.scale - 1.0
+        return self._of(lambda model: model.terms(q, qd))
+
+    def terms_along(self, motions):
+        """As `ArmModel.terms_along`."""
+        return self._of(lambda model: model.terms_along(motions))
+
+    def _of(self, terms_of):
+        """Terms that both models have of one state, or of several, at the present scale."""
+        one, more = terms_of(self._one), self.scale - 1.0
         if more == 0.0:
             return one
-        two = self._two.terms(q, qd)
-        return Terms(*(_between(getattr(one, name), getattr(two, name), more) for name in _NAMES))
+        return Terms(*(_between(x, y, more) for x, y in zip(one, terms_of(self._two), strict=True)))
 
 
 def need_payload(model, who):
@@ -50,9 +57,6 @@ def need_payload(model, who):
             value=0,
             hint="write the mass that it is expected to have there",
         )
-
-
-_NAMES = ("M", "f1", "f2", "C1", "C2", "K1", "K2")
 
 
 def _between(one, two, more):

@@ -321,6 +321,17 @@ class Path:
         self._horner((elapsed_ns - self._low_ns) / SECOND + offset, out)
         return True
 
+    def around(self, stamp_ns, offset, step, out):
+        """Fill `out` (p, 3, n) with states as of `near`, at offsets `step` [s] apart; the middle one is `offset`."""
+        elapsed_ns = max(stamp_ns - self.start_ns, 0)
+        if elapsed_ns >= self.duration_ns:
+            out[:] = self._end
+            return
+        if not self._low_ns <= elapsed_ns < self._high_ns:
+            self._enter_segment(elapsed_ns)
+        x = (elapsed_ns - self._low_ns) / SECOND + offset
+        kernels.compiled().horners(self._stack, x, step, out)
+
     def _horner(self, x, out):
         kernels.compiled().horner(self._stack, x, out)
 
@@ -337,6 +348,16 @@ class Path:
         stack[:, 0] = c
         np.multiply(c[1:], self._once, out=stack[:-1, 1])
         np.multiply(c[2:], self._twice, out=stack[:-2, 2])
+
+
+def around(path, stamp_ns, offset, step, out):
+    """As `Path.around`, for any path."""
+    if type(path) is Path:
+        path.around(stamp_ns, offset, step, out)
+        return
+    centre = len(out) // 2
+    for i, state in enumerate(out):
+        path.near(stamp_ns, offset + (i - centre) * step, state)
 
 
 class Slowing:

@@ -8,7 +8,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import TrajectoryError
 
-from .path import FinishedPath, Path, SlowedPath, Slowing
+from .path import FinishedPath, Path, SlowedPath, Slowing, around
 from .request import JointTrajectoryData
 from .scaling import ScaledPath, TimeLaw
 from .values import (
@@ -434,6 +434,13 @@ class ReferenceGenerator:
         else:
             self._path.near(self._last_ns, offset, self._near)
         return self._near
+
+    def around(self, step, out):
+        """Fill `out` (p, 3, n) with states at offsets `step` [s] apart, as of `near`; the middle one is 0."""
+        if self._path is None:
+            out[:] = self._state
+        else:
+            around(self._path, self._last_ns, 0.0, step, out)
 
     def _follow(self, path, start_ns):
         """Change to a path, from the reference at its start, and at the factor on the time."""

@@ -16,6 +16,34 @@ The equations of motion (2) of one link with m modes, every term of which is in 
 import numpy as np
 
 
+def terms_along(motions, data, friction, f1, f2, K1, K2):
+    """Fill terms of (2) that are not constant, without deflections, at k states of the joint.
+
+    Parameters
+    ----------
+    motions : ndarray, shape (k, 3, 1)
+        Position [rad], velocity [rad/s]; and acceleration, which is not taken.
+    data : tuple of ndarray
+        As of `derivative`.
+    friction : ndarray, shape (3,)
+        Viscous, Coulomb, smoothing speed.
+    f1, f2, K1, K2 : ndarray, shape (k, 1), (k, m), (k, 1, m), (k, m, m)
+    """
+    scalars, _, _, _, g, k, _, s = data
+    moment, gx, gy = scalars[1], scalars[2], scalars[3]
+    for p in range(motions.shape[0]):
+        q, qd = motions[p, 0, 0], motions[p, 1, 0]
+        cos, sin = np.cos(q), np.sin(q)
+        along, across = gx * cos + gy * sin, -gx * sin + gy * cos
+        f1[p, 0] = friction[0] * qd - moment * across
+        if friction[1] != 0.0:
+            f1[p, 0] += friction[1] * np.tanh(qd / friction[2])
+        for i in range(s.size):
+            f2[p, i], K1[p, 0, i] = -s[i] * across, s[i] * along
+            for j in range(s.size):
+                K2[p, i, j] = k[i, j] - qd * qd * g[i, j]
+
+
 def derivative(state, torque, data, out):
     """Fill `out` with the time derivative of `state`.
 

@@ -92,18 +92,32 @@ class Terms(_Tape):
 
     def __call__(self, q, qd):
         """Forces (n + m,), K and C (n + m, m), M (n + m, n + m) at q, qd (n,); each call has arrays of its own."""
-        r, size, m = self._record, self._n + self._m, self._m
+        r = self._record
         out = np.empty(r.outputs.size)
         self._run.evaluate(
             self._v, r.inputs, r.counts, r.places, r.signs, r.functions, r.outputs, self._friction, q, qd, out
         )  # fmt: skip
+        return self._parts(out)
+
+    def along(self, motions):
+        """As a call, at k states `motions`, (k, 3, n), whose accelerations do not count; a leading axis of k."""
+        r = self._record
+        out = np.empty((len(motions), r.outputs.size))
+        self._run.evaluate_along(
+            self._v, r.inputs, r.counts, r.places, r.signs, r.functions, r.outputs, self._friction, motions, out
+        )  # fmt: skip
+        return self._parts(out)
+
+    def _parts(self, out):
+        """Views of what the record gives, (..., number of results)."""
+        size, m, several = self._n + self._m, self._m, out.shape[:-1]
         K, C = size, size + size * m
         M = C + size * m
         return (
-            out[:size],
-            out[K:C].reshape(size, m),
-            out[C:M].reshape(size, m),
-            out[M:].reshape(size, size),
+            out[..., :size],
+            out[..., K:C].reshape(*several, size, m),
+            out[..., C:M].reshape(*several, size, m),
+            out[..., M:].reshape(*several, size, size),
         )
 
 

@@ -67,6 +67,24 @@ def evaluate(v, inputs, counts, places, signs, functions, outputs, friction, q, 
             out[i] += friction[i, 1] * np.tanh(qd[i] / friction[i, 2])
 
 
+def evaluate_along(v, inputs, counts, places, signs, functions, outputs, friction, motions, out):
+    """As `evaluate`, at k states: `motions` (k, 3, n) has positions, velocities and more; `out` is (k, …)."""
+    for i in range(motions.shape[0]):
+        evaluate(
+            v,
+            inputs,
+            counts,
+            places,
+            signs,
+            functions,
+            outputs,
+            friction,
+            motions[i, 0],
+            motions[i, 1],
+            out[i],
+        )
+
+
 def slow_torque_at(
     v,
     inputs,

@@ -317,6 +317,15 @@ class Chain(ArmModel):
             return None
         return self._recorded(straight_arm.SlowTorque)
 
+    def terms_along(self, motions):
+        if self._tape is None or self._transmissions or self._slips:
+            return super().terms_along(motions)
+        n = self.n_joints
+        f, K, C, M = self._tape.along(np.ascontiguousarray(motions, float))
+        return Terms(
+            M=M, f1=f[:, :n], f2=f[:, n:], C1=C[:, :n], C2=C[:, n:], K1=K[:, :n], K2=K[:, n:]
+        )
+
     def slow_torque(self, q, qd, acceleration):
         if self._slow_tape is None:
             return super().slow_torque(q, qd, acceleration)

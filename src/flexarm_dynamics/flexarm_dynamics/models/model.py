@@ -86,6 +86,9 @@ class ArmModel(ABC):
         """Number of modal coordinates m."""
         return len(self.mode_names)
 
+    #: Whether M without deflections, and K1, are the same in all states.
+    same_inertia = False
+
     @abstractmethod
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
@@ -97,6 +100,17 @@ class ArmModel(ABC):
         -------
         Terms
         """
+
+    def terms_along(self, motions):
+        """`Terms` at several states of the straight arm, each array with a leading axis of k.
+
+        Parameters
+        ----------
+        motions : ndarray, shape (k, 3, n)
+            Of the joints: positions [rad] and velocities [rad/s] are taken, accelerations are not.
+        """
+        each = [self.terms(motion[0], motion[1]) for motion in motions]
+        return Terms(*map(np.array, zip(*each, strict=True)))
 
     def slow_torque(self, q, qd, acceleration):
         """Torque (n,) that gives the slow subsystem (10) an acceleration at q, qd, (n,) each [N m].

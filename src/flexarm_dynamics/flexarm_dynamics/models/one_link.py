@@ -109,6 +109,7 @@ class OneLinkEquations(ArmModel):
         self._gravity_plain = float(self._gravity[0]), float(self._gravity[1])
         self._weighs = any(self._gravity_plain)
         self._terms_at_rest = self._constant_terms()
+        self._constant_along = {}  # mass and damping of `terms_along`, by the number of states
 
     def with_payload(self, scale):
         return self._carrying(scale, type(self)(scaled(self.arm, payload=scale), self.shapes))
@@ -149,6 +150,24 @@ class OneLinkEquations(ArmModel):
             M[0, 0] += delta @ c.G @ delta
             C1 = 2.0 * speed * (delta @ c.G)[None, :]
         return Terms(M=M, f1=np.array([f1]), f2=f2, C1=C1, C2=c.D, K1=K1, K2=c.K - speed**2 * c.G)
+
+    @property
+    def same_inertia(self):
+        return not self._weighs
+
+    def terms_along(self, motions):
+        count, m = len(motions), self.n_modes
+        constant = self._constant_along.get(count)
+        if constant is None:
+            c = self._terms_at_rest
+            constant = [np.repeat(x[None], count, axis=0) for x in (c.M, c.C1, c.C2)]
+            self._constant_along[count] = constant
+        M, C1, C2 = constant
+        f1, f2 = np.empty((count, 1)), np.empty((count, m))
+        K1, K2 = np.empty((count, 1, m)), np.empty((count, m, m))
+        motions = np.ascontiguousarray(motions, float)
+        self._kernel.terms_along(motions, self._constants, self._friction[0], f1, f2, K1, K2)
+        return Terms(M=M, f1=f1, f2=f2, C1=C1, C2=C2, K1=K1, K2=K2)
 
     def kinetic_energy(self, q, qd, delta, delta_d):
         v = np.concatenate([qd, delta_d])
