@@ -298,7 +298,7 @@ class Loop:
             if self.state == State.FAULT and time.monotonic() > again:
                 again = time.monotonic() + 1.0
                 self.desk.tell("recover")
-            return State.READY <= self.state <= State.STOPPING
+            return self.state in range(State.READY, State.STOPPING + 1)
 
         self.wait_for("torque", running)
 

@@ -505,8 +505,8 @@ LAWS = [
         (
             "expansion",
             "terms of the centre: of the first point",
-            "here = terms[len(terms) // 2]",
-            "here = terms[0]",
+            "t, centre = terms, len(terms.M) // 2",
+            "t, centre = terms, 0",
             TESTS + "test_control_kernels.py",
         ),
         (
