@@ -316,6 +316,30 @@ def test_a_push_is_damped_in_the_stream_by_strain_until_the_sensor_is_silent(ben
     assert values["damping"] == "off: the sensor is silent"
 
 
+def test_a_push_is_damped_in_a_stream_of_velocities_and_the_joint_comes_back(bench):
+    Shaper(bench, **DAMPING, stream_kind="velocities", stream_timeout=60.0)
+    node = bench.nodes["shaper"]
+    node.now_ns = lambda: round(1e9 * bench.queue.time)
+    commands = bench.tap(Float64MultiArray, "commands")
+    strain = bench.publisher(Float64MultiArray, "strain")
+    bench.publisher(Float64MultiArray, "stream").publish(Float64MultiArray(data=[0.0, 0.0]))
+    swing, p = 1e-3 + 0j, strain_damping.pole(FREQUENCY, 0.005)
+    away, largest = 0.0, 0.0
+    for _ in range(500):
+        strain.publish(Float64MultiArray(data=[7.0, swing.real]))
+        seen = len(commands.messages)
+        bench.wait_for("a command", lambda seen=seen: len(commands.messages) > seen)
+        other, rate = commands.newest.data
+        assert other == 0.0
+        assert abs(rate) <= 0.5
+        away += 0.008 * rate
+        largest = max(largest, abs(away))
+        swing = strain_damping.moved(swing, p, 1j * SENSITIVITY, away, 0.008)
+    assert abs(swing) < 0.1 * 1e-3 * np.exp(p.real * 4.0)
+    assert 1e-3 < largest < 0.021
+    assert abs(away) < 0.05 * largest
+
+
 IMU = {
     **DAMPING,
     "damping.sensor": "imu",
@@ -373,12 +397,12 @@ def test_a_push_is_damped_by_an_imu_until_it_is_in_doubt(bench, value, late, pro
     [
         ({"damping.sensor": "imu"}, "less than an accelerometer's"),
         ({"damping.joint": "x"}, "no joint of the stream"),
-        ({"stream_output": ""}, "no stream of positions"),
-        ({"stream_kind": "velocities"}, "no stream of positions"),
+        ({"stream_output": ""}, "no stream of positions or velocities"),
         (
             {"damping.joint": "", "play_trajectories": True, "stream_output": ""},
             "no stream of positions",
         ),
+        ({"play_trajectories": True, "stream_kind": "velocities"}, "no stream of positions"),
         ({"damping.target": 0.01, "damping.damping": 0.02}, "no more than the mode has"),
     ],
 )

@@ -427,10 +427,11 @@ class ShaperNode(ArmNode):
         self.plays = self.parameters["play_trajectories"]
         damping = self.parameters.group("damping.")
         if damping["joint"]:
-            self._refuse_without_positions(topic, "damping.joint")
-            self._damping = StreamDamping(self, self.joint_names, damping, self._step)
+            self._refuse_without_stream(topic, "damping.joint", (POSITIONS, VELOCITIES))
+            velocities = self.parameters["stream_kind"] == VELOCITIES
+            self._damping = StreamDamping(self, self.joint_names, damping, self._step, velocities)
         if self.plays:
-            self._refuse_without_positions(topic, "play_trajectories")
+            self._refuse_without_stream(topic, "play_trajectories", (POSITIONS,))
         if not topic:
             return
         self._commands = self.make_publisher(Float64MultiArray, topic)
@@ -440,11 +441,12 @@ class ShaperNode(ArmNode):
         self.make_subscription(Float64MultiArray, "stream", self._on_stream)
         self.make_timer(self._step, self._on_tick)
 
-    def _refuse_without_positions(self, topic, field):
-        """Refuse what needs a stream of positions where there is none; `topic` of the stream, `field` that needs it."""
-        if not topic or self.parameters["stream_kind"] != POSITIONS:
-            hint = f"give stream_output, with stream_kind {POSITIONS}"
-            raise ParameterError("has no stream of positions", field=field, hint=hint)
+    def _refuse_without_stream(self, topic, field, kinds):
+        """Refuse what needs a stream of some `kinds` where there is none: its `topic`, the `field` that needs it."""
+        if not topic or self.parameters["stream_kind"] not in kinds:
+            named = " or ".join(kinds)
+            hint = f"give stream_output, with stream_kind {named}"
+            raise ParameterError(f"has no stream of {named}", field=field, hint=hint)
 
     def _on_play(self):
         """Send the position of the shaped motion now, from the first trajectory on."""

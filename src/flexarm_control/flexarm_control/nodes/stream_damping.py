@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Damping in the shaper's stream: readings of a gauge or an IMU in, a correction of one joint's positions out."""
+"""Damping in the shaper's stream: readings of a gauge or an IMU in, a correction of one joint's values out."""
 
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
@@ -14,7 +14,7 @@ from ..shaping import strain_damping
 
 PARAMETERS = (
     parameter("joint", "", read_only=True).described(
-        "Joint whose streamed positions are corrected to damp a mode that a sensor shows; empty: no damping."
+        "Joint whose streamed values are corrected to damp a mode that a sensor shows; empty: no damping."
     ),
     parameter("sensor", "strain", choices=("strain", "imu"), read_only=True).described(
         "What shows the mode: a reading in the topic strain, or an acceleration in the topic imu [m/s^2]."
@@ -32,7 +32,7 @@ MIN_SCALE = 1.0
 
 
 class StreamDamping:
-    """Holds the newest reading until the next position is sent.
+    """Holds the newest reading until the next position or velocity is sent.
 
     Parameters
     ----------
@@ -43,6 +43,8 @@ class StreamDamping:
         Checked values of `PARAMETERS`.
     period : float
         Of the stream [s].
+    velocities : bool
+        Whether the stream has velocities.
 
     Attributes
     ----------
@@ -56,12 +58,13 @@ class StreamDamping:
         As `StrainDamping`.
     """
 
-    def __init__(self, node, names, settings, period):
+    def __init__(self, node, names, settings, period, velocities):
         if settings["joint"] not in names:
             hint = f"one of {', '.join(names)}"
             field, value = "damping.joint", settings["joint"]
             raise ParameterError("is no joint of the stream", field=field, value=value, hint=hint)
         self.law = strain_damping.StrainDamping(settings, period)
+        self._velocities = velocities
         self._node, self._joint = node, names.index(settings["joint"])
         self._gauge, self._reading = settings["gauge"], None
         self._stamp, self._axis = None, settings["axis"]
@@ -95,9 +98,9 @@ class StreamDamping:
             return
         self._reading = msg.data[self._gauge]
 
-    def corrected(self, positions, now):
-        """Positions (n,) [rad] with the correction of a time `now` [s]; call once in each period."""
+    def corrected(self, values, now):
+        """Positions [rad] or velocities [rad/s] (n,) with the correction of a time `now` [s]; once in each period."""
         reading, self._reading = self._reading, None
-        out = positions.copy()
-        out[self._joint] += self.law.update(now, reading, self._stamp)
+        out, correction = values.copy(), self.law.update(now, reading, self._stamp)
+        out[self._joint] += self.law.rate if self._velocities else correction
         return out

@@ -28,6 +28,8 @@ frequency that is off by `MARGIN`, the constructor refuses it.
 An accelerometer is a reading, too, of another phase. That it also moves with the joint is left out: this part is mostly
 in phase with the correction, and changes the frequency a little, not the damping.
 
+A velocity command gets the correction's rate, whose integral it is.
+
 The bounds keep the correction a sine: clipped it would come late. A sensor that sticks is taken for bias: the
 correction dies out.
 """
@@ -197,6 +199,8 @@ class StrainDamping:
     ----------
     correction : float
         What is added to the position command now [rad].
+    rate : float
+        What is added to a velocity command in its place, for a period: its integral is the correction [rad/s].
     state : str
         `ACTIVE`; `FADING`, out or in; `OFF`.
     reason : str
@@ -236,6 +240,7 @@ class StrainDamping:
         self._time = self._stamp = self._read_at = self._good_since = self._good_at = None
         self._saturated_since, self._swing = None, 0.0
         self.correction, self.state, self.reason, self.latched = 0.0, ACTIVE, "", False
+        self.rate = 0.0
 
     def update(self, now, strain=None, stamp=None):
         """Return the correction for the next command [rad]; call once in each period of the commands.
@@ -268,7 +273,9 @@ class StrainDamping:
         amplitude = self._gain * abs(self._z)
         self._note_saturation(now, amplitude)
         self._fade(step)
-        self.correction = self._bounded(amplitude, step)
+        before, self.correction = self.correction, self._bounded(amplitude, step)
+        largest = self.settings["max_rate"]
+        self.rate = min(max((self.correction - before) / self.period, -largest), largest)
         return self.correction
 
     def _step_to(self, now):
