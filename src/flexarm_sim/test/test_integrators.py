@@ -9,8 +9,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models import model
+from flexarm_dynamics.models.fixed_step import lost
 from flexarm_sim.integrators import MAX_SUBSTEPS, METHODS, PHASE_PER_STEP, integrate, substeps
 
 METHOD = METHODS["dop853"]
@@ -68,13 +70,37 @@ def test_a_substep_stays_below_a_radian_of_the_highest_mode(arm_r):
 
 @pytest.mark.parametrize("method", ["dop853", "rk4"])
 def test_a_mode_at_the_longest_substep_loses_less_than_a_millionth_of_its_energy_a_period(method):
-    tableau, phase = METHODS[method], PHASE_PER_STEP[method]
-    stages = np.linalg.solve(
-        np.eye(len(tableau.A)) - 1j * phase * tableau.A, np.ones(len(tableau.A))
-    )
-    gain = 1.0 + 1j * phase * tableau.weights @ stages  # of e^{i omega t} over a step
-    lost = 1.0 - np.abs(gain) ** (2.0 * 2.0 * np.pi / phase)
-    assert 1e-7 < lost < 1e-6  # shorter ones would be of no use
+    assert 1e-7 < lost(method, PHASE_PER_STEP[method]) < 1e-6  # shorter ones would be of no use
+
+
+def test_what_a_method_loses_is_what_an_oscillator_loses():
+    phase, state = 1.6, np.array([1.0, 0.0])
+    omega = np.array([[0.0, 1.0], [-(phase**2), 0.0]])
+    stages = []
+    for row in TABLEAU:
+        stages.append(omega @ (state + sum(a * k for a, k in zip(row, stages, strict=False))))
+    state = state + sum(b * k for b, k in zip(WEIGHTS, stages, strict=True))
+    energy = state[0] ** 2 + (state[1] / phase) ** 2  # of 1 before the step
+    assert_allclose(lost("dop853", phase), 1.0 - energy ** (2.0 * np.pi / phase), rtol=1e-6)
+
+
+def test_a_damped_mode_takes_fewer_substeps_and_the_arm_moves_the_same():
+    """The twist of `long_reach`, 1829 rad/s: one substep of a millisecond, beside eight."""
+    arm = arm_file.load("long_reach")
+    chain, undamped = model.build(arm), model.build(scaled(arm, damping=0.0))
+    assert chain.frequencies()[-1] > 1.5e3
+    assert (substeps(chain, 1e-3), substeps(undamped, 1e-3)) == (1, 2)
+    n, m, advance = chain.n_joints, chain.n_modes, chain.stepper(METHOD)
+    ends = []
+    for count in (1, 8):
+        state = np.zeros(2 * (n + m))
+        state[:n] = 0.0, 1.2, 0.8, -0.8
+        for k in range(300):  # a torque that jumps
+            advance(
+                state, np.array([50.0, 100.0, 60.0, 20.0]) * (k % 100 < 20), 1e-3 / count, count
+            )
+        ends.append(chain.tip_position(state[:n], state[n : n + m]))
+    assert np.abs(ends[0] - ends[1]).max() < 1e-6  # [m]
 
 
 def test_a_rigid_or_slow_arm_takes_one_substep(arm_r):

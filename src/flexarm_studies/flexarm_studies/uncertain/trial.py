@@ -120,7 +120,7 @@ def loop_of(case, setup, variant, seed=0):
         given["publish_joint_velocity"] = False
     rate = variant.rate or given.get("rate", RATE)
     plant = plant_of(known, variant)
-    explicit = substeps(model.build(plant), 1.0 / rate) <= EXPLICIT
+    explicit = substeps(model.build(plant), 1.0 / rate, undamped=True) <= EXPLICIT
     given["level"] = levels.level_of(plant)
     given["integrator"] = "dop853" if explicit else "implicit"
     scenario = scenarios.Scenario(
