@@ -564,6 +564,23 @@ def test_a_curved_path_of_many_points_takes_one_time_and_the_motion_does_not_gro
     assert made[0].duration == pytest.approx(made[1].duration, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("points", "duration"),
+    [
+        # A point half-way along the path, but for rounding, is as one of the grid; so is one as close to another point.
+        ([[0.0, 0.0], [0.6, 0.7], [1.2, 0.0]], 2.5),
+        ([[0.0, 0.0], [0.8, 0.3], [1.6, 0.0]], 2.5),
+        ([[0.0, 0.0], [0.25, 0.3], [0.25 + 1e-9, 0.3], [1.0, 0.0]], 1.6),
+    ],
+)
+def test_points_that_nearly_meet_make_no_endless_motion(points, duration):
+    motion = limited.time_optimal(points, [1.0, 1.0], [4.0, 4.0])
+    assert motion.duration < duration
+    assert_allclose(motion.end, points[-1], rtol=0.0, atol=1e-15)
+    away = np.abs(motion.position(np.linspace(0.0, motion.duration, 4000)) - points[1]).max(axis=1)
+    assert away.min() < 1e-3
+
+
 def test_a_jerk_limited_motion_is_replaced_on_the_way_and_a_time_optimal_one_is_not():
     there_and = trajectory([1.0], [[1.0, -0.5]])
     back = trajectory([1.0], [[0.0, 0.0]])

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms behind a position loop: planners' motions, what is measured, and what is left of the swing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -106,6 +108,26 @@ def test_a_motion_along_which_the_frequency_rises_needs_the_modes_of_both_ends_a
     unshaped, one, two, *new = (arm.follow(m, window).residual(window) for m in made)
     assert two < 0.1 * unshaped < one
     assert max(new) < 0.06 * unshaped
+
+
+def test_a_path_that_bends_is_shaped_by_the_modes_of_both_ends():
+    case = cases.random_arm(2)
+    motion = case.motions[0]
+    given = study.bent(motion)
+    t = np.linspace(0.0, given.duration, 1000)
+    away = given.position(t) - motion.start
+    away -= (away @ motion.angle)[:, None] / (motion.angle @ motion.angle) * motion.angle
+    assert np.abs(away).max() == pytest.approx(0.25 * np.abs(motion.angle).max(), rel=0.1)
+    for order in (1, 2):
+        most = np.abs(motion.derivative(order, motion.knots[1:] - 1e-9)).max()
+        assert np.abs(given.derivative(order, t)).max() < 1.001 * most
+    rows = study.run_bent(replace(case, motions=case.motions[:1]))
+    assert [row["method"] for row in rows] == list(study.BENT)
+    shaped, *off = (row["residual"] / rows[0]["residual"] for row in rows[1:])
+    assert shaped < 0.1
+    assert max(off) < 0.2
+    assert rows[1]["added"] < 1.2  # periods of the mode at the end; the lowest is lower
+    assert study.run_bent(replace(cases.payload(1.0), motions=cases.payload(1.0).motions[:1])) == []
 
 
 def test_the_table_counts_what_is_within_what_is_wanted():

@@ -21,8 +21,10 @@ from .piecewise import PiecewiseMotion
 #: Points of the spline at which TOPP-RA keeps the limits, for each piece between two points; at least, and at most, in
 #: all beside the points themselves: each is a point of the motion, and a shaper multiplies them.
 GRID, FEWEST, MOST = 50, 100, 800
+#: A step of the grid that ends closer to a point than this part of it ends there.
+CLOSE = 0.1
 #: Points closer to each other than this are one [rad].
-SAME = 1e-9
+SAME = 1e-7
 #: Knots closer than this are one [s].
 MOMENT = 1e-9
 
@@ -111,7 +113,8 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
     points = np.asarray(points, float)
     _refuse_unlimited({"velocity": velocity, "acceleration": acceleration})
     away = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    points = points[np.concatenate([[True], away > SAME])]
+    end, points = points[-1], points[np.concatenate([[True], away > SAME])]
+    points[-1] = end
     if len(points) < 2:
         return PiecewiseMotion.resting(points[0], 0.0)
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
@@ -124,10 +127,8 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
         toppra.constraint.JointVelocityConstraint(bounds[0]),
         toppra.constraint.JointAccelerationConstraint(bounds[1]),
     ]
-    count = int(np.clip(GRID * (len(points) - 1), FEWEST, MOST))
-    grid = np.linspace(0.0, length[-1], count + 1)
     path = toppra.SplineInterpolator(length, points, bc_type="natural")
-    grid = np.union1d(grid, length)
+    grid = _grid(length)
     problem = toppra.algorithm.TOPPRA(constraints, path, gridpoints=grid)
     rate = problem.compute_parameterization(0.0, 0.0)[1]
     if rate is None or not (rate[1:] + rate[:-1] > 0.0).all():
@@ -142,6 +143,16 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
     speed, bend = (np.abs(motion.derivative(order, places)).max(axis=0) for order in (1, 2))
     slower = max((speed / velocity).max(), np.sqrt((bend / acceleration).max()), 1.0)
     return PiecewiseMotion.through(slower * times, [states[0], states[1] / slower])
+
+
+def _grid(length):
+    """Places (g,) at which the limits are kept: the points at `length` (k,), and between them equal steps."""
+    count = int(np.clip(GRID * (length.size - 1), FEWEST, MOST))
+    even = np.linspace(0.0, length[-1], count + 1)
+    after = np.clip(np.searchsorted(length, even), 1, length.size - 1)
+    apart = np.minimum(np.abs(even - length[after - 1]), np.abs(even - length[after]))
+    # Of a place as close as rounding to a point, the speeds differ by more than the way between them.
+    return np.union1d(even[apart > CLOSE * even[1]], length)
 
 
 def _refuse_unlimited(limits):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .. import workers
-from ..markdown import write_between
+from ..markdown import table, write_between
 from ..progress import Progress
 from ..store import Store, gather
 from . import cases, figure, pushes, report, study
@@ -61,6 +61,11 @@ def add_arguments(parser):
         action="store_true",
         help="the least that any time law is found to leave of the motions that retimed misses; --out has the results",
     )
+    add(
+        "--bent",
+        action="store_true",
+        help="paths that bend, shaped by the modes of both ends",
+    )
     add("--figure", metavar="FILE", help="draw one arm's tip before and after, .svg or .png")
 
 
@@ -75,6 +80,12 @@ def vibration(options):
             pushes.write(decays, options.write)
         print(pushes.text(decays))
         return
+    if options.bent:
+        made = cases.all_of(options.count, options.seed).values()
+        rows = [row for make in made for row in study.run_bent(make())]
+        lines = table(report.COLUMNS, report.summary(rows))
+        _show(lines, options.write, report.BENT)
+        return
     if options.out and options.fresh:
         Path(options.out).unlink(missing_ok=True)
     methods = (study.METHODS[0], *options.methods) if options.methods else study.METHODS
@@ -85,13 +96,18 @@ def vibration(options):
     made = next((each for each, wanted in missed.items() if wanted), None)
     if made is not None:
         lines, where = made(rows, options.count, options.seed)
-        if options.write:
-            write_between(options.write, *where, "\n".join(lines))
-        print("\n".join(lines))
+        _show(lines, options.write, where)
         return
     if options.write:
         report.write(rows, options.write)
     print(report.text(rows))
+
+
+def _show(lines, path, where):
+    """Print lines, and write them between the markers `where` of a file, if there is one."""
+    if path:
+        write_between(path, *where, "\n".join(lines))
+    print("\n".join(lines))
 
 
 def _more_time(rows, count, seed):

@@ -10,6 +10,7 @@ BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
 #: Periods that a motion may get longer by, one as in the tables and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
+BENT = "<!-- bent: begin -->", "<!-- bent: end -->"
 LIMIT = "<!-- limit: begin -->", "<!-- limit: end -->"
 TRIALS = "<!-- trials: begin -->", "<!-- trials: end -->"
 #: Corrections of a motion that is made again and again.

@@ -46,6 +46,9 @@ RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
 QUICKEST = ("toppra", "ruckig, one period")
 #: Factors of the frequencies for the methods by a new time law [-].
 OFFS = {"retimed": 1.0, "retimed -15 %": 1.0 - OFF, "retimed +15 %": 1.0 + OFF}
+#: A path bends aside by this fraction of its largest way [-]; methods that it is shaped by, after the motion as it is.
+ASIDE = 0.25
+BENT = ("trapezoid", "robust, both ends", "robust, both ends -15 %", "robust, both ends +15 %")
 METHODS = (
     "trapezoid",
     "TOTG 0.1 s",
@@ -302,34 +305,103 @@ def run(case, methods=METHODS):
     list of dict
         A row for each motion and method.
     """
-    known = model.build(case.known)
-    arm = PositionArm(known, model.build(case.plant), 2.0 * np.pi / case.period)
-    out = []
+    arm, out = _arm(case), []
     for number, motion in enumerate(case.motions):
         found = measured(arm, motion.end, motion.angle, case.period)
-        common = {
-            "arm": case.name,
-            "motion": number,
-            "frequencies": found.frequencies.tolist(),
-            "dampings": found.dampings.tolist(),
-        }
         if not found.frequencies.size:
-            out.append({**common, "method": ""})
+            out += _left(arm, case, number, found, {})
             continue
-        lowest = 1.0 / found.frequencies.min()
         other = measured(arm, motion.start, -motion.angle, case.period)
         middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
-        for method, given in candidates(motion, found, middle, other, methods).items():
-            swing = arm.follow(given, WINDOW * case.period)
-            out.append(
-                {
-                    **common,
-                    "method": method,
-                    "residual": swing.residual(WINDOW * case.period),
-                    "added": float((given.duration - motion.duration) / lowest),
-                    "saturated": swing.saturated,
-                }
-            )
+        made = candidates(motion, found, middle, other, methods)
+        out += _left(arm, case, number, found, made)
+    return out
+
+
+def run_bent(case):
+    """Residuals of motions along paths that bend, between the ends of a case's motions: the quickest by TOPP-RA.
+
+    Parameters
+    ----------
+    case : cases.Case
+
+    Returns
+    -------
+    list of dict
+        As of `run`, of the methods `BENT`; none of an arm with one joint.
+    """
+    arm, out = _arm(case), []
+    for number, motion in enumerate(case.motions):
+        if motion.start.size == 1:
+            continue
+        given = bent(motion)
+        # Where it comes from at its end, where it goes at its start, as long as the way.
+        first, last = (given.position(t * given.duration) for t in np.array([[0.1], [0.9]]))
+        size = np.linalg.norm(motion.angle)
+        ways = [
+            w / np.linalg.norm(w) * size for w in (motion.end - last[0], motion.start - first[0])
+        ]
+        found, other = (
+            measured(arm, at, way, case.period)
+            for at, way in zip((motion.end, motion.start), ways, strict=True)
+        )
+        both = together(found, other)
+        offs = zip(BENT[1:], (1.0, 1.0 - OFF, 1.0 + OFF), strict=True)
+        made = {BENT[0]: given, **{name: shaped(given, "robust", both, off) for name, off in offs}}
+        out += _left(arm, case, number, found, made if found.frequencies.size else {})
+    return out
+
+
+def bent(motion):
+    """The quickest motion by TOPP-RA from start to end around a bend, by `ASIDE` of the largest way.
+
+    All joints keep the largest speed and acceleration of any of them in the motion that is given.
+
+    Parameters
+    ----------
+    motion : PiecewiseMotion
+        A trapezoid of speed of two joints at least.
+    """
+    way = motion.angle
+    aside = np.where(np.arange(way.size) % 2, -1.0, 1.0)
+    aside -= (aside @ way) / (way @ way) * way
+    aside *= ASIDE * np.abs(way).max() / np.abs(aside).max()
+    points = [motion.start, 0.5 * (motion.start + motion.end) + aside, motion.end]
+    speed, bend = (
+        np.full(way.size, np.abs(motion.derivative(k, motion.knots[1:] - 1e-9)).max())
+        for k in (1, 2)
+    )
+    return limited.time_optimal(points, speed, bend)
+
+
+def _arm(case):
+    """The arm of a case behind its drives."""
+    known, plant = model.build(case.known), model.build(case.plant)
+    return PositionArm(known, plant, 2.0 * np.pi / case.period)
+
+
+def _left(arm, case, number, found, made):
+    """Rows of `run` of one motion: by each method of `made`, the first as it is; one without a method where none is."""
+    common = {
+        "arm": case.name,
+        "motion": number,
+        "frequencies": found.frequencies.tolist(),
+        "dampings": found.dampings.tolist(),
+    }
+    if not made:
+        return [{**common, "method": ""}]
+    out, duration = [], next(iter(made.values())).duration
+    for method, given in made.items():
+        swing = arm.follow(given, WINDOW * case.period)
+        out.append(
+            {
+                **common,
+                "method": method,
+                "residual": swing.residual(WINDOW * case.period),
+                "added": float((given.duration - duration) * found.frequencies.min()),
+                "saturated": swing.saturated,
+            }
+        )
     return out
 
 
@@ -388,8 +460,7 @@ def _prepared(case, number, at_end=False):
 
     `at_end`: along it only as many modes as ring at the end, which is what the ringing after a trial shows.
     """
-    arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
-    motion = case.motions[number]
+    arm, motion = _arm(case), case.motions[number]
     end = measured(arm, motion.end, motion.angle, case.period)
     start = measured(arm, motion.start, -motion.angle, case.period)
     middle = measured(arm, 0.5 * (motion.start + motion.end), motion.angle, case.period)
