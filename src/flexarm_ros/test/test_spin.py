@@ -125,6 +125,25 @@ def test_whatever_comes_is_found_and_served(node, kind):
     executor.shutdown()
 
 
+def test_timers_are_served_without_the_executor(node):
+    found, executor = others(node)
+    served, slow = [], []
+    first = node.create_timer(0.001, lambda: served.append(1) or node.destroy_timer(first))
+    node.create_timer(100.0, lambda: slow.append(1))
+    assert soon(lambda: served, found.serve_timers)
+    found.serve_timers()
+    assert served == [1]  # destroyed by its own callback
+    assert slow == []
+
+    async def later():
+        served.append(2)
+
+    node.create_timer(0.001, later)
+    assert soon(lambda: found.waits(node), found.serve_timers)  # a coroutine is for the executor
+    assert soon(lambda: 2 in served, lambda: executor.spin_once(timeout_sec=0.0))
+    executor.shutdown()
+
+
 def test_a_subscription_that_is_not_to_be_served_is_not_looked_at(node):
     tap = session.Tap(node, String, "tapped")
     publisher = node.create_publisher(String, "tapped", session.DEEP)

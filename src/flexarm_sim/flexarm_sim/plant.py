@@ -116,7 +116,8 @@ class Plant:
         self._check()
 
     def _check(self):
-        if np.count_nonzero(np.isfinite(self.state)) < self.state.size:
+        state = self.state
+        if not (state.dot(state) < math.inf or np.isfinite(state).all()):
             raise ModelError(
                 "is no longer finite: torque or speed are beyond the range of its model",
                 field=f"state of {self.model.arm.name}",

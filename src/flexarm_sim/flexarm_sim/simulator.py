@@ -161,8 +161,16 @@ class Simulator:
         When the torque comes late, `before` acts during the first part of the period, of which `delay` is the
         fraction [-]. The torque of the next sample is the mean over the period.
         """
-        parts = [(before, delay)] if delay > 0.0 else []
-        self.advance_in_parts([*parts, (torque, 1.0 - delay)])
+        if delay > 0.0:
+            self.advance_in_parts([(before, delay), (torque, 1.0 - delay)])
+            return
+        if torque is None:
+            self.torque[:] = 0.0
+            self.plant.advance_safely()
+        else:
+            self.torque[:] = torque
+            self.plant.advance(torque)
+        self._next_sample()
 
     def advance_in_parts(self, parts):
         """Advance by one period under several torques in turn; `parts` are pairs (torque or None, fraction)."""
