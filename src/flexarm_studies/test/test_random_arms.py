@@ -319,3 +319,16 @@ def test_the_table_of_designs_has_the_decay_of_every_arm_once():
     rows.append({"controller": "pid", "number": 0, "arm": "planar1_0_0"})
     (found,) = report.decays(rows)
     assert found == ("designed", 3, pytest.approx(0.3), 0.2, 0.04, 1)
+
+
+def test_steps_are_short_enough_for_friction_on_a_light_hub():
+    slow, light = (
+        plants.plant_of(generator.arm(number).read(), plants.VARIANTS["exact"])
+        for number in (4, 12)
+    )
+    assert trial.longest_step(model.build(slow), np.zeros(3)) == trial.STEP
+    plant = model.build(light)
+    step = trial.longest_step(plant, np.zeros(3))
+    hubs = np.diag(np.linalg.inv(plant.terms(np.zeros(3), np.zeros(3)).M))[:3]
+    moved = plant.friction_table()[:, 1] * hubs * step**2
+    assert step < 0.3 * trial.STEP and moved.max() == pytest.approx(trial.KICK)
