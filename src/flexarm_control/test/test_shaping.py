@@ -564,6 +564,17 @@ def test_a_curved_path_of_many_points_takes_one_time_and_the_motion_does_not_gro
     assert made[0].duration == pytest.approx(made[1].duration, rel=1e-3)
 
 
+def test_points_microseconds_apart_are_joined_within_the_limits():
+    limits = {"velocity": [1.0, 0.8], "acceleration": [4.0, 3.0]}
+    own = shaper(limits, "time_optimal", type="robust", frequencies=[2.0, 7.0])
+    shaped = own.offer(trajectory([0.0, 1.0, 2.0], [[0.0, 0.0], [0.9, 0.3], [-0.5, -0.2]]), NOW)
+    motion = joined(shaped)
+    pieces = np.diff(motion.knots)
+    assert pieces.min() < 1e-5
+    places = (motion.knots[:-1, None] + pieces[:, None] * [0.001, 0.5, 0.999]).ravel()
+    assert (np.abs(motion.acceleration(places)) < 1.01 * np.array([4.0, 3.0])).all()
+
+
 @pytest.mark.parametrize(
     ("points", "duration"),
     [

@@ -467,9 +467,10 @@ class TrajectoryShaper:
                 limit=f"at most {MAX_POINTS}",
                 hint="send fewer: a quintic polynomial joins them",
             )
-        states = shaped.states(knots)[: motion.fields]
-        states[0][-1], states[1:, -1] = motion.end, 0.0
         times_ns = np.rint((knots - begin) * SECOND).astype(np.int64)
+        # At the rounded times: between points that are microseconds apart, the rounding would be an acceleration.
+        states = shaped.states(begin + times_ns / SECOND)[: motion.fields]
+        states[0][-1], states[1:, -1] = motion.end, 0.0
         begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
         added = float(shaped.end - last)
         result = Shaped(begin_ns, fresh, times_ns, list(states), end_ns, added, stretch)
