@@ -18,7 +18,7 @@ from .options import add_arm_arguments, angles, check_file, in_range, new_path, 
 COMMENTS = {
     "rate": "[Hz] samples per second that the design is for",
     "stability_margin": "[1/s] not checked again without filters and delay, for which these gains are not made",
-    "feedforward": "model: the nominal arm simulated alongside; preview: planned on receipt to end at rest",
+    "feedforward": "model: simulated alongside, begins at once; preview: planned first, for seconds, and ends at rest",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
     "slow.damping": "[N m s/rad]",
