@@ -148,6 +148,8 @@ def test_the_table_counts_what_is_within_what_is_wanted():
         report.time_table([(row, [0.3, 0.1, 0.05, 0.01])])[2]
         == "| x, motion 1 | 0.3 | 0.1 | 0.05 | 0.01 |"
     )
+    (line,) = report.places_table([(row, [0.3, 0.1, 0.05])])[2:]
+    assert line == "| x, motion 1 | retimed | 0.1 | 0.3 | 0.1 | 0.05 |"
     (line,) = report.trials_table([(row, [0.3, 0.1, 0.05, 0.01, 0.01, 0.01])])[2:]
     assert line.startswith("| x, motion 1 | retimed | 0.1 | 0.3 | 0.1 | 0.05 |")
 
@@ -171,6 +173,11 @@ def test_in_more_time_less_is_left():
     case = cases.all_of(0)["payload x1"]()
     one, three = study.in_more_time(case, 0, (0.3, 1.0))
     assert three < 0.02 < one
+
+
+def test_by_modes_at_more_places_less_is_left_where_they_come_close():
+    few, many = study.at_more_places(cases.random_arm(7), 2, (3, 5))
+    assert many < 0.08 < 0.1 < few
 
 
 def test_corrections_in_trials_take_out_what_the_measured_modes_have_missed():

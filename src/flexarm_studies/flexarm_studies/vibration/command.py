@@ -52,6 +52,11 @@ def add_arguments(parser):
         help="what retimed leaves in more than a period, of the motions that it misses; --out has the results",
     )
     add(
+        "--more-places",
+        action="store_true",
+        help="what retimed leaves of the motions that it misses by modes at more places; --out has the results",
+    )
+    add(
         "--trials",
         action="store_true",
         help="what retimed leaves of the motions that it misses, corrected in trials; --out has the results",
@@ -92,7 +97,12 @@ def vibration(options):
     rows = run(
         options.seed, options.count, options.out, options.workers, options.scheduler, methods
     )
-    missed = {_more_time: options.more_time, _in_trials: options.trials, _limits: options.limit}
+    missed = {
+        _more_time: options.more_time,
+        _more_places: options.more_places,
+        _in_trials: options.trials,
+        _limits: options.limit,
+    }
     made = next((each for each, wanted in missed.items() if wanted), None)
     if made is not None:
         lines, where = made(rows, options.count, options.seed)
@@ -117,6 +127,16 @@ def _more_time(rows, count, seed):
         (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
     ]
     return report.time_table(found), report.TIME
+
+
+def _more_places(rows, count, seed):
+    """The table of what `retimed` leaves by modes at `report.PLACES` of what it misses, and the markers around it."""
+    known, missed = _missed(rows, count, seed, report.LISTED)
+    found = [
+        (row, study.at_more_places(known[row["arm"]], row["motion"], report.PLACES, off))
+        for row, off in ((row, study.OFFS[row["method"]]) for row in missed)
+    ]
+    return report.places_table(found), report.PLACED
 
 
 def _limits(rows, count, seed):

@@ -11,6 +11,9 @@ TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
 #: Periods that a motion may get longer by, one as in the tables and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
 BENT = "<!-- bent: begin -->", "<!-- bent: end -->"
+#: Places along a motion at which its modes are measured.
+PLACES = (3, 5, 9)
+PLACED = "<!-- more places: begin -->", "<!-- more places: end -->"
 LIMIT = "<!-- limit: begin -->", "<!-- limit: end -->"
 TRIALS = "<!-- trials: begin -->", "<!-- trials: end -->"
 #: Corrections of a motion that is made again and again.
@@ -101,6 +104,16 @@ def time_table(found):
     """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
     columns = ("motion", *(f"{times:g} period{'s' * (times != 1.0)}" for times in TIMES))
     named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
+    return table(columns, named)
+
+
+def places_table(found):
+    """Lines of the table of what `retimed` leaves by modes at more places: of rows and their ratios for `PLACES`."""
+    columns = ("motion", "method", "wanted", *(f"{count} places" for count in PLACES))
+    named = (
+        (f"{row['arm']}, motion {row['motion']}", row["method"], WANTED[row["method"]], *left)
+        for row, left in found
+    )
     return table(columns, named)
 
 

@@ -427,6 +427,41 @@ def in_more_time(case, number, times):
     return [arm.follow(each, window).residual(window) / unshaped for each in given]
 
 
+def at_more_places(case, number, counts, off=1.0):
+    """What `retimed` leaves of a motion of a case whose modes are measured at more places of the way.
+
+    Parameters
+    ----------
+    case : cases.Case
+    number : int
+        Of the motion.
+    counts : sequence of int
+        Places from start to end, with both.
+    off : float
+        Factor of the frequencies: how wrong they are taken to be [-].
+
+    Returns
+    -------
+    list of float
+        Residual over that of the trapezoid for each of `counts` [-].
+    """
+    arm, motion, window = _arm(case), case.motions[number], WINDOW * case.period
+    unshaped, left = arm.follow(motion, window).residual(window), []
+    for count in counts:
+        found = [
+            measured(
+                arm,
+                motion.end - part * motion.angle,
+                (1.0 if part < 1.0 else -1.0) * motion.angle,
+                case.period,
+            )
+            for part in np.linspace(0.0, 1.0, count)
+        ]
+        given = retimed(motion, rows(found[0], found[1:]), off)
+        left.append(arm.follow(given, window).residual(window) / unshaped)
+    return left
+
+
 def at_least(case, number):
     """What `retimed` leaves of a motion of a case, and the least that a time law as long is found to leave.
 
