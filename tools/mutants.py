@@ -256,6 +256,31 @@ KERNELS = of(
     ),
 )
 
+MODELS = of(
+    "flexarm_dynamics",
+    "models",
+    "flexarm_sim/test/test_integrators.py",
+    (
+        "fixed_step",
+        "substeps of modes that are not damped: as if they were",
+        "PART_OF_DAMPING * 2.0 * np.pi * damping / omega",
+        "1.0 + 0.0 * omega",
+    ),
+    (
+        "fixed_step",
+        "substeps of damped modes: as if they were not",
+        "return fewer",
+        "return count",
+    ),
+    (
+        "chain",
+        "slow torque: play and slip are left out",
+        "or self._transmissions or self._slips:\n            return None",
+        "or self._slips:\n            return None",
+        "flexarm_dynamics/test/test_straight_arm.py",
+    ),
+)
+
 TESTS = "flexarm_control/test/"
 LAWS = [
     *of(
@@ -1093,7 +1118,7 @@ LIMITS = [
     ],
 ]
 
-MUTANTS = KERNELS + LAWS + LIMITS
+MUTANTS = KERNELS + MODELS + LAWS + LIMITS
 
 
 def places(mutant, root=ROOT):

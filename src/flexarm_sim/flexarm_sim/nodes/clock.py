@@ -38,8 +38,9 @@ class Clock:
         node.make_timer(LOOK, self.look)
 
     def publish(self, stamp_ns, first):
-        """Publish a stamp [ns] where it is due; `first` of a session: time may have gone back."""
-        if self._due(stamp_ns, first) and not self._silent:
+        """Publish a stamp [ns] where it is due and is read; `first` of a session: time may have gone back."""
+        due = self._due(stamp_ns, first) and not self._silent
+        if due and self._publisher.get_subscription_count():
             set_stamp(self._message.clock, stamp_ns)
             self._publisher.publish(self._message)
 

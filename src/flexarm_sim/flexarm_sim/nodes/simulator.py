@@ -125,8 +125,9 @@ class SimulatorNode(Driver):
         self.publish(self._sample)
 
     def publish(self, sample):
-        self.fill(sample, self.gate.controller_id(self.now()))
-        self.sent = self.faults.outgoing(self.writer.message, self.sim.time)
+        now = self.now()
+        self.fill(sample, self.gate.controller_id(now))
+        self.sent = self.faults.outgoing(self.writer.message, now)
         if self.faults.restarted:
             self.gate.begin((self.gate.session + 1) % WRAP)
         self.send()
@@ -138,9 +139,10 @@ class SimulatorNode(Driver):
 
     def send(self, again=False):
         """Send the messages of the present sample, for the first time or, while simulated time stands still, again."""
+        now = self.now()
         for message in self.sent:
             age = (self.sim.sequence - message.sequence) % WRAP  # a fault may have delayed it
-            then = self.now() - age * self.period
+            then = now - age * self.period
             if self._is_own(message):
                 message.controller_id = self.gate.sent(message.sequence, then)
             message.clock_stopped = again
