@@ -116,6 +116,8 @@ def test_options_choose_the_cases():
         *(f"R, {rate} Hz" for rate in (200, 500, 1000)),
         "long_reach, 500 Hz x 0.25",
     ]
+    at_rest = latency.chosen(options("--at-rest", "--arms", "long_reach"))
+    assert [c.name for c in at_rest] == ["long_reach, 1000 Hz"]
     quick = latency.chosen(options("--quick", "--arms", "R"))
     assert [c.rate for c in quick] == [500.0]
     with pytest.raises(FlexarmError, match=r"is not measured \(R, 200 Hz"):

@@ -3,6 +3,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
@@ -31,6 +32,9 @@ def add_arguments(parser):
     parser.add_argument("--arms", default="R,long_reach", help="of R and long_reach")
     parser.add_argument("--rates", default="200,500,1000", help="of arm R [Hz]")
     parser.add_argument(
+        "--at-rest", action="store_true", help="no motion; long_reach at 1 kHz, not slowed down"
+    )
+    parser.add_argument(
         "--relay-spin",
         choices=("executor", "line"),
         default="executor",
@@ -54,7 +58,10 @@ def chosen(options):
     """Cases that the options ask for."""
     arms, rates = options.arms.split(","), [float(r) for r in options.rates.split(",")]
     rates = [500.0] if options.quick else rates
-    cases = [c for c in CASES if c.arm in arms and (c.arm != "R" or c.rate in rates)]
+    known_cases = CASES
+    if options.at_rest:
+        known_cases = [replace(c, rate=1000.0, pace=1.0) if c.file else c for c in CASES]
+    cases = [c for c in known_cases if c.arm in arms and (c.arm != "R" or c.rate in rates)]
     if not cases:
         known = "; ".join(c.name for c in CASES)
         given = f"{options.arms} at {options.rates} Hz"
@@ -113,7 +120,7 @@ def _beside_the_relay(case, options, progress):
     rounds = options.rounds or (3 if options.quick else 5)
     chains = tuple(CHAINS)[:2] if options.quick else tuple(CHAINS)
     # Planning a motion of many joints takes longer than a quick run may.
-    moving = not (options.quick and case.file)
+    moving = not (options.at_rest or (options.quick and case.file))
     found = measure(case, rounds, chains, options.relay_spin, moving, progress.fraction)
     rows = [{**row, "moving": moving} for row in summary(case, found)]
     return found, rows, table(rows)
