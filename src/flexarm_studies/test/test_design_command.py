@@ -75,8 +75,8 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
 
 
 def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
-    held = []
-    monkeypatch.setattr(plt, "close", held.append)
+    held, close = [], plt.close
+    monkeypatch.setattr(plt, "close", lambda figure: held.append(figure) or close(figure))
     path = tmp_path / "card.svg"
     words = ["design", "R", *LOOP, "--effort", "0.1", "--figure", str(path), "--json"]
     assert main(words) == 0

@@ -74,8 +74,8 @@ def test_the_readme_has_these_numbers(summaries):
 
 
 def test_the_figure_has_all_three_controls_in_four_panels(runs, tmp_path, monkeypatch):
-    held = []
-    monkeypatch.setattr(plt, "close", held.append)
+    held, close = [], plt.close
+    monkeypatch.setattr(plt, "close", lambda figure: held.append(figure) or close(figure))
     arm = arm_file.load("R")
     records = {control: record for control, (record, _) in runs.items()}
     plant = build(scaled(arm, heavier.PAYLOAD))
