@@ -30,7 +30,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 from flexarm_dynamics.errors import MessageError
@@ -116,7 +116,7 @@ class Kalman(Observer):
 
     def _bound_of(self, count):
         """The bound of an innovation squared of so many measurements."""
-        return float(chi2.ppf(self.QUANTILE, max(count, 1)))
+        return float(2.0 * gammaincinv(0.5 * max(count, 1), self.QUANTILE))  # of chi-square
 
     def _prepare(self):
         self.motion = Motion(self.model, self.density)

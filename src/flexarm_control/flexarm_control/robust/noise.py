@@ -2,7 +2,6 @@
 """How much of the sensors' noise the gains pass on to the torque."""
 
 import numpy as np
-from scipy.signal import lfilter
 
 from flexarm_dynamics.arm.strain_map import StrainMap
 
@@ -74,6 +73,8 @@ def _passed(sampling, corner):
 
     `corner` [rad/s]: of a filtered derivative [1/s]; None: of the signal itself [-].
     """
+    from scipy.signal import lfilter  # with scipy.stats a third of a node's start
+
     pulse = np.zeros(SAMPLES)
     pulse[0] = 1.0
     if corner is not None:

@@ -4,7 +4,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import qmc
 
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
@@ -55,6 +54,8 @@ def configurations(arm, seed=0):
             if any(arm.gravity)
             else middle[None]
         )
+    from scipy.stats import qmc  # takes a third of a node's start
+
     drawn = qmc.scale(
         qmc.Halton(n, seed=seed).random(4 if n == 2 else 5), low, np.maximum(high, low + 1e-9)
     )
