@@ -178,7 +178,7 @@ def test_a_goal_that_is_replaced_has_a_result(line):
     bench, arm, client = line
     first, _ = client.send(trajectory((60.0, 0.8)))
     bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
-    second, _ = client.send(trajectory((2.0, 0.1)))
+    second, _ = client.send(trajectory((60.0, 0.1)))
     status, result = client.result(first)
     assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, R.INVALID_GOAL)
     assert result.error_string == "replaced by a newer goal"
