@@ -482,7 +482,12 @@ def test_where_the_joints_go_on_a_clock_has_jumped_and_the_arm_rests_on_its_path
     assert core.reason.startswith(
         "header.stamp: 0.301 s after the last state, and 0 states are missing: its clock"
     )
-    for k in range(501, 2500):  # as if it had been asked to stop
+    follow(core, 501, 300_000_000)
+    follow(other, 501)
+    stamp = sample(600).stamp_ns + 300_000_000
+    refused = core.offer(replace(motion(duration=1.0), stamp_ns=stamp))
+    assert not refused.accepted and "clock jumped" in refused.reason
+    for k in range(502, 2500):  # as if it had been asked to stop
         follow(core, k, 300_000_000)
         follow(other, k)
         assert_array_equal(core.reference.position, other.reference.position)

@@ -506,7 +506,7 @@ def adaptive(arm, **parameters):
 
 def test_a_model_between_two_payloads_is_the_model_of_that_payload(every_size):
     for arm in every_size:
-        q, qd, _ = some_state(arm.n_joints)
+        q, qd, ref = some_state(arm.n_joints)
         believed = PayloadModel(arm)
         assert believed.n_modes == arm.n_modes and believed.arm is arm.arm
         for scale in (1.0, 0.0, 3.5):
@@ -517,6 +517,8 @@ def test_a_model_between_two_payloads_is_the_model_of_that_payload(every_size):
             for name in ("M", "f1", "f2", "C1", "K1", "K2"):
                 a, b = getattr(mine, name), getattr(its, name)
                 assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(np.abs(b).max(initial=0.0), 1e-3))
+            u, wanted = (m.slow_torque(q, qd, ref.acceleration) for m in (believed, other))
+            assert_allclose(u, wanted, rtol=1e-8, atol=1e-9 * max(np.abs(wanted).max(), 1e-3))
 
 
 def test_the_regressor_is_the_torque_of_one_payload_more(rigid, long_reach):

@@ -301,10 +301,8 @@ class ModelFeedforward(Feedforward):
         self._prepared, self._first = None, True
         self._ahead = None  # the result of `look_ahead`
         self._held = None  # position, and the result of `wanted` there, while the reference rests
-        self._begins = (
-            None,
-            False,
-        )  # a state that a path begins from, and whether the preparation's is that
+        # A state that a path begins from, and whether the preparation's is that.
+        self._begins = None, False
 
     def _make_stepper(self):
         n, m = self.model.n_joints, self.model.n_modes

@@ -355,6 +355,10 @@ class ArmController:
             verdict = Verdict(False, f"no valid state: {self.supervisor.reason or 'none yet'}", 0)
         elif self._doubt:
             verdict = Verdict(False, f"a sensor is in doubt: {self._doubt}", 0)
+        elif self._jumped_ns and trajectory.stamp_ns:
+            verdict = Verdict(
+                False, "header.stamp: the source's clock jumped, wait for the arm to rest", 0
+            )
         else:
             verdict = self.reference.offer(trajectory, None if judged else self._judge_torque)
         if verdict.accepted:

@@ -5,6 +5,7 @@ import numpy as np
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import Terms
+from flexarm_dynamics.singular_perturbation import slow_torque
 
 
 class PayloadModel:
@@ -22,6 +23,9 @@ class PayloadModel:
         Payload in parts of the arm file's, set at will [-].
     """
 
+    #: The inertia changes with `scale`.
+    same_inertia = False
+
     def __init__(self, model):
         self._one, self._two = model, model.with_payload(2.0)
         self.scale = 1.0
@@ -38,6 +42,10 @@ class PayloadModel:
     def terms_along(self, motions):
         """As `ArmModel.terms_along`."""
         return self._of(lambda model: model.terms_along(motions))
+
+    def slow_torque(self, q, qd, acceleration):
+        """As `ArmModel.slow_torque`."""
+        return slow_torque(self.terms(q, qd), acceleration)
 
     def _of(self, terms_of):
         """Terms that both models have of one state, or of several, at the present scale."""
