@@ -285,6 +285,42 @@ def test_the_table_counts():
     assert any("lost in 1 runs: joint is … rad off" in line for line in report.reasons(rows))
 
 
+def test_what_is_wanted_of_designs_is_counted():
+    def runs(variant, settling, residual=1e-4, **more):
+        own = row(0, "designed", settling, variant=variant, residual_tip=residual, decay=0.3)
+        return [own | more, row(0, "pid_zvd", 2.0, variant=variant), row(0, "lqr", 4.0)]
+
+    rows = [
+        *runs("exact", 0.3),
+        *runs("payload x0.7", 1.0),
+        *runs("payload x1.3", 1.0, residual=2e-4),  # more than the best baseline's
+        *runs("stiffness x0.9", 2.5, at_rest=False),  # later than the best baseline
+        *runs("stiffness x1.1", None, at_rest=False),
+        *runs("noisy", 1.0, residual=2.9e-4, noise_tip=1e-4),
+    ]
+    names, table = report.reached(rows)
+    assert names == ["designed"]
+    assert [cell.split(" (")[0] for _, _, cell in table] == [
+        "6 of 6", "0 of 1", "1 of 1", "3 of 4", "2 of 4", "1 of 4", "1 of 1",
+    ]  # fmt: skip
+    (found,) = (
+        line[2] for line in report.reached(runs("noisy", 1.0, 3.1e-4, noise_tip=1e-4))[1][1:]
+    )
+    assert found == "0 of 1 (0 %)"
+
+
+def test_what_noise_alone_makes_is_measured_beside_a_noisy_run():
+    case = arm_like_r()
+    setup = CONTROLLERS["pid"](case)
+    alone = trial.run(case, setup, plants.VARIANTS["noise and counts"])["noise_tip"]
+    assert 0.0 < alone < 1e-3
+    assert "noise_tip" not in trial.run(case, setup, plants.VARIANTS["exact"])
+    # The sensors' noise is all there is: with ideal ones an arm that is held does not move.
+    q = specs.from_spec(case.motion, model.build(case.read())).positions[-1]
+    still = trial.of_noise_alone(case, setup, plants.VARIANTS["exact"], np.array(q))
+    assert still < 0.1 * alone
+
+
 def test_arms_that_miss_are_listed_with_what_they_miss():
     rows = [
         row(n, "designed", settling, arm=f"planar1_0_{n}", decay=0.3, **more)

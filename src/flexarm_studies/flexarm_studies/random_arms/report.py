@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import markdown
 from ..uncertain.controllers import BASELINES
+from ..uncertain.trial import JOINT_REST
 
 #: Markers of a seed's table.
 BEGIN, END = "<!-- random arms, seed {}: begin -->", "<!-- random arms, seed {}: end -->"
@@ -31,6 +32,12 @@ LEAST = 0.05
 EQUAL = 0.01
 #: Settled in time: locked periods after the motion [-].
 IN_TIME = 3.0
+#: Plants that differ from the file by what a design is for.
+UNSURE = ("payload x0.7", "payload x1.3", "stiffness x0.9", "stiffness x1.1")
+#: On the exact plant a design settles within [s], and within so many locked periods [-].
+AT_ONCE, SOON = 0.1, 0.5
+#: A residual of less, as a fraction of the reach, is none; one with noise may be so many times what noise alone makes.
+STILL, NOISE = 1e-6, 3.0
 #: So many reasons are listed per controller.
 REASONS = 6
 
@@ -126,6 +133,102 @@ def _in_words(row):
     return settled if row["at_rest"] else f"{settled} ({row['rest_joint_deg']:.2g}°)"
 
 
+def reached(rows):
+    """Cells of the table of what is wanted of designs: the line, what is wanted, and what each design reached.
+
+    Returns
+    -------
+    list of str, list of tuple
+        The designs' names, and the rows.
+    """
+    names = list(dict.fromkeys(row["controller"] for row in rows if "decay" in row))
+    best, smallest = best_baseline(rows), _smallest_residual(rows)
+    own = [[row for row in rows if row["controller"] == name] for name in names]
+
+    def line(words, wanted, right, which=lambda row: True):
+        groups = [[row for row in group if which(row)] for group in own]
+        return words, wanted, *(_share(list(map(right, group))) for group in groups)
+
+    def exact(row):
+        return row["variant"] == "exact"
+
+    def unsure(row):
+        return row["variant"] in UNSURE
+
+    def compared(row):
+        return unsure(row) and (row["number"], row["variant"]) in best
+
+    def no_worse(row):
+        place = row["number"], row["variant"]
+        if not row.get("settled"):
+            return not np.isfinite(best[place])
+        sooner = row["settling_s"] <= best[place] + EQUAL
+        return sooner and row["residual_tip"] <= max(smallest[place], STILL)
+
+    def quiet(row):
+        found, alone = row.get("residual_tip"), row.get("noise_tip")
+        return None not in (found, alone) and found <= max(NOISE * alone, STILL)
+
+    table = [
+        line("neither refused nor lost", "all", lambda row: outcome(row) == "works"),
+        line(
+            f"exact: settled within {AT_ONCE} s",
+            "95 % (`preview`)",
+            lambda row: row.get("settled") and row["settling_s"] <= AT_ONCE,
+            exact,
+        ),
+        line(
+            "exact: settled within half a period",
+            "95 %",
+            lambda row: _periods(row) <= SOON,
+            exact,
+        ),
+        line(
+            "payload and stiffness differ: settled within three periods",
+            "95 %",
+            lambda row: _periods(row) <= IN_TIME,
+            unsure,
+        ),
+        line(
+            f"the same: joints rest within {JOINT_REST}°",
+            "all",
+            lambda row: row.get("at_rest"),
+            unsure,
+        ),
+        line(
+            "the same: settled no later, and no more residual, than the best baseline",
+            "95 %",
+            no_worse,
+            compared,
+        ),
+        line(
+            f"noisy: residual at most {NOISE:g} times what noise alone makes",
+            "all",
+            quiet,
+            lambda row: "noise_tip" in row or (row["variant"] == "noisy"),
+        ),
+    ]
+    return names, [row for row in table if any(cell is not None for cell in row[2:])]
+
+
+def _smallest_residual(rows):
+    """Of the baselines that settle the soonest, by arm and variant, as a fraction of the reach [-]."""
+    best, found = best_baseline(rows), {}
+    for row in rows:
+        place = row["number"], row["variant"]
+        if row["controller"] in BASELINES and row.get("settling_s") == best[place]:
+            found[place] = row["residual_tip"]
+    return found
+
+
+def _share(right):
+    """How many of all, in words; None of none."""
+    if not right:
+        return None
+    count = sum(map(bool, right))
+    return f"{count} of {len(right)} ({100.0 * count / len(right):.0f} %)"
+
+
 def reasons(rows):
     """Lines: why arms were refused or lost, by controller, the commonest first; numbers and names left out."""
     lines = []
@@ -164,6 +267,8 @@ def text(rows, seed):
     lines = [f"{count} arms, seed {seed}.", "", *markdown.table(COLUMNS, rows_of(rows))]
     designs = list(decays(rows))
     if designs:
+        names, table = reached(rows)
+        lines += ["", *markdown.table(("of the runs", "wanted", *names), table)]
         lines += ["", *markdown.table(DECAYS, designs)]
         variants = dict.fromkeys(row["variant"] for row in rows)
         lines += ["", MISSES, "", *markdown.table((*MISSED, *variants), missed(rows))]

@@ -35,6 +35,8 @@ TOLERANCE = 1e-3
 WINDOW, REST = 6.0, 1.0
 #: The run after the motion is at least this long: a loop may be slow on a fast arm [s].
 MIN_WINDOW = 2.0
+#: To see what noise alone makes the arm is only held, for so many times that window: nothing else is left by then [-].
+HOLD = 2.0
 #: Joints are at rest within this of the reference [deg].
 JOINT_REST = 0.02
 #: Samples per second, where neither the controller's parameter ``rate`` nor the variant states another [Hz].
@@ -101,9 +103,7 @@ def run(case, setup, variant, seed=0):
         Ready for JSON: those of `judged`, ``lost`` with the reason where the arm was lost, or ``refused`` alone.
     """
     try:
-        loop = loop_of(case, setup, variant, seed)
-        if setup.law is not None:
-            loop.controller.law = setup.law(loop.model)
+        loop = _prepared(case, setup, variant, seed)
         wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
         motion = wanted if setup.motion is None else setup.motion(loop.model)
         loop.simulator.reset(wanted.positions[0])
@@ -113,7 +113,41 @@ def run(case, setup, variant, seed=0):
         return {"refused": str(error)}
     with np.errstate(over="ignore", invalid="ignore"):
         found = judged(case, loop.simulator.plant_model, _as_wanted(record, wanted, loop), end)
-    return found | ({"lost": loop.lost} if loop.lost else {})
+    if loop.lost:
+        return found | {"lost": loop.lost}
+    if variant.sensors:
+        found["noise_tip"] = of_noise_alone(case, setup, variant, wanted.positions[-1], seed)
+    return found
+
+
+def of_noise_alone(case, setup, variant, q, seed=0):
+    """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
+
+    Over the last `REST` period, as ``residual_tip`` of a run; None where the arm can't be held.
+    """
+    try:
+        loop = _prepared(case, setup, variant, seed)
+        loop.simulator.reset(q)
+        length = HOLD * window_of(case)
+        points = {"times": [0.5 * length, length], "positions": [q, q]}
+        record = loop.follow(scenarios.trajectory_of(points, loop.model, q), length)
+    except FlexarmError:
+        return None
+    if loop.lost:
+        return None
+    last = record.time >= record.time[-1] - REST * case.period
+    tip = tip_path(
+        loop.simulator.plant_model, record.plant_position[last], record.plant_amplitude[last]
+    )
+    return _finite(residual_vibration(tip) / case.read().reach)
+
+
+def _prepared(case, setup, variant, seed):
+    """The loop with the setup's own law, where it has one."""
+    loop = loop_of(case, setup, variant, seed)
+    if setup.law is not None:
+        loop.controller.law = setup.law(loop.model)
+    return loop
 
 
 def loop_of(case, setup, variant, seed=0):
