@@ -57,8 +57,9 @@ def run(
         Rows by arm, controller and variant.
     """
     keep, jobs = Store(path, Specification(seed)), []
-    for number in numbers:
-        for controller in controllers:
+    # All arms under one controller, then under the next: the second one of an arm finds the first one's design.
+    for controller in controllers:
+        for number in numbers:
             left = [v for v in variants if key(number, controller, v) not in keep.results]
             if left:
                 jobs.append((seed, number, controller, left))
