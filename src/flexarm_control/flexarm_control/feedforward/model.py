@@ -21,6 +21,13 @@ torque reaches, as the vertical bending of an arm that only yaws, is left out. I
 inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated. A
 trajectory that arrives while the arm moves is then followed on the slow manifold alone.
 
+Coulomb friction would hold the simulated arm beside the reference, where no integral moves it on. So its torque
+has, in the place of the friction on the reference, which u_ref has, that of its own speeds, sample by sample: friction
+takes just that from the torque, and the arm moves as one without.
+
+At rest s_ref and u_ref are where the control model rests under its own weight. The manifold leaves out products of
+deflections and weight, so that the simulated arm would hang beside the reference.
+
 The manifold jumps wherever the reference's jerk or snap does: between the polynomials of a trajectory, at its start and
 end. The regulator's torque must not. So the jump is added to what the regulator tracks, and fades (module `fading`):
 J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives; likewise for u_ref.
@@ -33,7 +40,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 
-from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import copy
@@ -228,6 +235,8 @@ class _Run:
     Attributes
     ----------
     state, torque : ndarray, shapes (2 (n + m),) and (n,)
+    driven : ndarray, shape (n,)
+        The torque without its Coulomb friction: what moves it [N m].
     fading : Fading
         Of (state, torque).
     source : _Source or None
@@ -237,12 +246,12 @@ class _Run:
     """
 
     def __init__(self, size, n, rate):
-        self.state, self.torque = np.zeros(size), np.zeros(n)
+        self.state, self.torque, self.driven = np.zeros(size), np.zeros(n), np.zeros(n)
         self.fading, self.source, self.gained = Fading(size + n, rate), None, False
 
     def take(self, other):
         """Go on as the other one would."""
-        self.state[:], self.torque[:] = other.state, other.torque
+        self.state[:], self.torque[:], self.driven[:] = other.state, other.torque, other.driven
         self.fading.take(other.fading)
         self.source, self.gained = other.source, other.gained
 
@@ -290,6 +299,8 @@ class ModelFeedforward(Feedforward):
         n, m = model.n_joints, model.n_modes
         self._make_stepper()
         self._substeps = substeps(model, settings.period, METHOD)
+        self._friction = model.friction_table()
+        self._sliding = self._friction * [1.0, 0.0, 1.0]
         self._error, self._no_gain = np.zeros(2 * (n + m)), np.zeros((n, 2 * (n + m)))
         rate = fading_rate(model, settings.configuration)
         self._run, self._spare = (_Run(2 * (n + m), n, rate) for _ in range(2))
@@ -418,7 +429,7 @@ class ModelFeedforward(Feedforward):
         elif held is not None and np.array_equal(held[0], reference.position):
             state, torque = held[1:]
         else:
-            state, torque = self._on_manifold(reference)
+            state, torque = self._at_rest(reference.position)
             self._held = reference.position.copy(), state, torque
         return _Source(path, piece, plan, stamp, state, torque)
 
@@ -426,6 +437,20 @@ class ModelFeedforward(Feedforward):
         """State (2 (n + m),) and torque (n,) of the slow manifold."""
         delta, rate, torque = self.manifold.along(reference)
         return np.concatenate([reference.position, delta, reference.velocity, rate]), torque
+
+    def _at_rest(self, position):
+        """The same where the reference rests: exactly, as the control model bends under its own weight."""
+        model, none = self.model, np.zeros(self.model.n_joints)
+        state, torque = self._on_manifold(at_rest(position))
+        if not any(model.arm.gravity) or not model.n_modes:
+            return state, torque
+        try:
+            delta = model.static_deflection(position)
+        except ModelError:  # it folds there
+            return state, torque
+        terms = model.terms(position, none, delta, np.zeros_like(delta))
+        state[none.size : none.size + delta.size] = delta
+        return state, terms.f1 + terms.K1 @ delta
 
     def _continued(self, source, dt):
         """State and torque that a source would give after a time [s], (2 (n + m) + n,)."""
@@ -459,7 +484,7 @@ class ModelFeedforward(Feedforward):
             fading.clear()
             if not (source.rests or some(reference.velocity) or reference.acceleration.any()):
                 # A motion's first instant: the arm still rests, and the manifold has jumped.
-                rest = np.concatenate(self._on_manifold(at_rest(reference.position)))
+                rest = np.concatenate(self._at_rest(reference.position))
                 fading.jump(rest - np.concatenate([source.state, source.torque]))
         else:
             fading.advance(dt)
@@ -476,12 +501,15 @@ class ModelFeedforward(Feedforward):
             run.state += error
             error[:] = 0.0
         gain = self._no_gain if K is None else K
-        compiled.regulated(source.torque, left, gain, error, self.limit, run.torque)
+        compiled.regulated(
+            source.torque, left, gain, error, self.limit, self._friction, source.state, run.state, run.torque,
+            run.driven,
+        )  # fmt: skip
 
     def _move(self, run, dt):
         """Advance a run's simulated arm, under its present torque."""
         count = max(1, round(dt / self.settings.period)) * self._substeps
-        self._advance(run.state, run.torque, dt / count, count)
+        self._advance(run.state, run.driven, dt / count, count, self._sliding)
 
     def look_ahead(self, reference, dt):
         if self._first or dt <= 0.0 or reference.path is None:

@@ -147,15 +147,30 @@ def off(state, left, own, error):
     return joints, largest
 
 
-def regulated(torque, left, gain, error, limit, out):
-    """Fill `out`, (n,), with a torque, its fading jump, and the regulator's, clipped to the limit; see `off`."""
-    first = error.size
+def regulated(torque, left, gain, error, limit, friction, wanted, own, out, driven):
+    """Fill `out`, (n,), with the torque for a simulated arm; and `driven`, (n,), with what friction leaves of it.
+
+    A torque, its fading jump, the regulator's, and what the Coulomb friction of the arm's own speeds differs by from
+    that of the wanted ones, all clipped to the limit; see `off`.
+
+    Parameters
+    ----------
+    friction : ndarray, shape (n, 3)
+        As of `ArmModel.friction_table`.
+    wanted, own : ndarray, shape (N,)
+        States; as of `off`.
+    """
+    first, half = error.size, error.size // 2
     for i in range(out.size):
-        value = 0.0
+        value, rubs = 0.0, 0.0
         for j in range(first):
             value += gain[i, j] * error[j]
         value += torque[i] + left[first + i]
+        if friction[i, 1] > 0.0:
+            rubs = friction[i, 1] * np.tanh(own[half + i] / friction[i, 2])
+            value += rubs - friction[i, 1] * np.tanh(wanted[half + i] / friction[i, 2])
         out[i] = min(max(value, -limit[i]), limit[i])
+        driven[i] = out[i] - rubs
 
 
 def horner(coefficients, x, out):
