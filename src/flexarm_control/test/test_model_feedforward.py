@@ -14,6 +14,7 @@ from flexarm_control.fading import Fading
 from flexarm_control.feedforward.model import gains_along, path_of, regulator
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import Friction
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
@@ -84,6 +85,31 @@ def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):
     # The manifold's own amplitude is -3 mm there: of the snap with which the motion begins.
     assert_allclose(motion.amplitude, 0.0, atol=1e-12)
     assert_allclose(motion.torque, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("change", ["friction", "weight"])
+def test_the_simulated_arm_comes_to_rest_on_the_reference(two_link, change):
+    """Neither Coulomb friction nor what the manifold leaves out of the weight holds it beside."""
+    rough, arm = Friction(viscous=0.0, coulomb=0.3, smoothing=0.01), two_link.arm
+    if change == "friction":
+        arm = replace(arm, joints=tuple(replace(joint, friction=rough) for joint in arm.joints))
+    else:
+        arm = replace(arm, gravity=(0.0, -0.98, 0.0))
+    model, names, none = build(arm), two_link.joint_names, np.zeros(2)
+    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
+    settings = {"feedforward": "model", "stability_margin": -1000.0}
+    motion = design(model, *laws, {"type": "reference"}, settings).feedforward
+    reference, start, end = ReferenceGenerator(names), np.array([0.0, 0.3]), np.array([0.5, 0.5])
+    reference.start(start, 0)
+    data = trajectory.validate(names, names, 0, [(2000 * MS, end, none, none, [])])
+    verdict = reference.offer(data)
+    assert verdict.accepted
+    motion.take(motion.prepare(data, np.stack([start, none, none])), verdict.trajectory_id)
+    for k in range(8000):
+        reference.sample(k * MS)
+        motion.update(reference, 1e-3 if k else 0.0)
+    assert_allclose(motion.position, end, rtol=0.0, atol=2e-5)
+    assert_allclose(motion.amplitude, model.static_deflection(end), atol=1e-5)
 
 
 def test_jumps_add_up_and_fade_whatever_the_samples():

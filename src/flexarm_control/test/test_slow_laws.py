@@ -790,6 +790,26 @@ def test_joint_pid_pushes_a_joint_that_sticks_beside_its_place_back(two_link):
     assert_allclose(law.feedback(q, moving.velocity, moving), [0.0, 0.0], atol=1e-9)
 
 
+def test_joint_pid_overcomes_the_rest_of_the_friction_by_the_error_alone(two_link):
+    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
+    rough = replace(
+        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    )
+    parts = {"friction": [0.8, 0.1], "breakaway": [0.95, 0.95], "breakaway_rate": 5.0}
+    law = law_of("joint_pid", model.build(rough), **parts)
+    plain = law_of("joint_pid", model.build(rough), friction=[0.8, 0.1])
+    q, ref = np.array([0.002, -10.0]), reference([0.0, 0.0], [0.0, 0.0])
+    wanted = 0.5 * np.array([0.15 * np.tanh(-0.01 / 0.02), 0.85])
+    for speed in (0.0, 0.3):  # whatever the joint's own speed is
+        qd = np.full(2, speed)
+        more = law.feedback(q, qd, ref) - plain.feedback(q, qd, ref)
+        assert_allclose(more, wanted, rtol=1e-12)
+    there = reference([0.002, -10.0], [0.4, -0.4])
+    assert_allclose(law.feedback(q, there.velocity, there), [0.0, 0.0], atol=1e-12)
+    with law.without_friction(), plain.without_friction():
+        assert_allclose(law.feedback(q, qd, ref), plain.feedback(q, qd, ref), rtol=0.0)
+
+
 @pytest.mark.parametrize("bandwidth", [0.0, 50.0])
 def test_a_torque_that_the_integral_takes_over_does_not_go_through_the_low_pass(arm_r, bandwidth):
     gains = {"stiffness": [9.0], "damping": [1.0], "integral": [2.0], "bandwidth": bandwidth}

@@ -66,6 +66,9 @@ FASTEST, NOISIEST = 0.6, 0.03
 #: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
 #: its friction cancelled: as fast as the fastest decay. More would hold it so stiffly that it damps no link any more.
 RETURN = FASTEST * (1.0 - CANCELLED) / CANCELLED
+#: Part of the friction that is overcome where a joint sticks, and `slow.breakaway_rate` over omega_1: at twice that a
+#: light hub hunted.
+BREAKAWAY, BREAKAWAY_RATE = 0.95, 0.5
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,9 @@ class Design:
         if any(self.sampling.friction):
             friction["slow.friction"] = numbers(self.sampling.friction)
             friction["slow.return_rate"] = numbers([self.sampling.return_rate])[0]
+            rubs = np.array(self.sampling.friction) > 0.0
+            friction["slow.breakaway"] = numbers(np.where(rubs, BREAKAWAY, 0.0))
+            friction["slow.breakaway_rate"] = numbers([BREAKAWAY_RATE * self.omega_1])[0]
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,

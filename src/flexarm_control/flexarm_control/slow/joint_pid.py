@@ -23,7 +23,18 @@ which :math:`\bar u` has, is added without the low pass:
 A joint that sticks beside its place is pushed back as if it moved there at the speed :math:`\lambda e`: without that it
 creeps, and the integral grows until it breaks loose. With :math:`\gamma` below 1 friction is left over, whatever the
 delay: by itself this moves no joint whose place is where it is. In turn, where the friction is less than :math:`\gamma`
-of the file's, small movements grow. Linear loops are judged without both.
+of the file's, small movements grow.
+
+Of a light joint that moves far until the torque answers, little can be cancelled so. Where its error alone decides, the
+delay does not turn the torque against it, and nearly all friction can be overcome. So a part :math:`\beta` of the
+friction, less what is cancelled already, is added as for a joint that goes back at the speed :math:`\lambda_\beta e`
+from where it sticks,
+
+.. math:: u_b = \max(\beta - \gamma, 0)\,f_c
+    \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_s) - \tanh(\dot q_{ref}/v_s)] ,
+
+which the friction itself damps: at an amplitude and frequency at which it is a stiffness k, the friction is a damper of
+at least :math:`k/\omega`. Linear loops are judged without these torques.
 
 The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
 an angle: a change of K_w does not move it.
@@ -77,6 +88,13 @@ class JointPid(SlowLaw):
             "Where joint_pid cancels friction, a joint's speed counts as greater by its error times this: one that"
             " sticks beside its place is pushed back."
         ),
+        parameter("breakaway", [0.0], "-", 0.0, 1.0, length="joints").described(
+            "Part of the arm file's Coulomb friction, with what joint_pid cancels of it, that is overcome where a joint"
+            " sticks beside its place."
+        ),
+        parameter("breakaway_rate", 0.0, "1/s", 0.0, 1e4).described(
+            "Speed over error at which a joint goes back from where it sticks, with breakaway."
+        ),
         SCHEDULE,
         BANDWIDTH,
     )
@@ -94,12 +112,13 @@ class JointPid(SlowLaw):
         self._low_pass = LowPass(n, self.parameters["bandwidth"])
         _, coulomb, self._smoothing = model.friction_table().T.copy()
         self._cancelled = np.array(self.parameters["friction"]) * coulomb
-        self._return_rate = self.parameters["return_rate"]
-        self._cancels, self._slides, self._more = (
-            some(self._cancelled),
-            np.zeros((2, n)),
-            np.zeros(n),
+        self._overcome = np.maximum(
+            np.array(self.parameters["breakaway"]) * coulomb - self._cancelled, 0.0
         )
+        rates = self.parameters["return_rate"], self.parameters["breakaway_rate"]
+        self._rates = np.array(rates)[:, None]
+        self._cancels = some(self._cancelled) or some(self._overcome)
+        self._slides, self._more = np.zeros((3, n)), np.zeros(n)
 
     @contextmanager
     def without_friction(self):
@@ -163,13 +182,16 @@ class JointPid(SlowLaw):
         All are (n,), in rad/s; what is returned is in N m.
         """
         slides, more = self._slides, self._more
-        np.multiply(self._error, self._return_rate, out=slides[0])
+        np.multiply(self._rates, self._error, out=slides[:2])
         slides[0] += qd
-        slides[1] = expected
+        slides[1] += expected
+        slides[2] = expected
         slides /= self._smoothing
         np.tanh(slides, out=slides)
-        np.subtract(slides[0], slides[1], out=more)
-        more *= self._cancelled
+        slides[:2] -= slides[2]
+        np.multiply(self._cancelled, slides[0], out=more)
+        slides[1] *= self._overcome
+        more += slides[1]
         return more
 
     def absorb(self, torque):

@@ -163,7 +163,7 @@ def reached(rows):
         if not row.get("settled"):
             return not np.isfinite(best[place])
         sooner = row["settling_s"] <= best[place] + EQUAL
-        return sooner and row["residual_tip"] <= max(smallest[place], STILL)
+        return sooner and row["residual_tip"] <= max(smallest.get(place, np.inf), STILL)
 
     def quiet(row):
         found, alone = row.get("residual_tip"), row.get("noise_tip")
