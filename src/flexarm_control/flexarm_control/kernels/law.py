@@ -155,10 +155,20 @@ def regulated(torque, left, gain, error, limit, friction, wanted, own, out, driv
 
     Parameters
     ----------
+    torque : ndarray, shape (n,)
+        Of the reference.
+    left : ndarray, shape (N + n,)
+        Of the jumps of state and torque.
+    gain : ndarray, shape (n, N)
+        The regulator's.
+    error : ndarray, shape (N,)
+        As `off` fills it.
+    limit : ndarray, shape (n,)
     friction : ndarray, shape (n, 3)
         As of `ArmModel.friction_table`.
     wanted, own : ndarray, shape (N,)
         States; as of `off`.
+    out, driven : ndarray, shape (n,)
     """
     first, half = error.size, error.size // 2
     for i in range(out.size):

@@ -123,7 +123,8 @@ def run(case, setup, variant, seed=0):
 def of_noise_alone(case, setup, variant, q, seed=0):
     """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
 
-    Over the last `REST` period, as ``residual_tip`` of a run; None where the arm can't be held.
+    Over the last `REST` period, as ``residual_tip`` of a run of the same case, setup and variant; None where the arm
+    can't be held.
     """
     try:
         loop = _prepared(case, setup, variant, seed)
