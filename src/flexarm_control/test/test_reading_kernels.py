@@ -124,15 +124,17 @@ def test_gauges_and_velocities_are_found_that_stop_at_once_or_longer_than_their_
 ):
     size, end = 2 * N + G, N + G
     now = sometimes(random, random.normal(size=size), 0.0)
-    still = random.integers(random.choice([0, 6]), 12, size)
+    still = random.integers(random.choice([0, 6]), 15, size)
     smallest, tiny = 0.1 * random.random(size), np.full(size, 1e-3)
     changes, found = random.random((8, size)), np.zeros(size, bool)
     gauges = np.stack([random.random(G), sometimes(random, random.random(G), INF), np.full(G, 9.0)])
-    quiet, mean = still >= 6, changes.mean(axis=0)
-    abrupt = quiet & (mean > 6.0 * smallest) & (mean > tiny)
+    quiet, mean, at = still >= 6, changes.mean(axis=0), int(random.integers(8))
+    order = (at - 1 - still - np.arange(2)[:, None]) % 8
+    slow = changes[order, np.arange(size)].max(axis=0) <= 6.0 * smallest
+    abrupt = quiet & (mean > 6.0 * smallest) & (mean > tiny) & ~(slow & (still < 12))
     silent = (gauges[0] >= 0.5 * gauges[1]) & (still[N:end] >= gauges[2])
     wanted = np.concatenate([[False] * N, abrupt[N:end] | silent, abrupt[end:] & (now[end:] != 0)])
-    frame = COMPILED.stopped(now, still, smallest, changes, tiny, gauges, (6, 6.0), found)
+    frame = COMPILED.stopped(now, still, smallest, changes, at, tiny, gauges, (6, 6.0), found)
     assert frame == (quiet[:end].all() and abrupt[:end].any())
     np.testing.assert_array_equal(found, wanted)
 

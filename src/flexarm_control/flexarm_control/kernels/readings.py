@@ -446,7 +446,7 @@ def follow_joints(
     return some
 
 
-def stopped(readings, still, smallest, changes, tiny, gauges, limits, found):
+def stopped(readings, still, smallest, changes, at, tiny, gauges, limits, found):
     """Find gauges and joint velocities that stand still, and whether all positions and gauges do; see `standstill`.
 
     Parameters
@@ -455,11 +455,13 @@ def stopped(readings, still, smallest, changes, tiny, gauges, limits, found):
         Joint positions, strains, joint velocities.
     still, smallest, tiny : ndarray, shape (N,)
     changes : ndarray, shape (k, N)
-        Before each reading became still.
+        Before each reading became still; a ring.
+    at : int
+        Where the ring's next change goes.
     gauges : ndarray, shape (3, g)
         Noise that was seen, noise that is stated, and how many equal readings that rules out.
     limits : tuple of int and float
-        Samples that count, and the ratio of changes.
+        Samples that count when the last two changes are large, too, else twice as many do; the ratio of changes.
     found : ndarray of bool, shape (N,)
         Filled with those of the gauges and velocities.
 
@@ -477,7 +479,11 @@ def stopped(readings, still, smallest, changes, tiny, gauges, limits, found):
         for k in range(changes.shape[0]):
             mean += changes[k, i]
         mean /= changes.shape[0]
-        abrupt = quiet and mean > times * smallest[i] and mean > tiny[i]
+        bound = times * smallest[i]
+        last = (at - 1 - still[i]) % changes.shape[0]  # -1 is the last row
+        abrupt = quiet and mean > bound and mean > tiny[i]
+        if abrupt and still[i] < 2 * least:
+            abrupt = max(changes[last, i], changes[last - 1, i]) > bound
         if i < end:
             all_quiet &= quiet
             at_once |= abrupt

@@ -5,9 +5,10 @@ A reading is still while it is the same to the last bit. Quantised readings of a
 is a simulated arm that is exactly at rest; therefore stillness alone is no evidence. It is
 
 1. of a strain gauge, of a joint velocity that is not zero, or of the whole frame (all joints and gauges), when it
-   lasts `ABRUPT` samples and began abruptly: over the `BEFORE` samples before, the reading changed by more than
-   `TIMES` times its smallest change so far. A smooth motion that ends, or turns, changes by ever less before it is
-   still: less than twice the step of a converter in a sample.
+   lasts `ABRUPT` samples and began abruptly: over the `BEFORE` samples before, the reading changed on average by more
+   than `TIMES` times its smallest change so far, and so it did in one of the last two. A smooth motion that ends, or
+   turns, changes by ever less before it is still: less than twice the step of a converter in a sample. Where both of
+   the last two changes are smaller, a fast vibration may turn; it is not still for twice `ABRUPT` samples then.
 2. of a gauge whose noise is stated and has been seen: with the probability :math:`p =
    \mathrm{erf}(s/2\sqrt2\sigma)` of the most probable count, s its step, when it lasts N samples with :math:`p^N <
    10^{-14}`. The noise has been seen when the readings' rms in `jumps` is at least half of it.
@@ -136,7 +137,8 @@ class Standstill:
             joints = self._unmoved(readings[:n], torque, dt, amplitude)
         self._gauges[0] = noise
         frame = self._kernels.stopped(
-            readings, still, self._smallest, self._changes, self._tiny, self._gauges, (ABRUPT, TIMES), self._found
+            readings, still, self._smallest, self._changes, self._next, self._tiny, self._gauges, (ABRUPT, TIMES),
+            self._found,
         )  # fmt: skip
         if not frame and not some(self._found):
             return joints, NONE, NONE, False
