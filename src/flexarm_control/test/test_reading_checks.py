@@ -345,9 +345,32 @@ def test_steps_of_the_torque_swing_a_light_joint_between_samples_that_see_it_at_
     assert named == found
 
 
+@pytest.mark.parametrize(("period", "soon"), [(20e-3, True), (24e-3, False)])
+def test_a_velocity_that_swings_near_the_sampling_frequency_is_judged_over_long_windows(
+    period, soon
+):
+    """In 60 samples in a row a swing of the next mode is in the same phase, and takes half of the velocity away."""
+    model = models.build(known_arm())
+    channels = Channels(model, StrainMap(model))
+    assert (channels.fastest * period > 2.0) != soon
+    agreement, named = Agreement(channels), False
+    for k in range(1000):
+        value = np.full(channels.size, np.nan)
+        value[channels.position] = k * period
+        value[channels.velocity] = 0.5 if 400 <= k < 460 else 1.0
+        named |= agreement.update(value, period, 0.0, np.zeros(1)) is not None
+    assert named == soon
+
+
 @pytest.mark.parametrize(
     ("period", "factor", "found"),
-    [(1e-3, 1.3, True), (12e-3, 1.3, False), (12e-3, 2.0, True), (12e-3, 0.5, True)],
+    [
+        (1e-3, 1.3, True),
+        (12e-3, 1.3, False),
+        (12e-3, 2.0, True),
+        (24e-3, 2.0, True),
+        (24e-3, 0.5, True),
+    ],
 )
 def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(period, factor, found):
     model = models.build(known_arm())
@@ -355,7 +378,7 @@ def test_a_velocity_may_be_off_by_more_where_modes_are_fast_for_the_sampling(per
     fastest = channels.model.frequencies(np.zeros(1))[-1]
     assert (fastest * period > 1.0) == (period > 2e-3)
     agreement, named = Agreement(channels), False
-    for k in range(100):
+    for k in range(300):
         value = np.full(channels.size, np.nan)
         value[channels.position], value[channels.velocity] = factor * k * period, 1.0
         named |= agreement.update(value, period, 0.0, np.zeros(1)) is not None

@@ -264,7 +264,8 @@ def agree(
         Step of the torque [N m].
     gain : ndarray, shape (k, n)
     factors : tuple of float
-        Ratio by which a rate may be wrong, what multiplies that which the rule can miss, delay of a filtered rate [s].
+        Ratio by which a rate may be wrong, what multiplies that which the rule can miss, delay of a filtered rate [s],
+        and samples after which a window counts.
     noise : ndarray, shape (2, k)
         Of the difference, and of the rates.
     lengths : tuple of int
@@ -286,7 +287,7 @@ def agree(
     """
     if not is_given(value, pairs[1]):
         return UNKNOWN
-    scale, missed, delay = factors
+    scale, missed, delay, least = factors
     any_wrong = False
     for w in range(len(lengths)):
         ages[1, w] += dt
@@ -307,7 +308,7 @@ def agree(
             bound += missed * windows[MISSED, w, j] + windows[BETWEEN, w, j]
             bound += delay * abs(now - windows[FIRST, w, j]) + noise[0, j]
             bound += 2.0 * late * abs(now) + noise[1, j] * np.sqrt(ages[1, w] * dt)
-            if abs(windows[CHANGED, w, j] - windows[DRIVEN, w, j]) > bound:
+            if ages[0, w] >= least and abs(windows[CHANGED, w, j] - windows[DRIVEN, w, j]) > bound:
                 wrong = True
         run[j] = run[j] + 1 if wrong else 0
         any_wrong |= wrong

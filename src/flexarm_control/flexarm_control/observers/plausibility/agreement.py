@@ -14,7 +14,9 @@ two samples, which begin and end such a swing in the same phase when a mode is a
 `WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are evidence: a sign is wrong, a
 scale by more than s, one of the two stands still, or the value drifts.
 s is 10 %, and 35 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings,
-but a factor of two is found.
+but a factor of two is found. Where a mode turns by more than `ALIASED`, the next one, which the model may not have, can
+be near the sampling frequency. A light joint swings with it, is in the same phase in many samples in a row, and its
+velocity then differs from what the position does on average. Windows count from `LONG` samples on there.
 """
 
 import numpy as np
@@ -30,6 +32,8 @@ PERSISTENT = 4
 SCALE = 0.1
 #: The same, and the factor of what the trapezoidal rule can miss, where modes are fast for the sampling [-].
 FAST_SCALE, FAST_MISSED = 0.35, 2.0
+#: Angle by which a mode turns in a sample from which on its successor may be aliased [rad]; samples that count then.
+ALIASED, LONG = 2.0, 100
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005
 #: Standard deviations that noise may reach.
@@ -96,8 +100,9 @@ class Agreement:
             self._begun = self._kernels.is_given(value, self.pairs[1])
             self._kernels.begin_agreement(value, self.pairs, self._rate, self._windows, self._ages)
             return None
-        fast = self.channels.fastest * dt > 1.0
-        factors = (FAST_SCALE, FAST_MISSED, LATE) if fast else (SCALE, 1.0, LATE)
+        turn = self.channels.fastest * dt
+        scale, missed = (FAST_SCALE, FAST_MISSED) if turn > 1.0 else (SCALE, 1.0)
+        factors = scale, missed, LATE, LONG if turn > ALIASED else 0
         verdict = self._kernels.agree(
             value, self.pairs, dt, jitter, change, self._gain, factors, self._noise, WINDOWS, self._rate,
             self._windows, self._ages, self._run, self._evidence,
