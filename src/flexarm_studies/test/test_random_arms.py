@@ -367,4 +367,4 @@ def test_steps_are_short_enough_for_friction_on_a_light_hub():
     step = trial.longest_step(plant, np.zeros(3))
     hubs = np.diag(np.linalg.inv(plant.terms(np.zeros(3), np.zeros(3)).M))[:3]
     moved = plant.friction_table()[:, 1] * hubs * step**2
-    assert step < 0.3 * trial.STEP and moved.max() == pytest.approx(trial.KICK)
+    assert step < 0.7 * trial.STEP and moved.max() == pytest.approx(trial.KICK)
