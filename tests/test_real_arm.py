@@ -37,7 +37,7 @@ def sections():
 
 
 SECTIONS = sections()
-#: The arm file whose loop may be unstable, and what is said then.
+#: The arm file whose loop may be unstable, and what is reported then.
 LINK_ENCODERS, UNSTABLE = "results/tudor_link.yaml", "the loop is unstable as it is"
 #: Seconds of the recording that stand for those of the page where a command is only tried.
 SHORTER = {"14:60": "56:60", "60:80": "60:63"}
