@@ -116,7 +116,7 @@ def test_commands_of_a_section_work_as_they_are_typed(heading, typed, desk, monk
 
 
 def _as_the_page_says(printed, on_links):
-    """What the simulated controller does is at most twice what the page says: the search for gains rounds."""
+    """What the simulated controller does is at most four times what the page says: the search for gains rounds."""
     if on_links and UNSTABLE in printed:
         return  # so it is with the gains of some processors; play is then not looked at
     pairs = {
@@ -130,7 +130,7 @@ def _as_the_page_says(printed, on_links):
                 np.array(re.findall(x, y), float) for x, y in ((found, printed), (written, PAGE))
             ]
             assert values[0].size and values[0].shape == values[1].shape
-            assert (values[0] < 2.0 * values[1]).all(), values
+            assert (values[0] < 4.0 * values[1]).all(), values
 
 
 def table_of(printed):
