@@ -116,21 +116,24 @@ def test_commands_of_a_section_work_as_they_are_typed(heading, typed, desk, monk
 
 
 def _as_the_page_says(printed, on_links):
-    """What the simulated controller does is at most four times what the page says: the search for gains rounds."""
+    """What the simulated controller does is at most so many times what the page says: the search for gains rounds."""
     if on_links and UNSTABLE in printed:
         return  # so it is with the gains of some processors; play is then not looked at
     pairs = {
-        r"likely to oscillate at ([\d.]+) Hz, the link by \+-([\d.]+) mrad": r"([\d.]+) Hz and ±([\d.]+) mrad",
-        r"settled within 1 mm after \[s\] +([\d.]+)": r"settles within 1 mm ([\d.]+) s",
-        r"vibration 1 to 3 s after it, rms \[mm\] +([\d.]+)": r"vibrates with ([\d.]+) mm",
+        r"likely to oscillate at ([\d.]+) Hz, the link by \+-([\d.]+) mrad": (
+            2.0,
+            r"([\d.]+) Hz and ±([\d.]+) mrad",
+        ),
+        r"settled within 1 mm after \[s\] +([\d.]+)": (2.0, r"settles within 1 mm ([\d.]+) s"),
+        r"vibration 1 to 3 s after it, rms \[mm\] +([\d.]+)": (4.0, r"vibrates with ([\d.]+) mm"),
     }
-    for k, (found, written) in enumerate(pairs.items()):
+    for k, (found, (most, written)) in enumerate(pairs.items()):
         if (k == 0) == on_links:
             values = [
                 np.array(re.findall(x, y), float) for x, y in ((found, printed), (written, PAGE))
             ]
             assert values[0].size and values[0].shape == values[1].shape
-            assert (values[0] < 4.0 * values[1]).all(), values
+            assert (values[0] < most * values[1]).all(), values
 
 
 def table_of(printed):

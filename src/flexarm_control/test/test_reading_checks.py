@@ -308,6 +308,25 @@ def test_a_joint_that_stands_is_not_asked_to_answer_what_another_joints_friction
     assert set(answers) == ({0} if found else set())
 
 
+@pytest.mark.parametrize(
+    ("changes", "still", "found"),
+    [
+        ((-24, -20, -17, -7, -6, -3, -3), 7, False),  # of a simulated gauge that turned
+        ((-24, -20, -17, -7, -6, -3, -3), 13, True),  # no vibration turns so slowly
+        ((-24, -20, -17, -17, -16, -17, -16), 7, True),
+    ],
+)
+def test_a_gauge_that_turns_at_once_does_not_stand_still(changes, still, found):
+    c = channels()
+    checks, gauges, count = Standstill(c), [], 0.0
+    for change in (1, 2, 1, *changes, *(0,) * still):
+        count += change
+        reading = np.full(2 * c.n + c.g, np.nan)
+        reading[c.n : c.n + c.g] = 1e-6 * count
+        gauges += checks.update(reading, np.full(c.n, np.nan), np.zeros(c.g), PERIOD)[1].tolist()
+    assert bool(gauges) == found
+
+
 def test_joint_is_light_if_it_is_so_in_one_configuration():
     """A joint of small inertia elsewhere does not hide it."""
 

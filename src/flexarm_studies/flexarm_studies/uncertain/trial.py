@@ -39,7 +39,7 @@ MIN_WINDOW = 2.0
 #: To see what noise alone makes the arm is only held, for so many times that window: nothing else is left by then [-].
 HOLD = 2.0
 #: Its motion leads nowhere and is short: a long one takes long to plan [s].
-AT_ONCE = 0.1, 0.2
+SHORT = 0.1, 0.2
 #: Joints are at rest within this of the reference [deg].
 JOINT_REST = 0.02
 #: Samples per second, where neither the controller's parameter ``rate`` nor the variant states another [Hz].
@@ -133,7 +133,7 @@ def of_noise_alone(case, setup, variant, q, seed=0):
         loop = _prepared(case, setup, variant, seed)
         loop.simulator.reset(q)
         length = HOLD * window_of(case)
-        points = {"times": list(AT_ONCE), "positions": [q, q]}
+        points = {"times": list(SHORT), "positions": [q, q]}
         record = loop.follow(scenarios.trajectory_of(points, loop.model, q), length)
     except FlexarmError:
         return None
