@@ -279,7 +279,7 @@ def test_the_table_counts():
     ]
     table = dict(zip(("default", "lqr", "pid_ei"), report.rows_of(rows), strict=True))
     # works, refused, lost, settled, within 3 periods, periods until settled, at rest, no later than the best baseline
-    assert table["default"][2:10] == (2, 1, 1, 2, 1, "4", 2, 1)
+    assert table["default"][2:10] == (2, 1, 1, 2, 1, "4 (never)", 2, 1)
     assert table["default"][10] == "1.5° (2°)"
     assert table["lqr"][9] is None
     assert any("lost in 1 runs: joint is … rad off" in line for line in report.reasons(rows))

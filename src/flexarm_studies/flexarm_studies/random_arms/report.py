@@ -13,9 +13,9 @@ from ..uncertain.trial import JOINT_REST
 #: Markers of a seed's table.
 BEGIN, END = "<!-- random arms, seed {}: begin -->", "<!-- random arms, seed {}: end -->"
 COLUMNS = (
-    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "periods until settled, median",
+    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "periods until settled, median (worst)",
     "joints at rest", "no later than the best baseline", "peak joint error, median (worst)",
-    "residual, median [1e-3 reach]",
+    "residual, median (worst) [1e-3 reach]",
 )  # fmt: skip
 DECAYS = (
     "designs", "arms", "worst-case decay, median of one link (wanted: 0.3)", "median of all (0.15)", "the least (0.05)",
@@ -92,17 +92,19 @@ def _cells(group, best):
         sum(row["at_rest"] for row in works),
         no_later,
         f"{np.median(peaks):.2g}° ({max(peaks):.2g}°)" if peaks else None,
-        f"{np.median(residual):.2g}" if residual else None,
+        f"{np.median(residual):.2g} ({max(residual):.2g})" if residual else None,
     )
 
 
 def _median_periods(group):
-    """Locked periods until settled, in the median of all runs that were not refused, in words."""
+    """Locked periods until settled, median and worst of all runs that were not refused, in words."""
     periods = [_periods(row) for row in group if outcome(row) != "refused"]
     if not periods:
         return None
-    median = np.median(periods)
-    return f"{median:.2g}" if np.isfinite(median) else "never"
+    median, worst = (
+        f"{of(periods):.2g}" if np.isfinite(of(periods)) else "never" for of in (np.median, np.max)
+    )
+    return f"{median} ({worst})"
 
 
 def _periods(row):
