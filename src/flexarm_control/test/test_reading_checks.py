@@ -381,6 +381,19 @@ def test_a_velocity_that_swings_near_the_sampling_frequency_is_judged_over_long_
     assert named == soon
 
 
+@pytest.mark.parametrize("period", [12e-3, 24e-3])
+def test_a_velocity_of_the_wrong_sign_is_found_at_once_however_fast_the_modes_are(period):
+    model = models.build(known_arm())
+    channels = Channels(model, StrainMap(model))
+    agreement, found = Agreement(channels), []
+    for k in range(60):
+        value = np.full(channels.size, np.nan)
+        value[channels.position], value[channels.velocity] = -k * period, 1.0
+        if agreement.update(value, period, 0.0, np.zeros(1)) is not None:
+            found.append(k)
+    assert found and found[0] < 24
+
+
 @pytest.mark.parametrize(
     ("period", "factor", "found"),
     [

@@ -265,7 +265,7 @@ def agree(
     gain : ndarray, shape (k, n)
     factors : tuple of float
         Ratio by which a rate may be wrong, what multiplies that which the rule can miss, delay of a filtered rate [s],
-        and samples after which a window counts.
+        and samples from which on that ratio counts: before, only an opposite sign does.
     noise : ndarray, shape (2, k)
         Of the difference, and of the rates.
     lengths : tuple of int
@@ -304,11 +304,12 @@ def agree(
             windows[MISSED, w, j] += miss
             windows[BETWEEN, w, j] += between
             windows[CHANGED, w, j] = at - windows[START, w, j]
-            bound = scale * larger(abs(windows[CHANGED, w, j]), abs(windows[DRIVEN, w, j]))
+            ratio = scale if ages[0, w] >= least else 1.0
+            bound = ratio * larger(abs(windows[CHANGED, w, j]), abs(windows[DRIVEN, w, j]))
             bound += missed * windows[MISSED, w, j] + windows[BETWEEN, w, j]
             bound += delay * abs(now - windows[FIRST, w, j]) + noise[0, j]
             bound += 2.0 * late * abs(now) + noise[1, j] * np.sqrt(ages[1, w] * dt)
-            if ages[0, w] >= least and abs(windows[CHANGED, w, j] - windows[DRIVEN, w, j]) > bound:
+            if abs(windows[CHANGED, w, j] - windows[DRIVEN, w, j]) > bound:
                 wrong = True
         run[j] = run[j] + 1 if wrong else 0
         any_wrong |= wrong

@@ -16,7 +16,8 @@ scale by more than s, one of the two stands still, or the value drifts.
 s is 10 %, and 35 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings,
 but a factor of two is found. Where a mode turns by more than `ALIASED`, the next one, which the model may not have, can
 be near the sampling frequency. A light joint swings with it, is in the same phase in many samples in a row, and its
-velocity then differs from what the position does on average. Windows count from `LONG` samples on there.
+velocity then differs from what the position does on average. There s counts from `LONG` samples of a window on; before
+it is 1, which finds a wrong sign alone.
 """
 
 import numpy as np
