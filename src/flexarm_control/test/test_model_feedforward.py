@@ -6,16 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control import trajectory
 from flexarm_control.composite.design import design
 from flexarm_control.fading import Fading
 from flexarm_control.feedforward.model import gains_along, path_of, regulator
 from flexarm_control.trajectory import ReferenceGenerator
+from flexarm_control.trajectory.path import SlowedPath
+from flexarm_control.trajectory.scaling import ScaledPath, TimeLaw
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Friction
-from flexarm_dynamics.linear import linear_plant, sampled
+from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models.model import build
 
 MS = 1_000_000
@@ -69,8 +71,34 @@ def test_regulators_hold_everywhere_along_a_motion_there_and_back():
     gains, state = gains_along(model, path, period), np.zeros((3, 4))
     for t in np.linspace(0.0, 5.02, 50):
         path.evaluate(round(t * 1e9), state)
-        Phi, Gamma = sampled(*linear_plant(model, state[0], coulomb=False), period)
-        assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains.at(t))).max() < 1.0, t
+        for plant in (linear_plant(model, state[0], coulomb=False), moving_plant(model, *state)):
+            Phi, Gamma = sampled(*plant, period)
+            assert np.abs(np.linalg.eigvals(Phi - Gamma @ gains.at(t))).max() < 1.0, t
+
+
+def test_a_stop_on_the_way_ends_with_the_regulator_of_the_arm_at_rest(two_link):
+    names, still, start = two_link.joint_names, np.zeros(2), np.array([0.0, 0.3])
+    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
+    settings = {"feedforward": "model", "stability_margin": -1000.0}
+    motion = design(two_link, *laws, {"type": "reference"}, settings).feedforward
+    points = [(800 * MS, np.array([1.2, 1.0]), still, still, [])]
+    data = trajectory.validate(names, names, 0, points)
+    prepared = motion.prepare(data, np.stack([start, still, still]))
+    path, t = path_of(data, np.stack([start, still, still])), 0.2
+    path.begin(0, np.stack([start, still, still]))
+    stop = SlowedPath(path, round(t * 1e9), 400 * MS)
+    moving, resting = prepared.gains.at(t), prepared.at_rest.at(t)
+    assert np.abs(moving - resting).max() > 1e-3 * np.abs(moving).max()
+    assert_array_equal(prepared.at(t, path, round(t * 1e9)), moving)
+    assert_array_equal(prepared.at(t, stop, round(t * 1e9)), moving)
+    assert_array_equal(prepared.at(t, stop, 700 * MS), resting)
+    half = next(k for k in range(200, 600) if stop.speed(k * MS) < np.sqrt(0.5)) * MS
+    share = stop.pace(half) ** 2
+    assert_allclose(prepared.at(t, stop, half), share * moving + (1.0 - share) * resting)
+    # At half the speed the acceleration is a quarter.
+    slow = ScaledPath(path, TimeLaw(0, 0.0, 0.5))
+    assert slow.pace(100 * MS) == 0.5
+    assert_allclose(prepared.at(t, slow, 100 * MS), 0.25 * moving + 0.75 * resting)
 
 
 def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):

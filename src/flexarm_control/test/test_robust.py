@@ -168,6 +168,28 @@ def test_a_joint_that_sticks_is_as_stiff_as_its_return_makes_it(two_link):
     K = np.zeros((2, plain.N.shape[0]))
     K[:, :2] = 0.5 * 0.8 * 5.0 * 0.02 / 0.01 * np.eye(2)
     assert_allclose(stiff.F, plain.F - plain.G @ K @ plain.N, atol=1e-12)
+    # What is overcome beyond that: 0.95 - 0.8 of the damper, at a speed of 20 e.
+    more = replace(sampling, breakaway=(0.95, 0.0), breakaway_rate=20.0)
+    stiffer = sampled_loop(rough, rough, q, more, sticking=0.5)
+    K[0, 0] += 0.5 * 0.15 * 20.0 * 0.02 / 0.01
+    assert_allclose(stiffer.F, plain.F - plain.G @ K @ plain.N, atol=1e-12)
+
+
+def test_a_joint_that_sticks_creeps_back_as_fast_as_its_friction_and_breakaway_say(two_link):
+    r"""Of a steep friction: s = -(gamma lambda + (beta - gamma) lambda_b) / (1 - gamma), whatever the arm is."""
+    friction = replace(two_link.arm.joints[0].friction, coulomb=20.0, smoothing=1e-3)
+    joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    rough, q = build(replace(two_link.arm, joints=joints)), np.array([0.0, 0.7])
+    gamma, beta, back, loose = 0.5, 0.9, 2.0, 3.0
+    sampling = Sampling(
+        1e-4, 0.0, np.inf, 300.0, np.inf, (gamma,) * 2, back, (beta,) * 2, loose
+    )  # fmt: skip
+    loop = sampled_loop(rough, rough, q, sampling, sticking=1.0)
+    s = np.log(np.linalg.eigvals(loop.F).astype(complex) + 1e-300) / 1e-4
+    wanted = -(gamma * back + (beta - gamma) * loose) / (1.0 - gamma)
+    slow = s[(np.abs(s) > 0.1) & (np.abs(s) < 10.0) & (np.abs(s.imag) < 1e-3)]
+    assert len(slow) == 2
+    assert_allclose(slow.real, wanted, rtol=1e-2)
 
 
 def test_less_friction_is_cancelled_of_a_joint_that_moves_far_until_the_torque_can_answer(

@@ -46,15 +46,14 @@ def jacobian(function, x, step=STEP):
 
 
 def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
-    """A of the arm (2) linearised at rest, of the state (q, delta, qd, delta_d).
+    """A of the arm (2) linearised in a state (q, delta, qd, delta_d) under a torque.
 
     Parameters
     ----------
     model : ArmModel
     state : ndarray, shape (2 (n + m),)
-        Its rates are zero.
     torque : ndarray, shape (n,), or 0.0
-        That holds the arm there [N m].
+        [N m]
     coulomb : bool
         With Coulomb friction as steep as its smoothing makes it at rest, as a law that compensates it takes it to
         be; False: with viscous friction only, as when the arm moves.
@@ -102,6 +101,40 @@ def linear_plant(model, q, coulomb=True):
     # The arm is exactly linear in the torque: a step of one.
     B = jacobian(lambda u: model.derivative(rest, hold + u), np.zeros(n), step=1.0)
     return A, B
+
+
+def moving_plant(model, q, velocity, acceleration):
+    r"""The arm (2) linearised about a motion, at one time of it: "frozen" there.
+
+    Its links are bent as slow motions bend them, :math:`K_2\delta = -f_2(q, \dot q) - M_{21}\ddot q`, the torque is the
+    one that gives the joints their acceleration, and Coulomb friction is what it is in a joint that moves on: constant.
+    At rest it is `linear_plant` without Coulomb friction, but for products of deflections and weight.
+
+    Parameters
+    ----------
+    model : ArmModel
+    q, velocity, acceleration : ndarray, shape (n,)
+        [rad], [rad/s], [rad/s^2]
+
+    Returns
+    -------
+    A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
+        As of `linear_plant`.
+    """
+    model = model.without_play()
+    n, m = model.n_joints, model.n_modes
+    terms = model.terms(q, velocity)
+    state = np.zeros(2 * (n + m))
+    state[:n], state[n + m : 2 * n + m] = q, velocity
+    state[n : n + m] = np.linalg.solve(terms.K2, -terms.f2 - terms.M[n:, :n] @ acceleration)
+    joints = slice(n + m, 2 * n + m)
+    free = np.array(model.derivative(state, np.zeros(n)))
+    B = jacobian(lambda u: model.derivative(state, u), np.zeros(n), step=1.0)
+    torque = np.linalg.solve(B[joints], acceleration - free[joints])
+    # `state_matrix` has viscous friction alone: what Coulomb friction takes at this speed, it takes all the time.
+    taken = model.friction(velocity, state[n : n + m], np.zeros(m))
+    torque -= taken - model.friction_table()[:, 0] * velocity
+    return state_matrix(model, state, torque, coulomb=False), B
 
 
 def softened(model, q, A, place, transmission, fraction):

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from flexarm_dynamics import linear
@@ -91,6 +92,38 @@ def test_linear_plant_is_the_arms_equations_at_rest(shipped, name):
     if not any(model.arm.gravity):
         assert_allclose(A[n + m :, n : n + m], -t.H @ K, rtol=1e-6, atol=1e-6 * np.abs(A).max())
         assert_allclose(A[n + m :, 2 * n + m :], -t.H @ C, rtol=1e-6, atol=1e-8 * np.abs(A).max())
+
+
+@pytest.mark.parametrize("name", ["R", "two_link", "long_reach"])
+def test_the_plant_about_a_motion_is_that_of_small_deviations_from_it(shipped, name):
+    """Two nearby states a tenth of a millisecond on, under the torque of the motion, and the transition matrix."""
+    model = shipped(name)
+    n, half, rng = model.n_joints, model.n_joints + model.n_modes, np.random.default_rng(0)
+    q, qd, qdd = rng.uniform(-0.8, 0.8, (3, n))
+    A, B = linear.moving_plant(model, q, qd, qdd)
+    terms, state, dt = model.terms(q, qd), np.zeros(2 * half), 1e-4
+    state[:n], state[half : half + n] = q, qd
+    state[n:half] = np.linalg.solve(terms.K2, -terms.f2 - terms.M[n:, :n] @ qdd)
+    none, joints = np.zeros(n), slice(half, half + n)
+    viscous, move = model.friction_table()[:, 0], 1e-6 * rng.standard_normal(2 * half)
+
+    def accelerated(s, u):
+        """Under viscous friction alone."""
+        speed = s[joints]
+        rubs = model.friction(speed, s[n:half], s[half + n :]) - viscous * speed
+        return np.array(model.derivative(s, u + rubs))
+
+    torque = np.linalg.solve(B[joints], qdd - accelerated(state, none)[joints])
+    assert_allclose(accelerated(state, torque)[joints], qdd, rtol=1e-8, atol=1e-8)
+
+    def after(start):
+        return solve_ivp(
+            lambda _, s: accelerated(s, torque), (0.0, dt), start, rtol=1e-12, atol=1e-14
+        ).y[:, -1]
+
+    found, wanted = after(state + move) - after(state - move), 2.0 * expm(A * dt) @ move
+    for part in (slice(half), slice(half, None)):
+        assert np.abs(found - wanted)[part].max() < 1e-3 * np.abs(wanted[part]).max()
 
 
 def test_coulomb_friction_at_rest_is_left_out_on_request(shipped):

@@ -11,10 +11,14 @@ import yaml
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
+from flexarm_control.feedforward import base
+from flexarm_control.feedforward.model import ModelFeedforward, path_of
+from flexarm_control.feedforward.preview import Preview
 from flexarm_control.robust.design import Settings, design
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models import model
 from flexarm_studies.random_arms import command, generator, report, study
 from flexarm_studies.uncertain import baselines, plants, trial
@@ -41,6 +45,55 @@ def test_an_arm_with_light_hubs_has_gains_by_a_low_pass():
     law = control(model.build(found.arm), found.parameters())
     for part in (law.slow, law.fast):
         assert part.parameters["bandwidth"] == pytest.approx(found.sampling.torque_corner, rel=1e-5)
+
+
+# --------------------------------------------------------------------------- feed-forwards
+
+
+def reference_manifold(known):
+    return control(known, {"slow.type": "joint_pid", "stability_margin": -1000.0}).manifold
+
+
+def prepared(number, kind):
+    """The arm's model, the path of its motion, and what a feed-forward makes of it."""
+    case = generator.arm(number)
+    known = model.build(case.read().known)
+    n = known.n_joints
+    motion = specs.trajectory_of(case.motion, known, np.zeros(n))
+    start = np.zeros((3, n))
+    start[0] = motion.positions[0]
+    settings = base.Settings(2e-3, start[0])
+    forward = kind(known, reference_manifold(known), settings)
+    forward.limit = known.arm.torque_limits
+    return known, path_of(motion, start), forward.prepare(motion, start)
+
+
+def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not():
+    known, path, found = prepared(10, ModelFeedforward)
+    state, resting = np.zeros((3, known.n_joints)), []
+    for t in np.linspace(0.0, 1e-9 * path.duration_ns, 60):
+        path.evaluate(min(round(t * 1e9), path.duration_ns - 1), state)
+        Phi, Gamma = sampled(*moving_plant(known, *state), 2e-3)
+        assert np.abs(np.linalg.eigvals(Phi - Gamma @ found.gains.at(t))).max() < 1.0, t
+        K = found.at_rest.at(t)
+        resting.append(np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max())
+        Phi, Gamma = sampled(*linear_plant(known, state[0], coulomb=False), 2e-3)
+        assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < 1.0, t
+    assert max(resting) > 1.05
+
+
+def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
+    _, _, found = prepared(7, Preview)
+    assert found.plan is None and found.note.startswith(
+        "preview: no motion within the torque limits"
+    )
+    assert found.gains is not None
+
+
+def test_a_mode_that_no_joint_moves_is_not_planned():
+    known, _, found = prepared(41, Preview)
+    assert found.plan is not None and not found.note
+    assert (np.abs(found.plan.torque) <= known.arm.torque_limits).all()
 
 
 # --------------------------------------------------------------------------- the generator

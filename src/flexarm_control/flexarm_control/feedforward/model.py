@@ -18,8 +18,10 @@ The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the j
 :math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`. omega_1 is the lowest bending
 frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. A mode that no
 torque reaches, as the vertical bending of an arm that only yaws, is left out. If the arm's
-inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated. A
-trajectory that arrives while the arm moves is then followed on the slow manifold alone.
+inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated: about
+the arm as it moves there (`moving_plant`), since one that is bent by its acceleration answers otherwise than one at
+rest; for a stop on the way also about the arm at rest. A trajectory that arrives while the arm moves is then followed
+on the slow manifold alone.
 
 Coulomb friction would hold the simulated arm beside the reference, where no integral moves it on. So its torque
 has, in the place of the friction on the reference, which u_ref has, that of its own speeds, sample by sample: friction
@@ -41,7 +43,7 @@ import numpy as np
 from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 
 from flexarm_dynamics.errors import DesignError, ModelError
-from flexarm_dynamics.linear import linear_plant, sampled
+from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models.fixed_step import METHODS, substeps
 from flexarm_dynamics.models.model import copy
 
@@ -60,8 +62,10 @@ DECAY = 0.3
 METHOD = "dop853"
 #: Beyond this joint error the simulated arm starts again on the reference [rad].
 LOST = 1.0
-#: Largest turn of a joint between two designs along a trajectory [rad].
-APART = 0.12
+#: Largest turn of a joint [rad], and of the lowest mode's phase [rad], between two designs along a trajectory.
+APART, PHASE = 0.12, 0.5
+#: Times of a trajectory at which one may be.
+GRID = 400
 #: Relative change of the plant with the joints below which one gain serves everywhere.
 NEGLIGIBLE = 1e-6
 #: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
@@ -73,14 +77,15 @@ THERE = 1e-9
 SAME_START = 1e-6
 
 
-def regulator(model, q, period):
-    """Optimal gain K_s of the whole arm at rest in a configuration, shape (n, 2 (n + m)); see the module.
+def regulator(model, q, period, velocity=None, acceleration=None):
+    """Optimal gain K_s of the whole arm in a configuration, shape (n, 2 (n + m)); see the module.
 
-    Where the torque is held for a `period` [s] that is too long for the gain of continuous time, as with modes near
-    the sampling frequency, it is the optimal gain of sampled time.
+    With a `velocity` and an `acceleration` (n,) of its joints it moves; without, it rests. Where the torque is held for
+    a `period` [s] that is too long for the gain of continuous time, as with modes near the sampling frequency, it is
+    the optimal gain of sampled time.
     """
     n, omega = model.n_joints, lowest(model, q)
-    A, B = linear_plant(model, q, coulomb=False)
+    A, B = _plant(model, q, velocity, acceleration)
     Q = np.zeros(A.shape)
     inertia = np.diag(model.terms(q, np.zeros(n)).M)[:n]
     Q[:n, :n] = np.diag((inertia * omega**2) ** 2)
@@ -102,6 +107,12 @@ def regulator(model, q, period):
             hint="set feedforward: none",
         ) from None
     return K @ V.T
+
+
+def _plant(model, q, velocity=None, acceleration=None):
+    if velocity is None:
+        return linear_plant(model, q, coulomb=False)
+    return moving_plant(model, q, velocity, acceleration)
 
 
 def reached(A, B):
@@ -146,8 +157,18 @@ class Preparation:
 
     start: np.ndarray  # state of the reference that it begins from, (3, n)
     gains: Gains | None
+    at_rest: Gains | None = None  # for a stop on the way
     plan: object = None  # a `preview.Plan`
     trajectory_id: int = 0  # 0 until it is accepted
+    note: str = ""  # why there is no plan though one is wanted
+
+    def at(self, elapsed, path, stamp_ns):
+        """Gain at a time since the start [s]; on a path that is slowed down, what bends the arm falls as s'^2."""
+        K, moves = self.gains.at(elapsed), min(path.pace(stamp_ns) ** 2, 1.0)
+        if moves < 1.0:
+            K *= moves
+            K += (1.0 - moves) * self.at_rest.at(elapsed)
+        return K
 
 
 def path_of(trajectory, start):
@@ -159,31 +180,37 @@ def path_of(trajectory, start):
     return path
 
 
-def gains_along(model, path, period):
+def gains_along(model, path, period, moving=True):
     """`Gains` along a path for samples of a `period` [s], checked on the path at `CHECKS` times of each interval.
 
-    An interval whose interpolated gain does not hold the arm there is halved, while a joint turns by more than
-    `NEAREST` in it.
+    They are for the arm as it moves there, or, not `moving`, for one that rests there. An interval whose interpolated
+    gain does not hold the arm is halved, while a joint turns by more than `NEAREST` in it.
 
     Raises
     ------
     DesignError
         Where a configuration has no regulator, or the gain of so short an interval does not hold.
     """
-    n, state = model.n_joints, np.zeros((3, model.n_joints))
-    grid = np.linspace(0.0, path.duration_ns / SECOND, 400)
-    q = np.empty((grid.size, n))
-    for k, t in enumerate(grid):
+    grid = np.linspace(0.0, path.duration_ns / SECOND, GRID)
+    states = np.empty((grid.size, 3, model.n_joints))
+    for t, state in zip(grid, states, strict=True):
         path.evaluate(min(round(t * SECOND), path.duration_ns - 1), state)
-        q[k] = state[0]
+    q = states[:, 0]
     way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
     count = int(np.ceil(way[-1] / APART)) + 1
-    at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], count))).tolist()
-    gains = [regulator(model, q[k], period) for k in at]
+    at = {*np.searchsorted(way, np.linspace(0.0, way[-1], count)).tolist()}
+    if moving:
+        phase = grid[-1] * lowest(model, q[0])
+        times = np.linspace(0.0, grid[-1], int(np.ceil(phase / PHASE)) + 1)
+        at |= {*np.searchsorted(grid, times).tolist()}
+    else:
+        states = states[:, :1]
+    at = sorted(at)
+    gains = [_regulator_of(model, states[k], period) for k in at]
     i = 0
     while i < len(at) - 1:
         here, there = at[i], at[i + 1]
-        if _hold_between(model, q[here : there + 1], gains[i : i + 2], period):
+        if _hold_between(model, states[here : there + 1], gains[i : i + 2], period):
             i += 1
             continue
         if way[there] - way[here] <= NEAREST or there - here < 2:
@@ -194,16 +221,21 @@ def gains_along(model, path, period):
             )
         middle = (here + there) // 2
         at.insert(i + 1, middle)
-        gains.insert(i + 1, regulator(model, q[middle], period))
+        gains.insert(i + 1, _regulator_of(model, states[middle], period))
     return Gains(grid[at], np.array(gains))
 
 
-def _hold_between(model, q, gains, period):
-    """Whether the gains of both ends, linear in time, hold the sampled arm in the configurations between, q (k, n)."""
-    steps = len(q) - 1
+def _regulator_of(model, state, period):
+    """`regulator` of an arm in a state (position, velocity, acceleration), (3, n), or at rest in a (1, n) position."""
+    return regulator(model, state[0], period, *state[1:])
+
+
+def _hold_between(model, states, gains, period):
+    """Whether the gains of both ends, linear in time, hold the sampled arm in the states between, (k, 3 or 1, n)."""
+    steps = len(states) - 1
     for k in np.unique(np.linspace(0, steps, CHECKS + 2).astype(int))[1:-1]:
         K = gains[0] + k / steps * (gains[1] - gains[0])
-        Phi, Gamma = sampled(*linear_plant(model, q[k], coulomb=False), period)
+        Phi, Gamma = sampled(*_plant(model, *states[k]), period)
         if np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() >= 1.0:
             return False
     return True
@@ -365,11 +397,19 @@ class ModelFeedforward(Feedforward):
     def prepare(self, trajectory, start):
         # A model of its own: the loop goes on with this one meanwhile.
         model, path = copy(self.model), path_of(trajectory, start)
-        gains = None if self.K is not None else gains_along(model, path, self.settings.period)
-        return Preparation(start, gains, self._plan(model, path, start))
+        found = Preparation(start, None)
+        if self.K is None:
+            period = self.settings.period
+            found.gains = gains_along(model, path, period)
+            found.at_rest = gains_along(model, path, period, moving=False)
+        try:
+            found.plan = self._plan(model, path, start)
+        except DesignError as error:
+            found.note = str(error)
+        return found
 
     def _plan(self, model, path, start):
-        """A `Plan` that is followed in place of the slow manifold, if any."""
+        """A `Plan` that is followed in place of the slow manifold, if any; a `DesignError` where there is none."""
 
     def take(self, plan, trajectory_id):
         if plan is not None:
@@ -479,7 +519,7 @@ class ModelFeedforward(Feedforward):
         source, before = self._source(reference, prepared), run.source
         K, fading = self.K, run.fading
         if K is None and prepared is not None and prepared.gains is not None:
-            K = prepared.gains.at(elapsed)
+            K = prepared.at(elapsed, reference.path, reference.stamp_ns)
         if self._first or before is None:
             fading.clear()
             if not (source.rests or some(reference.velocity) or reference.acceleration.any()):

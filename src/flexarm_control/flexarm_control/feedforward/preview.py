@@ -59,6 +59,8 @@ SMOOTHNESS = 0.01
 STABLE = 1.5
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
+#: A mode that the shift moves by less than this of what it moves the others by is left as it is [-].
+UNMOVED = 1e-6
 #: A longer motion is not planned [samples].
 MAX_STEPS = 20_000
 
@@ -303,9 +305,12 @@ class _Planner:
         forced, end = self._respond(), free[-1]
         A = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
         b = -np.concatenate([self.modal @ (end[0] - self.rest), self.modal @ end[1]])
-        # On one scale: deflections are thousandths.
-        scale = 1.0 / np.maximum(np.abs(A).max(axis=1), 1e-30)
-        A, b = A * scale[:, None], b * scale
+        # On one scale: deflections are thousandths. A mode that no joint moves is left as it is.
+        largest = np.abs(A).max(axis=1)
+        moved = (largest.reshape(2, -1) > UNMOVED * largest.reshape(2, -1).max(1)[:, None]).all(0)
+        moved = np.tile(moved, 2)
+        scale = 1.0 / largest[moved]
+        A, b = A[moved] * scale[:, None], b[moved] * scale
         each = slice(None, None, max(1, self.steps // GRID))
         u, du = u[each], self._torque(forced)[each]
         change = self._least_squares(c, A, b)

@@ -102,13 +102,16 @@ class TrajectoryInbox:
         try:
             if feedforward is not None and feedforward.plans and start is not None and whole:
                 plan = self._designer.prepare(feedforward, ahead, start)
+                note = getattr(plan, "note", "")
+                if note:
+                    self._node.get_logger().warning(f"trajectory without preview: {note}")
         except CancelledError:
             return
         except Exception as error:
             if self._designer.closed:
                 return
             kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
-            self._node.get_logger().warning(f"trajectory without preview: {kind}{error}")
+            self._node.get_logger().warning(f"trajectory on the slow manifold alone: {kind}{error}")
         self._node.hand_over(self._offer, data, plan, name)
 
     def _judge_torque(self, data):

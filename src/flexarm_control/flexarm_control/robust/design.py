@@ -51,11 +51,11 @@ TRANSPORT = 1e-3
 #: A pole is hardly in reach of the torque where one unit of all gains changes its value by less than this [-], and fast
 #: for the loop where the torque's delay turns it by more than this [rad].
 HARDLY, FAST = 1.0, 0.5
-#: Where scheduled gains reach less of the decay than this, one set for all is tried, too [-].
-LITTLE = 0.05
-#: Where that reaches less than this, low passes are tried that end the torque's reach: of faster modes only their own
-#: damping is asked. Taken where the decay is so many times larger [-].
-POOR, WORTH = 0.25, 1.3
+#: Where scheduled gains reach less of the decay than this, low passes are tried that end the torque's reach: of faster
+#: modes only their own damping is asked. Taken where the decay is so many times larger [-].
+POOR, WORTH = 0.25, 1.2
+#: Where those reach less than this, one set for all is tried, too; the same without them [-].
+LITTLE, LEAST = 0.08, 0.05
 #: Of the progress, the part of the usual search.
 USUAL = 0.6
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
@@ -212,9 +212,8 @@ class Design:
         if any(self.sampling.friction):
             friction["slow.friction"] = numbers(self.sampling.friction)
             friction["slow.return_rate"] = numbers([self.sampling.return_rate])[0]
-            rubs = np.array(self.sampling.friction) > 0.0
-            friction["slow.breakaway"] = numbers(np.where(rubs, BREAKAWAY, 0.0))
-            friction["slow.breakaway_rate"] = numbers([BREAKAWAY_RATE * self.omega_1])[0]
+            friction["slow.breakaway"] = numbers(self.sampling.breakaway)
+            friction["slow.breakaway_rate"] = numbers([self.sampling.breakaway_rate])[0]
         out = {
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
@@ -319,7 +318,11 @@ def sampling_for(nominal, at, settings):
     omega_1 = lowest(nominal)
     corner = max(corner, min(PER_SAMPLE * settings.rate, FAST_ARM * omega_1))
     friction = cancelled(nominal, at, h + settings.delay)
-    samples = Sampling(h, settings.delay, corner, corner, np.inf, friction, RETURN * omega_1)
+    rates = {"return_rate": RETURN * omega_1, "breakaway_rate": BREAKAWAY_RATE * omega_1}
+    overcome = tuple(BREAKAWAY if part else 0.0 for part in friction)
+    samples = Sampling(
+        h, settings.delay, corner, corner, np.inf, friction, breakaway=overcome, **rates
+    )
     return samples, omega_c
 
 
@@ -370,10 +373,12 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
     task, say = _Task(arm, settings, uncertainty), _Progress(progress)
-    found = task.found(say.part(0.0, USUAL), gains)
+    found = task.found(say.part(0.0, USUAL), gains, 0.0)
     if found.decay < POOR * task.speed:
         short = _Task(arm, settings, uncertainty, short=True)
-        other = short.found(say.part(USUAL, 1.0), gains)
+        other = short.found(say.part(USUAL, 1.0), gains, LITTLE)
+        if max(found.decay, other.decay) < LEAST:
+            found = task.found_alone(say.part(USUAL, 1.0), gains, found)
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
     say.part(0.0, 1.0)(1.0, found.decay)
@@ -431,13 +436,23 @@ class _Task:
         self.scale = units(nominal, self.at, self.omega_1)
         self.speed = max(settings.speed, 0.05)
 
-    def found(self, progress, gains):
-        """The better one of a set for each configuration and, where that reaches little, one for all."""
-        sets = self.scheduled(progress, gains) if len(self.at) > 1 else None
-        if sets is not None and sets.decay >= LITTLE:
+    def found(self, progress, gains, enough):
+        """A set for each configuration; where these reach less than `enough`, one for all may be better."""
+        if len(self.at) == 1:
+            return self.alone(progress, gains)
+        sets = self.scheduled(progress, gains)
+        return sets if sets.decay >= enough else self.found_alone(progress, gains, sets)
+
+    def found_alone(self, progress, gains, sets):
+        """The better one of `sets` and of one set for all, from which one for each configuration goes on."""
+        if len(self.at) == 1:
             return sets
         alone = self.alone(progress, gains)
-        return alone if sets is None or alone.decay > sets.decay else sets
+        if alone.decay < sets.decay:
+            return sets
+        each = np.repeat(alone.K, len(self.at), axis=0)
+        more = self._together(each, alone.sampling, alone.evaluations)
+        return more if more.decay > alone.decay else alone
 
     def alone(self, progress, gains):
         """One set for all configurations."""

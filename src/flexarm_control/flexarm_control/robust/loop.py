@@ -43,6 +43,10 @@ class Sampling:
     torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
     friction: tuple = (0.0,)  # part of each joint's Coulomb friction that is cancelled [-]
     return_rate: float = 0.0  # see `slow.joint_pid` [1/s]
+    breakaway: tuple = (
+        0.0,
+    )  # part of each joint's Coulomb friction that is overcome where it sticks [-]
+    breakaway_rate: float = 0.0  # see `slow.joint_pid` [1/s]
 
 
 @dataclass(frozen=True)
@@ -125,9 +129,12 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
 
     if sticking:
         _, coulomb, smoothing = nominal.friction_table().T
-        cancelled = np.array(sampling.friction) * sticking * coulomb / smoothing
+        damper = sticking * coulomb / smoothing
+        cancelled = np.array(sampling.friction) * damper
+        overcome = np.maximum(np.array(sampling.breakaway) * damper - cancelled, 0.0)
+        stiffness = sampling.return_rate * cancelled + sampling.breakaway_rate * overcome
         out += cancelled[:, None] * rate[:n]
-        out[:, :size] -= (sampling.return_rate * cancelled)[:, None] * C[:n]
+        out[:, :size] -= stiffness[:, None] * C[:n]
 
     def add(matrix, age):
         if age:

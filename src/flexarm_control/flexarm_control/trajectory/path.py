@@ -206,6 +206,10 @@ class Path:
         """Time of this path that a stamp stands for, from its start [s]."""
         return (stamp_ns - self.start_ns) / SECOND
 
+    def pace(self, stamp_ns):
+        """How fast the time of the path that is followed goes [-]."""
+        return 1.0
+
     def piece(self, stamp_ns):
         """Number of the polynomial at a stamp; `END` at the end and after it."""
         elapsed_ns = max(stamp_ns - self.start_ns, 0)
@@ -451,6 +455,10 @@ class SlowedPath:
         """How fast the path's time goes, s', `offset` [s] from a stamp [-]."""
         return self._slowing.at((stamp_ns - self.start_ns) / SECOND + offset)[1]
 
+    def pace(self, stamp_ns):
+        """How fast the time of the path that is followed goes [-]."""
+        return self.speed(stamp_ns) * self._way.pace(self._at(stamp_ns)[0])
+
     @property
     def pushes(self):
         """Whether there is an effort on the way."""
@@ -509,7 +517,8 @@ class FinishedPath:
         self.duration_ns = path.start_ns + path.duration_ns - start_ns
         self.begin_state = np.zeros_like(path.begin_state)
         path.evaluate(start_ns, self.begin_state)
-        self.elapsed, self.piece, self.effort = path.elapsed, path.piece, path.effort
+        self.elapsed, self.piece, self.pace = path.elapsed, path.piece, path.pace
+        self.effort = path.effort
         self.evaluate, self.near = path.evaluate, path.near
 
     @property

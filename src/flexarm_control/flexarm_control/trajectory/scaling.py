@@ -114,6 +114,10 @@ class ScaledPath:
         """Time of the path that a stamp stands for, from the path's start [s]."""
         return self.law.at(stamp_ns)[0]
 
+    def pace(self, stamp_ns):
+        """How fast the time of the path that is followed goes [-]."""
+        return self.law.at(stamp_ns)[1]
+
     def rate(self, stamp_ns):
         """Largest rate from a stamp on [-]."""
         law = self.law.since(stamp_ns)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexarm_control.feedforward.model import Preparation
 from flexarm_dynamics.errors import FlexarmError
 
 from ..loop import scenario as scenarios
@@ -104,7 +103,6 @@ def _reuse_plan(case, kind, controller):
         if key not in _PREPARED:
             law.limit = controller.torque_limit
             _PREPARED[key] = law.feedforward.prepare(trajectory, start)
-        found = _PREPARED[key]
-        return Preparation(found.start, found.gains, found.plan)
+        return replace(_PREPARED[key], trajectory_id=0)
 
     controller.prepare = prepare

@@ -269,7 +269,9 @@ class ClosedLoop:
         self.unprepared = ""
         if controller.plans:
             try:
-                return controller.prepare(trajectory)
+                plan = controller.prepare(trajectory)
+                self.unprepared = getattr(plan, "note", "")
+                return plan
             except FlexarmError as error:
                 self.unprepared = str(error)
         return None

@@ -13,9 +13,9 @@ from ..uncertain.trial import JOINT_REST
 #: Markers of a seed's table.
 BEGIN, END = "<!-- random arms, seed {}: begin -->", "<!-- random arms, seed {}: end -->"
 COLUMNS = (
-    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods", "periods until settled, median (worst)",
-    "joints at rest", "no later than the best baseline", "peak joint error, median (worst)",
-    "residual, median (worst) [1e-3 reach]",
+    "plant", "controller", "works", "refused", "lost", "settled", "within 3 periods",
+    "periods until settled, median (worst)", "joints at rest", "no later than the best baseline",
+    "peak joint error, median (worst)", "residual, median (worst) [1e-3 reach]",
 )  # fmt: skip
 DECAYS = (
     "designs", "arms", "worst-case decay, median of one link (wanted: 0.3)", "median of all (0.15)", "the least (0.05)",
