@@ -20,6 +20,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models import model
+from flexarm_studies.loop import scenario
 from flexarm_studies.random_arms import command, generator, report, study
 from flexarm_studies.uncertain import baselines, plants, trial
 from flexarm_studies.uncertain.controllers import CONTROLLERS
@@ -51,7 +52,9 @@ def test_an_arm_with_light_hubs_has_gains_by_a_low_pass():
 
 
 def reference_manifold(known):
-    return control(known, {"slow.type": "joint_pid", "stability_margin": -1000.0}).manifold
+    return control(
+        known, {"slow.type": "joint_pid", "fast.type": "none", "stability_margin": -1000.0}
+    ).manifold
 
 
 def prepared(number, kind):
@@ -59,7 +62,7 @@ def prepared(number, kind):
     case = generator.arm(number)
     known = model.build(case.read().known)
     n = known.n_joints
-    motion = specs.trajectory_of(case.motion, known, np.zeros(n))
+    motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
     start = np.zeros((3, n))
     start[0] = motion.positions[0]
     settings = base.Settings(2e-3, start[0])
@@ -79,7 +82,7 @@ def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not
         resting.append(np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max())
         Phi, Gamma = sampled(*linear_plant(known, state[0], coulomb=False), 2e-3)
         assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < 1.0, t
-    assert max(resting) > 1.05
+    assert max(resting) > 1.0
 
 
 def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
