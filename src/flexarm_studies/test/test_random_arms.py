@@ -11,7 +11,7 @@ import yaml
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
-from flexarm_control.feedforward import base
+from flexarm_control.feedforward import base, preview
 from flexarm_control.feedforward.model import ModelFeedforward, path_of
 from flexarm_control.feedforward.preview import Preview
 from flexarm_control.robust.design import Settings, design
@@ -91,6 +91,22 @@ def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
         "preview: no motion within the torque limits"
     )
     assert found.gains is not None
+
+
+def test_the_compiled_bending_of_a_plan_is_that_of_the_equations():
+    case = generator.arm(10)
+    known = model.build(case.read().known)
+    motion = scenario.trajectory_of(case.motion, known, np.zeros(2))
+    start = np.stack([motion.positions[0], np.zeros(2), np.zeros(2)])
+    planner = preview._Planner(known, path_of(motion, start), start, known.arm.torque_limits)
+    planner._along(np.zeros((2, planner.basis.shape[2])))
+    compiled = planner._bend()
+    a, u = planner._forces([100], *compiled)
+    planner.stepper = None
+    for found, wanted in zip(compiled, planner._bend(), strict=True):
+        assert_allclose(found, wanted, rtol=0.0, atol=1e-5 * np.abs(wanted).max())
+    for found, wanted in zip((a, u), planner._forces([100], *compiled), strict=True):
+        assert_allclose(found, wanted, rtol=1e-9)
 
 
 def test_a_mode_that_no_joint_moves_is_not_planned():

@@ -37,6 +37,7 @@ from scipy.linalg import eigh
 from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.models.fixed_step import METHODS
 
 from .. import kernels
 from ..trajectory.values import SECOND
@@ -48,8 +49,8 @@ KNOTS_PER_PERIOD = 6.0
 MIN_COUNT, MAX_COUNT = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
-#: Rounds of linearisation.
-ROUNDS = 4
+#: Rounds of linearisation at most, and change of the shift after which there is no other one [rad].
+ROUNDS, CLOSE = 6, 1e-7
 #: Number of times at which shift and torque are bounded.
 GRID = 100
 #: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s].
@@ -62,6 +63,8 @@ STABLE = 1.5
 STEPS_PER_PERIOD = 40.0
 #: A mode that the shift moves by less than this of what it moves the others by is left as it is [-].
 UNMOVED = 1e-6
+#: Length of the plan's steps over that of those grid steps, at most [-].
+PLANNED = 0.25
 #: A longer motion is not planned [samples].
 MAX_STEPS = 20_000
 
@@ -138,6 +141,7 @@ class _Planner:
 
     def __init__(self, model, path, start, limit):
         self.model, self.start, self.limit = model, start, limit
+        self.stepper = model.driven_stepper(METHODS["rk4"])
         n, m = model.n_joints, model.n_modes
         self.duration = path.duration_ns / SECOND
         end = np.zeros((3, n))
@@ -155,6 +159,9 @@ class _Planner:
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, STABLE / omega[-1])))
+        # The plan has fewer, where the fastest mode, which is not planned, needs short steps.
+        self.stride = max(1, int(PLANNED * step * self.steps / self.duration))
+        self.steps = self.stride * int(np.ceil(self.steps / self.stride))
         if self.steps > MAX_STEPS:
             raise DesignError(
                 f"a motion of {self.duration:g} s takes {self.steps} steps",
@@ -175,32 +182,47 @@ class _Planner:
         self.basis = np.array([everything(self.times, nu)[:, 3:-3] for nu in range(3)])
 
     def solve(self):
-        """The plan, after `ROUNDS` of linearisation about the last one."""
+        """The plan, after up to `ROUNDS` of linearisation about the last one."""
         n = self.model.n_joints
         c = np.zeros((n, self.basis.shape[2]))
         for _ in range(ROUNDS if self.model.n_modes else 0):
             self._along(c)
-            c = c + self._programme(c)
+            change = self._programme(c)
+            c = c + change
+            if np.abs(self.basis[0] @ change.T).max() < CLOSE:
+                break
         self._along(c)
-        q, free, torque = self.motion, *_finite(*self._bend())
-        state = np.concatenate([q[::2, 0], free[:, 0], q[::2, 1], free[:, 1]], axis=1)
-        rates = np.concatenate([q[::2, 1], free[:, 1], q[::2, 2], free[:, 2]], axis=1)
-        motion = CubicHermiteSpline(self.times[::2], state, rates)
-        return Plan(self.duration, motion, torque, self.h)
+        x, v = _finite(*self._bend())
+        at = np.arange(0, self.steps + 1, self.stride)
+        a, torque = _finite(*self._forces(at, x, v))
+        q, x, v = self.motion[2 * at], x[at], v[at]
+        state = np.concatenate([q[:, 0], x, q[:, 1], v], axis=1)
+        rates = np.concatenate([q[:, 1], v, q[:, 2], a], axis=1)
+        motion = CubicHermiteSpline(self.times[2 * at], state, rates)
+        return Plan(self.duration, motion, torque, self.stride * self.h)
 
     def _bend(self):
-        """Bending (steps + 1, 3, m) and joint torque (steps + 1, n) of the motion, products of deflections included."""
-        torque = np.zeros((self.steps + 1, self.model.n_joints))
-
-        def acceleration(k, x, v):
-            a, u = self._bending(*self.motion[k], x, v)
-            # At a whole step; its own first stage replaces the last stage of the step before.
-            if k % 2 == 0:
-                torque[k // 2] = u
-            return a
-
+        """Bending and its rate under the motion, products of deflections included, at whole steps, (steps + 1, m)."""
         start = self.model.static_deflection(self.start[0])
-        return self._integrated(acceleration, start), torque
+        if self.stepper is None:
+            found = self._integrated(lambda k, x, v: self._bending(*self.motion[k], x, v)[0], start)
+            return found[:, 0], found[:, 1]
+        q, (n, m) = self.motion[::2], (self.model.n_joints, self.model.n_modes)
+        states, change = np.zeros((len(q), 2 * (n + m))), np.diff(q[:, 2], axis=0)
+        # The line in each step that has the acceleration's mean, by Simpson's rule, and its first moment.
+        begin = (q[:-1, 2] + 4.0 * self.motion[1::2, 2] + q[1:, 2]) / 6.0 - 0.5 * change
+        states[0, n : n + m] = start
+        states[:, :n], states[:, n + m : 2 * n + m] = q[:, 0], q[:, 1]
+        for i in range(self.steps):
+            state, after = states[i].copy(), states[i + 1]
+            self.stepper(state, begin[i], self.h, change=change[i])
+            after[n : n + m], after[2 * n + m :] = state[n : n + m], state[2 * n + m :]
+        return states[:, n : n + m], states[:, 2 * n + m :]
+
+    def _forces(self, at, x, v):
+        """Acceleration of the bending (k, m) and joint torque (k, n) at some whole steps of the motion."""
+        found = [self._bending(*self.motion[2 * k], x[k], v[k]) for k in at]
+        return np.array([a for a, _ in found]), np.array([u for _, u in found])
 
     def _integrated(self, acceleration, start):
         """Deflection and its derivatives at whole steps, (steps + 1, 3, ...), by Runge-Kutta's method from rest.
@@ -227,19 +249,15 @@ class _Planner:
         """Set the motion: the reference shifted by c."""
         self.motion = self.reference + np.einsum("dtj,nj->tdn", self.basis, c)
 
-    def _linearise(self, bending):
+    def _linearise(self, x, v):
         """Derivatives of the bending's acceleration and of the joint torque along a motion, at all times.
 
         By deflection and its rate, and by the joints' position, velocity and acceleration: differences of (2) in
         full, at `KNOTS` times and linear between.
         """
         n, m = self.model.n_joints, self.model.n_modes
-        at = np.unique(np.linspace(0, self.times.size - 1, KNOTS).astype(int))
-        x = CubicHermiteSpline(self.times[::2], bending[:, 0], bending[:, 1])
-        v = CubicHermiteSpline(self.times[::2], bending[:, 1], bending[:, 2])
-        (found,) = _finite(
-            np.array([self._derivatives(k, x(self.times[k]), v(self.times[k])) for k in at])
-        )
+        at = 2 * np.unique(np.linspace(0, self.steps, KNOTS).astype(int))
+        (found,) = _finite(np.array([self._derivatives(k, x[k // 2], v[k // 2]) for k in at]))
         flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
         everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
         # Columns: q, qd, qdd, x, v, and the bending's own acceleration, in the torque alone.
@@ -274,10 +292,15 @@ class _Planner:
     def _bending(self, q, qd, qdd, x, v):
         """Acceleration of the bending, and joint torque, with the joints moved as given: (2), in full."""
         n = self.model.n_joints
-        t = self.model.terms(q, qd, x, v)
-        force = -t.f2 - t.C2 @ v - t.K2 @ x - t.M[n:, :n] @ qdd
-        a = np.linalg.solve(t.M[n:, n:], force) if force.size else force
-        return a, t.M[:n, :n] @ qdd + t.M[:n, n:] @ a + t.f1 + t.C1 @ v + t.K1 @ x
+        if self.stepper is None:
+            t = self.model.terms(q, qd, x, v)
+            M, f1, f2 = t.M, t.f1 + t.C1 @ v + t.K1 @ x, t.f2 + t.C2 @ v + t.K2 @ x
+        else:  # the same, without the arm's derivatives
+            M, f = self.model.mass_matrix(q, x), self.model.forces(q, qd, x, v)
+            f1, f2 = f[:n] + self.model.friction(qd, x, v), f[n:]
+        force = -f2 - M[n:, :n] @ qdd
+        a = np.linalg.solve(M[n:, n:], force) if force.size else force
+        return a, M[:n, :n] @ qdd + M[:n, n:] @ a + f1
 
     def _respond(self):
         """Linear response of the bending to each coefficient of the shift: (steps + 1, 3, m, n count)."""
@@ -290,30 +313,30 @@ class _Planner:
 
         return self._integrated(acceleration, np.zeros((m, n * count)))
 
-    def _torque(self, bending):
-        """Joint torque that goes with `_respond`'s columns, at whole steps, (steps + 1, n, n count)."""
-        each, n, count = slice(None, None, 2), self.model.n_joints, self.basis.shape[2]
-        by = self.torque_by_joints[each].reshape(-1, n, 3, n)
-        u = np.einsum("tidj,dtc->tijc", by, self.basis[:, each]).reshape(-1, n, n * count)
+    def _torque(self, bending, at):
+        """Joint torque that goes with `_respond`'s columns, at some whole steps, (k, n, n count)."""
+        n, count = self.model.n_joints, self.basis.shape[2]
+        by = self.torque_by_joints[2 * at].reshape(-1, n, 3, n)
+        u = np.einsum("tidj,dtc->tijc", by, self.basis[:, 2 * at]).reshape(-1, n, n * count)
         for matrix, part in ((self.M12, 2), (self.C1, 1), (self.K1, 0)):
-            u += np.einsum("tij,tjc->tic", matrix[each], bending[:, part])
+            u += np.einsum("tij,tjc->tic", matrix[2 * at], bending[at, part])
         return u
 
     def _programme(self, c):
         """Change of the shift's coefficients, (n, count)."""
-        free, u = _finite(*self._bend())
-        self._linearise(free)
-        forced, end = self._respond(), free[-1]
+        x, v = _finite(*self._bend())
+        self._linearise(x, v)
+        forced = self._respond()
         A = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
-        b = -np.concatenate([self.modal @ (end[0] - self.rest), self.modal @ end[1]])
+        b = -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
         # On one scale: deflections are thousandths. A mode that no joint moves is left as it is.
         largest = np.abs(A).max(axis=1)
-        moved = (largest.reshape(2, -1) > UNMOVED * largest.reshape(2, -1).max(1)[:, None]).all(0)
-        moved = np.tile(moved, 2)
+        each = largest.reshape(2, -1)
+        moved = np.tile((each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0), 2)
         scale = 1.0 / largest[moved]
         A, b = A[moved] * scale[:, None], b[moved] * scale
-        each = slice(None, None, max(1, self.steps // GRID))
-        u, du = u[each], self._torque(forced)[each]
+        at = np.arange(0, self.steps + 1, max(1, self.steps // GRID))
+        (_, u), du = _finite(*self._forces(at, x, v)), self._torque(forced, at)
         change = self._least_squares(c, A, b)
         if (np.abs(u + du @ change.ravel()) <= self.limit).all():
             return change

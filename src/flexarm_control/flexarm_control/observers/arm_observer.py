@@ -22,6 +22,9 @@ PARAMETERS = (
     parameter("joint_velocity_bandwidth", 500.0, "rad/s", 1.0, 1e6).described(
         "Corner of the filtered derivative of the joint positions, for a source without joint velocities."
     ),
+    parameter("measured_velocity", True).described(
+        "Use the joint velocities that the source sends; false: as of a source without. They are checked all the same."
+    ),
     parameter("delay", 0.0, "s", 0.0, 0.1).described(
         "Time from a sample's stamp until its torque acts; the estimate is predicted ahead by it."
     ),
@@ -54,8 +57,8 @@ def observe(model, name, values):
 class ArmObserver:
     r"""Estimates modal amplitudes and rates, sample by sample.
 
-    A joint velocity that the source does not report is the observer's estimate, if it makes one, else the filtered
-    derivative of the positions.
+    A joint velocity that the source does not report, or that is not to be used, is the observer's estimate, if it makes
+    one, else the filtered derivative of the positions.
 
     With a `delay`, the estimate is the state at the stamp plus the delay: the model's motion (`motion`) under the
     reported torque, held. Torques sent since then are unknown here.
@@ -114,6 +117,7 @@ class ArmObserver:
             self._state, (n, n + m, 2 * n + m)
         )
         self._measured, self._derivative = np.zeros(n), np.zeros(n)
+        self._derived, self._sent = np.zeros(n), np.zeros(n)
         self._mapped, self._nothing = np.zeros(m), np.zeros(0)
         self._motion = Motion(model)
         self._order = SampleOrder()
@@ -167,10 +171,18 @@ class ArmObserver:
             self.observer.reset()
         if self.settings["delay"] and not restart:
             need_torque(sample.torque, "observer.delay", "set observer.delay to 0.0")
-        if not sample.velocity_known:
-            sample.velocity[:] = self._joint_velocity(sample, dt)
-        self._update(sample, dt)
-        self._pass_on(sample)
+        if sample.velocity_known and self.settings["measured_velocity"]:
+            self._estimate(sample, dt, sample.velocity_known)
+            self._derivative[:] = sample.velocity
+        else:
+            self._sent[:] = sample.velocity
+            sample.velocity[:] = self._derived[:] = self._joint_velocity(sample, dt)
+            try:
+                self._estimate(sample, dt, False)
+            finally:
+                if sample.velocity_known:
+                    sample.velocity[:] = self._sent
+            self._derivative[:] = self._derived
         # Only now, so that a refused sample leaves nothing behind, not even its time step.
         if judges:
             self.monitor.mark(sample)
@@ -178,7 +190,7 @@ class ArmObserver:
         if not later:
             self._take()
         self._order.take(sample)
-        self._derivative[:], self._measured[:] = sample.velocity, sample.position
+        self._measured[:] = sample.position
         if sample.strain is not None and self.calibration is not None:
             self.calibration.push(sample)
         return self.observer.converged
@@ -277,11 +289,16 @@ class ArmObserver:
         self.observer.rest_at(self.strain_map.amplitudes(self.calibration.last))
         return old, new
 
-    def _pass_on(self, sample):
+    def _estimate(self, sample, dt, measured):
+        """Update the observer, and set the output; `measured`: the sample's joint velocities are."""
+        self._update(sample, dt)
+        self._pass_on(sample, measured)
+
+    def _pass_on(self, sample, measured):
         """Set the output: the observer's estimate or the sample's values, predicted ahead by the delay."""
         observer = self.observer
         smooth = self.settings["smooth_position"] and observer.joint_position is not None
-        estimated = not sample.velocity_known and observer.joint_velocity is not None
+        estimated = not measured and observer.joint_velocity is not None
         position = observer.joint_position if smooth else sample.position
         velocity = observer.joint_velocity if estimated else sample.velocity
         amplitude, rate = observer.amplitude, observer.rate

@@ -62,7 +62,7 @@ USUAL = 0.6
 #: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
-FASTEST, NOISIEST = 0.6, 0.03
+FASTEST, NOISIEST = 0.6, 0.035
 #: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
 #: its friction cancelled: as fast as the fastest decay. More would hold it so stiffly that it damps no link any more.
 RETURN = FASTEST * (1.0 - CANCELLED) / CANCELLED
@@ -158,7 +158,11 @@ class Design:
     @property
     def reached(self):
         """The least decay over what is asked, of the arms with other payloads and stiffnesses alone [-]."""
-        return -max(value for name, _, value in self.slowest if name.startswith("payload"))
+        return -max(
+            value
+            for name, _, value in self.slowest
+            if name.startswith("payload") and "no delay" not in name
+        )
 
     @property
     def scheduled(self):
@@ -248,6 +252,7 @@ def observer_parameters(sampling):
         "observer.type": "filtered_derivative",
         "observer.bandwidth": modal,
         "observer.joint_velocity_bandwidth": joint,
+        "observer.measured_velocity": False,
     }
 
 
@@ -522,8 +527,7 @@ class _Task:
         """The search with a low pass of a corner over omega_1, in configurations from number `first` on; its starts."""
         corner = factor * self.omega_1
         samples = replace(self.sampling, torque_corner=corner)
-        several = len(self.at) > 1
-        loops = uncertain_loops(self.nominal, at, samples, self.uncertainty, first, every=several)
+        loops = uncertain_loops(self.nominal, at, samples, self.uncertainty, first)
         slowest = Slowest(loops, self._wanted(corner), self.scale)
         noise = Noise(slowest, self.nominal, samples, self.speed * NOISIEST, self.omega_1)
         late = samples.delay + 0.5 * samples.period + 1.0 / samples.joint_corner + POLES / corner

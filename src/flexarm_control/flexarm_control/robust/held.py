@@ -67,7 +67,7 @@ def held_loops(nominal, at, sampling, uncertainty, count=1):
     loops, weights = [], []
     for number, (place, q, w) in enumerate(places(nominal, at, count)):
         sticking = number < len(at)
-        found = uncertain_loops(nominal, q[None], sampling, uncertainty, 1, sticking, every=True)
+        found = uncertain_loops(nominal, q[None], sampling, uncertainty, 1, sticking)
         loops += [replace(one, name=f"{one.name.split(', at conf')[0]}, {place}") for one in found]
         weights += [w] * len(found)
     return loops, weights

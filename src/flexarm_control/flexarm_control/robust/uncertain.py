@@ -108,16 +108,16 @@ def richer(arm):
     return replace(arm, links=links)
 
 
-def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, every=False):
+def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     """The set of loops that a design is for.
 
-    In each configuration the softest, the stated and the stiffest arm, each one mode richer than the file, and one of
-    these with measured joint speeds and without delay; then the arm with the file's modes alone, once with filtered and
-    once with measured joint speeds: a mode beyond the file's lets a joint give way, and gains may hold with it that do
-    not hold without it. In the first configuration a loop with more and one with less gain, one that is later, and one
-    whose joint speeds are measured. An arm with Coulomb friction also sticks, each of the three: its friction is a
-    damper, as steep at rest as its smoothing makes it, and less for larger movements, by the first harmonic. What is
-    stable with every part of it does not hunt.
+    In each configuration the softest, the stated and the stiffest arm, each one mode richer than the file, with the
+    delay and without; then the same of the arm with the file's modes alone: a mode beyond the file's lets a joint give
+    way, and gains may hold with it that do not hold without it. In the first configuration a loop with more and one
+    with less gain, and one that is later. An arm with Coulomb friction also sticks, each of the three: its friction is
+    a damper, as steep at rest as its smoothing makes it, and less for larger movements, by the first harmonic. What is
+    stable with every part of it does not hunt. Joint speeds are filtered derivatives in all of them, as the observer's
+    are (`observer.measured_velocity`): a loop with measured speeds is another one.
 
     Parameters
     ----------
@@ -131,8 +131,6 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, 
         Number of the first configuration, for names.
     sticking : bool
         Whether an arm with Coulomb friction also sticks.
-    every : bool
-        Whether loops without delay also have filtered joint speeds, and the file's modes alone.
 
     Returns
     -------
@@ -145,15 +143,17 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, 
         for p, k in ((1.0, 1.0), (p1, k0), (p0, k1))
     }
     stated = next(iter(plants.values()))
+    at_once = replace(sampling, delay=0.0)
+    kinds = {"": (sampling, 1.0), ", no delay": (at_once, UNLIKELY)}
     out, here = [], "" if first == 1 else f", at configuration {first}"
     for i, q in enumerate(at, first):
         for name, plant in plants.items():
-            try:
-                out.append(
-                    sampled_loop(nominal, plant, q, sampling, name=f"{name}, at configuration {i}")
-                )
-            except ModelError:  # heavier than what rests there
-                continue
+            for words, (samples, fraction) in kinds.items():
+                name_here = f"{name}{words}, at configuration {i}"
+                try:
+                    out.append(sampled_loop(nominal, plant, q, samples, 1.0, name_here, fraction))
+                except ModelError:  # heavier than what rests there
+                    continue
     for gain in uncertainty.gain:
         out.append(
             sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", UNLIKELY)
@@ -169,24 +169,12 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True, 
             fraction=UNLIKELY,
         )
     )
-    measured = replace(sampling, joint_corner=np.inf)
-    name = f"joint speeds measured{here}"
-    out.append(sampled_loop(nominal, stated, at[0], measured, name=name, fraction=UNLIKELY))
-    sooner = replace(measured, delay=0.0)
-    for i, q in enumerate(at, first):
-        name = f"joint speeds measured, no delay, at configuration {i}"
-        out.append(sampled_loop(nominal, stated, q, sooner, name=name, fraction=UNLIKELY))
-        if every:
-            name = f"no delay, at configuration {i}"
-            out.append(
-                sampled_loop(nominal, stated, q, replace(sampling, delay=0.0), 1.0, name, UNLIKELY)
-            )
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
     if own.n_modes < stated.n_modes:
-        kinds = {"": sampling, ", joint speeds measured": measured}
-        if every:
-            kinds[", joint speeds measured, no delay"] = sooner
-        out += _own_modes(nominal, own, at, kinds, first)
+        for i, q in enumerate(at, first):
+            for words, (samples, _) in kinds.items():
+                name = f"the file's modes alone{words}, at configuration {i}"
+                out.append(sampled_loop(nominal, own, q, samples, 1.0, name, UNLIKELY))
     if sticking and any(joint.friction.coulomb for joint in arm.joints):
         out += _sticking(nominal, plants, at, sampling, first)
     return out
@@ -204,22 +192,6 @@ def _sticking(nominal, plants, at, sampling, first):
                         sampled_loop(nominal, plant, q, sampling, 1.0, words, fraction, part)
                     )
     return out
-
-
-def _own_modes(nominal, plant, at, kinds, first):
-    """Loops of a plant with the file's modes alone, of these kinds of sampling by their names."""
-    return [
-        sampled_loop(
-            nominal,
-            plant,
-            q,
-            samples,
-            name=f"the file's modes alone{name}, at configuration {i}",
-            fraction=UNLIKELY,
-        )
-        for i, q in enumerate(at, first)
-        for name, samples in kinds.items()
-    ]
 
 
 def reach(model, at, late):

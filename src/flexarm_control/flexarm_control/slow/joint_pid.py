@@ -34,8 +34,8 @@ from where it sticks,
     \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_s) - \tanh(\dot q_{ref}/v_s)] ,
 
 which the friction itself damps: at an amplitude and frequency at which it is a stiffness k, the friction is a damper of
-at least :math:`k/\omega`. Linear loops are judged without these torques; `flexarm design` has loops of joints that stick, with
-both (`robust.loop`).
+at least :math:`k/\omega`. Linear loops are judged without these torques; `flexarm design` has loops of joints that
+stick, with both (`robust.loop`).
 
 The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
 an angle: a change of K_w does not move it.

@@ -169,6 +169,10 @@ class ArmModel(ABC):
         Stepper
         """
 
+    def driven_stepper(self, method):
+        """As `stepper`, with joint accelerations in the place of torque; None: the model has none."""
+        return None
+
     def lockable_stepper(self, method):
         """As `stepper`, with `Stepper.lock`: for brakes.
 
