@@ -23,6 +23,15 @@ PARAMETERS = (
         " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
         " end at rest. Or another of the entry-point group flexarm.feedforwards."
     ),
+    parameter("motion_velocity_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
+        "Corner of the filter by which the observer makes joint speeds (observer.joint_velocity_bandwidth, where"
+        " observer.measured_velocity is false): those of the feed-forward's motion pass it too, so that its lag is no"
+        " error; 0.0: none."
+    ),
+    parameter("motion_rate_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
+        "The same of the rates of deflections, where the observer filters them (observer.bandwidth of"
+        " filtered_derivative); 0.0: none."
+    ),
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0).described(
         "Samples per second that the driver or simulator sends: what designs are checked at."
     ),
@@ -85,7 +94,8 @@ def design(model, slow, fast, manifold=None, settings=None):
     if kind is None or slow_law.learns:
         return control
     motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
-    return CompositeControl(model, slow_law, fast_law, surface, motion)
+    corners = chosen["motion_velocity_bandwidth"], chosen["motion_rate_bandwidth"]
+    return CompositeControl(model, slow_law, fast_law, surface, motion, corners)
 
 
 def typed(given, prefix):

@@ -20,6 +20,7 @@ from ..arrays import clip, some
 from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..feedforward.model import At
+from ..feedforward.seen import SeenMotion
 from ..manifold.quasi_steady import QuasiSteady
 
 #: Rate at which the torque of another payload fades, over the lowest locked frequency: a hundredth is left after two
@@ -39,6 +40,8 @@ class CompositeControl:
         The paper's, `QuasiSteady`, if not given.
     feedforward : Feedforward, optional
         The motion that the arm is held to; the reference and the manifold's, if not given.
+    corners : (float, float)
+        Of the observer's filters of joint speeds and rates, see `SeenMotion` [rad/s]; 0.0: none.
 
     Attributes
     ----------
@@ -52,7 +55,7 @@ class CompositeControl:
         Fraction of the fast torque that is applied, 0 to 1.
     """
 
-    def __init__(self, model, slow, fast, manifold=None, feedforward=None):
+    def __init__(self, model, slow, fast, manifold=None, feedforward=None, corners=(0.0, 0.0)):
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_fraction = 1.0
         self._last = None  # reference and interval of the last step
@@ -66,8 +69,9 @@ class CompositeControl:
         # Of what motion, and the slow law's torque on it.
         self._nominal, self._no_torque = (b"", np.zeros(n)), np.zeros(n)
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
-        self.feedforward = feedforward
+        self.feedforward = self._seen = feedforward
         if feedforward is not None:
+            self._seen = SeenMotion(feedforward, *corners) if any(corners) else feedforward
             response = self.manifold.error_response(feedforward.settings.configuration)
             self._response, self._bar = np.vstack(response), np.zeros(2 * model.n_modes)
         n, m = model.n_joints, model.n_modes
@@ -99,6 +103,8 @@ class CompositeControl:
         self.fast.resume(other.fast)
         if self.feedforward is not None and other.feedforward is not None:
             self.feedforward.resume(other.feedforward)
+            if isinstance(self._seen, SeenMotion) and isinstance(other._seen, SeenMotion):
+                self._seen.take(other._seen)
         self.limit, self.fast_fraction = other.limit, other.fast_fraction
         self._pieces.take(other._pieces)
         self._source = other._source
@@ -122,6 +128,8 @@ class CompositeControl:
         """A new session begins: the laws forget their own states."""
         for part in self._parts():
             part.reset()
+        if self._seen is not self.feedforward:
+            self._seen.reset()
         self._exchanged.clear()
         self._pieces.clear()
         self._last = self._before = self._source = None
@@ -184,6 +192,8 @@ class CompositeControl:
             self.fast.advance(dt)
         if self.feedforward is not None:
             self.feedforward.update(reference, dt)
+            if self._seen is not self.feedforward:
+                self._seen.update(dt)
 
     def _slow_on_manifold(self, q, qd, reference, dt):
         """Slow torque towards the reference, and the manifold's z_bar with the torque that belongs to it."""
@@ -225,15 +235,15 @@ class CompositeControl:
         The motion's torque takes the place of what the slow law gives on the motion; the manifold's response to the
         tracking error is added to both.
         """
-        u, motion, m = self.slow_torque, self.feedforward, self.model.n_modes
+        u, motion, m, seen = self.slow_torque, self.feedforward, self.model.n_modes, self._seen
         if self.slow.separate:
-            u[:], nominal = self.slow.feedback(q, qd, motion), self._no_torque
+            u[:], nominal = self.slow.feedback(q, qd, seen), self._no_torque
         else:
             u[:] = self.slow.torque_at(q, qd, motion)
             nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
         kernels.compiled().about_motion(
-            q, qd, motion.position, motion.velocity, motion.torque, nominal, self._response, motion.amplitude,
-            motion.rate, u, self._bar,
+            q, qd, motion.position, seen.velocity, motion.torque, nominal, self._response, motion.amplitude,
+            seen.rate, u, self._bar,
         )  # fmt: skip
         return u, self._bar[:m], self._bar[m:]
 

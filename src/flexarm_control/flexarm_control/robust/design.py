@@ -222,6 +222,8 @@ class Design:
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
             "feedforward": self.settings.feedforward,
+            "motion_velocity_bandwidth": numbers([self.sampling.joint_corner])[0],
+            "motion_rate_bandwidth": numbers([self.sampling.modal_corner])[0],
             "slow.type": "joint_pid",
             "slow.stiffness": numbers([np.diag(one[:, :n]) for one in K]),
             "slow.damping": numbers([np.diag(one[:, n : 2 * n]) for one in K]),

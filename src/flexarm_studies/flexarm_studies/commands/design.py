@@ -34,6 +34,7 @@ COMMENTS = {
     "observer.type": "rates as filtered derivatives: no model that could be wrong",
     "observer.bandwidth": "[rad/s]",
     "observer.joint_velocity_bandwidth": "[rad/s]",
+    "observer.measured_velocity": "the gains are for joint speeds that the observer derives",
 }
 #: Options that make a design another one.
 OF_THE_DESIGN = (
