@@ -62,7 +62,7 @@ USUAL = 0.6
 #: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
 #: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
-FASTEST, NOISIEST = 0.6, 0.035
+FASTEST, NOISIEST = 0.6, 0.03
 #: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
 #: its friction cancelled: as fast as the fastest decay. More would hold it so stiffly that it damps no link any more.
 RETURN = FASTEST * (1.0 - CANCELLED) / CANCELLED
