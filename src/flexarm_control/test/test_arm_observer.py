@@ -278,6 +278,30 @@ def test_an_absent_joint_velocity_is_the_filtered_derivative_of_the_position(arm
         assert_array_equal(s.velocity, core.velocity)
 
 
+def test_a_measured_joint_velocity_that_is_not_used_is_checked_and_left_as_it_was(arm_r):
+    options = {"joint_velocity_bandwidth": 400.0}
+    unused, without = (
+        observed(arm_r, measured_velocity=False, **options),
+        observed(arm_r, **options),
+    )
+    for k in range(40):
+        args = {"position": [0.002 * k**1.5]}
+        sent = sample(k, velocity=[0.07 * k**0.5], **args)
+        unused.step(sent)
+        without.step(sample(k, velocity_known=False, **args))
+        assert_array_equal(unused.velocity, without.velocity)
+        assert_array_equal(sent.velocity, [0.07 * k**0.5])
+        assert sent.velocity_known
+    assert np.abs(unused.velocity - sent.velocity) > 1e-3
+    # Of the wrong sign: found, though it is not used.
+    doubts = []
+    for k in range(40, 80):
+        sent = sample(k, position=[0.002 * k**1.5], velocity=[-0.07 * k**0.5])
+        unused.step(sent)
+        doubts.append(sent.doubt)
+    assert any("wrong" in doubt for doubt in doubts), set(doubts)
+
+
 def test_luenberger_takes_its_friction_from_the_reconstructed_joint_velocity(heavy_arm):
     known, unknown = observed(heavy_arm, "luenberger"), observed(heavy_arm, "luenberger")
     for k in range(40):

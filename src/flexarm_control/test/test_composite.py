@@ -9,7 +9,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import FAST, SLOW, design, design_law
-from flexarm_control.observers.arm_observer import design_observer
+from flexarm_control.feedforward.seen import SeenMotion
+from flexarm_control.loop.samples import ArmSample
+from flexarm_control.observers.arm_observer import design_observer, observe
 from flexarm_control.trajectory import ReferenceGenerator, validate
 from flexarm_dynamics.errors import (
     NOT_GIVEN,
@@ -18,6 +20,7 @@ from flexarm_dynamics.errors import (
     UnknownComponentError,
 )
 
+MS = 10**6  # [ns]
 SLOW_LAW = {"type": "linear_model_following"}
 FAST_LAW = {"type": "lqr", "q": [20.0, 20.0, 1000.0, 6e5], "configuration": [np.pi / 2]}
 REFERENCE = SimpleNamespace(
@@ -220,6 +223,71 @@ def test_a_motion_beyond_all_bounds_has_no_preview_and_says_why(arm_r, far):
     prepared = control.feedforward.prepare(motion, np.zeros((3, 1)))
     assert prepared.plan is None
     assert prepared.note.startswith("preview: the arm does not stand this motion")
+
+
+# --------------------------------------------------------------------------- the motion as the observer sees it
+
+
+class Swinging:
+    """A motion of one joint and two modes, by the time."""
+
+    def __init__(self):
+        self.position, self.velocity, self.acceleration = np.zeros((3, 1))
+        self.amplitude, self.rate = np.zeros((2, 2))
+
+    def at(self, t):
+        whole, rates = np.sin([3.0 * t, 20.0 * t, 31.0 * t]), [3.0, 20.0, 31.0]
+        self.position[:], self.amplitude[:] = whole[:1], whole[1:]
+        both = rates * np.cos([3.0 * t, 20.0 * t, 31.0 * t])
+        self.velocity[:], self.rate[:] = both[:1], both[1:]
+
+
+def test_the_motion_is_seen_as_the_observer_sees_an_arm_that_follows_it(arm_r):
+    """By the observer's own filters, with samples that get lost; what is left falls with the period's square."""
+    corners = {"joint_velocity_bandwidth": 150.0, "bandwidth": 220.0}
+    worst = []
+    for period in (2 * MS, MS):
+        motion = Swinging()
+        seen = SeenMotion(motion, *corners.values())
+        core = observe(arm_r, "filtered_derivative", corners | {"measured_velocity": False})
+        arm, last, off = ArmSample(1, 2, 2), None, 0.0
+        for k in range(400):
+            if k in (100, 101, 250):
+                continue
+            motion.at(1e-9 * k * period)
+            arm.stamp_ns, arm.session, arm.sequence = 1 + k * period, 1, k
+            arm.position[:], arm.amplitude, arm.strain = (
+                motion.position,
+                motion.amplitude.copy(),
+                None,
+            )
+            arm.velocity[:], arm.torque[:] = motion.velocity, 0.0
+            core.step(arm)
+            seen.update(0.0 if last is None else 1e-9 * (arm.stamp_ns - last))
+            last = arm.stamp_ns
+            if 1e-9 * k * period > 0.1:
+                off = max(off, np.abs(core.velocity - seen.velocity).max() / 3.0)
+                off = max(off, np.abs(core.rate - seen.rate).max() / 31.0)
+        worst.append(off)
+    assert worst[1] < 1e-3 and worst[0] / worst[1] > 3.0, worst
+    assert np.abs(motion.rate - seen.rate).max() > 1e-2  # its lag is no small thing
+    motion.position += 1.0
+    before = seen.velocity.copy()
+    seen.update(1e-3)
+    assert (
+        np.abs(seen.velocity - before).max() < 0.5
+    )  # a motion that is put elsewhere makes no speed
+
+
+def test_without_corners_the_motion_is_seen_as_it_is():
+    motion = Swinging()
+    seen = SeenMotion(motion, 0.0, 100.0)
+    for k in range(5):
+        motion.at(1e-2 * k)
+        seen.update(1e-2 * (k > 0))
+    assert_array_equal(seen.velocity, motion.velocity)
+    assert (seen.rate != motion.rate).all()
+    assert seen.position is motion.position and seen.amplitude is motion.amplitude
 
 
 # --------------------------------------------------------------------------- exchanges without a step

@@ -175,7 +175,8 @@ class ArmObserver:
             self._estimate(sample, dt, sample.velocity_known)
             self._derivative[:] = sample.velocity
         else:
-            self._sent[:] = sample.velocity
+            if sample.velocity_known:
+                self._sent[:] = sample.velocity
             sample.velocity[:] = self._derived[:] = self._joint_velocity(sample, dt)
             try:
                 self._estimate(sample, dt, False)
