@@ -178,7 +178,7 @@ def test_the_observer_of_a_design_is_known_without_a_search(made):
     whole = default.default(ARM, settings, Uncertainty()).parameters
     found = default.for_observer(build(ARM), settings)
     assert found == {k: v for k, v in whole.items() if k.startswith("observer.")}
-    assert len(found) == 3 and len(made) == 1
+    assert len(found) == 4 and len(made) == 1
 
 
 @pytest.mark.parametrize(

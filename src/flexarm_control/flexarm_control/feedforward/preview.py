@@ -14,8 +14,9 @@ are linear in c to first order. The shift of least mean square,
     \min_c \int |p|^2 + \epsilon\,|\ddot p|^2/\omega_1^4\,dt \quad\text{s.t.}\quad
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
-solves one linear system. If its torque exceeds the limit, a linear programme (HiGHS through scipy) finds the shift with
-the smallest maximum within the limit. The full equations are then integrated along the solution, linearised there, and
+solves one linear system. If its torque exceeds the limit, what is beyond 0.95 of it is penalised where it is, round by
+round; if that does not end within the limit, a linear programme (HiGHS through scipy) finds the shift with the smallest
+maximum, which is rougher: its steep turns excite the modes that are not in the plan. The full equations are then integrated along the solution, linearised there, and
 solved again. A mode that the shift does not move is left out. All of this happens when the trajectory is received, off
 the control path. `model` follows the motion in place of the slow manifold: the regulator of its simulated arm removes
 the remaining error. Where no shift is found the manifold remains, and the reason is in `Preparation.note`.
@@ -51,6 +52,9 @@ MIN_COUNT, MAX_COUNT = 24, 160
 FASTEST = 3.0
 #: Rounds of linearisation at most, and change of the shift after which there is no other one [rad].
 ROUNDS, CLOSE = 6, 1e-7
+#: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
+#: so many rounds at most.
+RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
 #: Number of times at which shift and torque are bounded.
 GRID = 100
 #: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s].
@@ -337,20 +341,46 @@ class _Planner:
         A, b = A[moved] * scale[:, None], b[moved] * scale
         at = np.arange(0, self.steps + 1, max(1, self.steps // GRID))
         (_, u), du = _finite(*self._forces(at, x, v)), self._torque(forced, at)
-        change = self._least_squares(c, A, b)
-        if (np.abs(u + du @ change.ravel()) <= self.limit).all():
-            return change
-        return self._linear_programme(c, A, b, u, du)
+        change = self._within_limits(c, A, b, u, du)
+        return self._linear_programme(c, A, b, u, du) if change is None else change
 
-    def _least_squares(self, c, A, b):
-        """The change after which the mean square of the shift, and of its acceleration, is least."""
+    def _within_limits(self, c, A, b, u, du):
+        """As `_least_squares`, within the torque limit; None where that is not found.
+
+        What is beyond `RESERVED` of the limit is penalised, at the times and joints where it is, until these no longer
+        change.
+        """
+        bounded = np.flatnonzero(np.isfinite(self.limit))
+        limit = self.limit[bounded]
+        here, by = u[:, bounded] / limit, du[:, bounded] / limit[:, None]
+        over, change = np.zeros(here.shape), self._least_squares(c, A, b)
+        for _ in range(PENALTIES):
+            share = here + by @ change.ravel()
+            if np.abs(share).max(initial=0.0) <= 1.0 and not over.any():
+                return change
+            now = np.where(np.abs(share) > RESERVED, np.sign(share), 0.0)
+            if (now == over).all():
+                return change if np.abs(share).max() <= 1.0 else None
+            over = now
+            at = over != 0.0
+            change = self._least_squares(c, A, b, by[at], RESERVED * over[at] - here[at])
+        return None
+
+    def _least_squares(self, c, A, b, rows=None, values=None):
+        """The change x after which the mean square of the shift, and of its acceleration, is least, with A x = b.
+
+        `rows` x should be near `values`, by a penalty of weight `PENALTY`.
+        """
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2
         weight = N.T @ N + SMOOTHNESS * Ndd.T @ Ndd
         H = np.kron(np.eye(n), weight / np.abs(weight).max())
-        size, rows = n * count, len(b)
-        kkt = np.block([[H, A.T], [A, np.zeros((rows, rows))]])
-        right = np.concatenate([-H @ c.ravel(), b])
+        size, held, right = n * count, len(b), -H @ c.ravel()
+        if rows is not None:
+            H = H + PENALTY * rows.T @ rows
+            right = right + PENALTY * rows.T @ values
+        kkt = np.block([[H, A.T], [A, np.zeros((held, held))]])
+        right = np.concatenate([right, b])
         return np.linalg.lstsq(kkt, right, rcond=1e-12)[0][:size].reshape(n, count)
 
     def _linear_programme(self, c, A, b, u, du):
