@@ -93,6 +93,16 @@ def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
     assert found.gains is not None
 
 
+def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback(monkeypatch):
+    def never(*_):
+        raise AssertionError("a linear programme")
+
+    monkeypatch.setattr(preview._Planner, "_linear_programme", never)
+    known, _, found = prepared(10, Preview)
+    torque, limits = np.abs(found.plan.torque), known.arm.torque_limits
+    assert (torque < 0.96 * limits).all() and (torque.max(axis=0) > 0.94 * limits).any()
+
+
 def test_the_compiled_bending_of_a_plan_is_that_of_the_equations():
     case = generator.arm(10)
     known = model.build(case.read().known)

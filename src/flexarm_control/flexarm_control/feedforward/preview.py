@@ -16,10 +16,11 @@ are linear in c to first order. The shift of least mean square,
 
 solves one linear system. If its torque exceeds the limit, what is beyond 0.95 of it is penalised where it is, round by
 round; if that does not end within the limit, a linear programme (HiGHS through scipy) finds the shift with the smallest
-maximum, which is rougher: its steep turns excite the modes that are not in the plan. The full equations are then integrated along the solution, linearised there, and
-solved again. A mode that the shift does not move is left out. All of this happens when the trajectory is received, off
-the control path. `model` follows the motion in place of the slow manifold: the regulator of its simulated arm removes
-the remaining error. Where no shift is found the manifold remains, and the reason is in `Preparation.note`.
+maximum, which is rougher: its steep turns excite the modes that are not in the plan. The full equations are then
+integrated along the solution, linearised there, and solved again. A mode that the shift does not move is left out. All
+of this happens when the trajectory is received, off the control path. `model` follows the motion in place of the slow
+manifold: the regulator of its simulated arm removes the remaining error. Where no shift is found the manifold remains,
+and the reason is in `Preparation.note`.
 
 In a stop, the plan can't be followed. Its bending beside the slow manifold is a vibration, which goes on in its own
 time and ends with the plan; the regulator damps it as the joints slow down. So with the manifold's motion s_ref along
