@@ -15,7 +15,7 @@ from flexarm_control.feedforward import base, preview
 from flexarm_control.feedforward.model import ModelFeedforward, path_of
 from flexarm_control.feedforward.preview import Preview
 from flexarm_control.robust.design import Settings, design
-from flexarm_control.trajectory import specs
+from flexarm_control.trajectory import ReferenceGenerator, specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
@@ -58,7 +58,7 @@ def reference_manifold(known):
 
 
 def prepared(number, kind):
-    """The arm's model, the path of its motion, and what a feed-forward makes of it."""
+    """The arm's model, the path of its motion, and what a feed-forward makes of it; which it can follow."""
     case = generator.arm(number)
     known = model.build(case.read().known)
     n = known.n_joints
@@ -68,7 +68,16 @@ def prepared(number, kind):
     settings = base.Settings(2e-3, start[0])
     forward = kind(known, reference_manifold(known), settings)
     forward.limit = known.arm.torque_limits
-    return known, path_of(motion, start), forward.prepare(motion, start)
+    found = forward.prepare(motion, start)
+    reference = ReferenceGenerator(known.joint_names)
+    reference.start(start[0], 0)
+    verdict = reference.offer(motion)
+    forward.take(found, verdict.trajectory_id)
+    for k in range(20):
+        reference.sample(2_000_000 * k)
+        forward.update(reference, 2e-3 if k else 0.0)
+    assert np.abs(forward.position - reference.position).max() < np.radians(10.0)
+    return known, path_of(motion, start), found
 
 
 def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not():

@@ -115,8 +115,8 @@ class Preview(ModelFeedforward):
             return _Planner(model, path, start, self.limit).solve()
 
     def _planned(self, prepared, path, stamp_ns):
-        if prepared is None or path.scaled:  # a plan at another speed is no motion of the arm
-            return None
+        if prepared is None or prepared.plan is None or path.scaled:
+            return None  # a plan at another speed is no motion of the arm
         elapsed_ns = stamp_ns - path.followed.start_ns
         return prepared.plan if 0 <= elapsed_ns < prepared.plan.duration * SECOND else None
 
