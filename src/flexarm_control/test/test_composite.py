@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import FAST, SLOW, design, design_law
-from flexarm_control.feedforward.seen import SeenMotion
+from flexarm_control.composite.seen import SeenMotion
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import design_observer, observe
 from flexarm_control.trajectory import ReferenceGenerator, validate

@@ -30,7 +30,7 @@ def test_the_designed_control_tracks_as_the_slow_one_and_rests_sooner_than_both(
     assert designed["peak_joint_error_deg"] < slow["peak_joint_error_deg"] < 0.3
     assert designed["peak_joint_error_deg"] < 0.06 * composite["peak_joint_error_deg"]
     for other in (slow, composite):
-        assert designed["residual_tip_rms_ft"] < 0.02 * other["residual_tip_rms_ft"]
+        assert designed["residual_tip_rms_ft"] < 0.03 * other["residual_tip_rms_ft"]
         assert designed["settling_time_s"] < 0.2 * other["settling_time_s"]
 
 

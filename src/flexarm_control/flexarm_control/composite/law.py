@@ -20,8 +20,8 @@ from ..arrays import clip, some
 from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..feedforward.model import At
-from ..feedforward.seen import SeenMotion
 from ..manifold.quasi_steady import QuasiSteady
+from .seen import SeenMotion
 
 #: Rate at which the torque of another payload fades, over the lowest locked frequency: a hundredth is left after two
 #: periods.
