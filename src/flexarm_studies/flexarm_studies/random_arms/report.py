@@ -75,7 +75,7 @@ def _cells(group, best):
     settled = [row for row in works if row["settled"]]
     in_time = sum(row["settling_periods"] <= IN_TIME for row in settled)
     no_later = None
-    if best:
+    if best and any((row["number"], row["variant"]) in best for row in group):
         compared = [row for row in settled if (row["number"], row["variant"]) in best]
         no_later = sum(
             row["settling_s"] <= best[row["number"], row["variant"]] + EQUAL for row in compared
