@@ -11,12 +11,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_control import trajectory
 from flexarm_control.composite.design import design
 from flexarm_control.fading import Fading
+from flexarm_control.feedforward import model as model_feedforward
 from flexarm_control.feedforward.model import gains_along, path_of, regulator
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_control.trajectory.path import SlowedPath
 from flexarm_control.trajectory.scaling import ScaledPath, TimeLaw
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import Friction
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models.model import build
 
@@ -78,9 +80,7 @@ def test_regulators_hold_everywhere_along_a_motion_there_and_back():
 
 def test_a_stop_on_the_way_ends_with_the_regulator_of_the_arm_at_rest(two_link):
     names, still, start = two_link.joint_names, np.zeros(2), np.array([0.0, 0.3])
-    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
-    settings = {"feedforward": "model", "stability_margin": -1000.0}
-    motion = design(two_link, *laws, {"type": "reference"}, settings).feedforward
+    motion = joint_pid_motion(two_link)
     points = [(800 * MS, np.array([1.2, 1.0]), still, still, [])]
     data = trajectory.validate(names, names, 0, points)
     prepared = motion.prepare(data, np.stack([start, still, still]))
@@ -99,6 +99,43 @@ def test_a_stop_on_the_way_ends_with_the_regulator_of_the_arm_at_rest(two_link):
     slow = ScaledPath(path, TimeLaw(0, 0.0, 0.5))
     assert slow.pace(100 * MS) == 0.5
     assert_allclose(prepared.at(t, slow, 100 * MS), 0.25 * moving + 0.75 * resting)
+
+
+def joint_pid_motion(model):
+    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
+    settings = {"feedforward": "model", "stability_margin": -1000.0}
+    return design(model, *laws, {"type": "reference"}, settings).feedforward
+
+
+def test_after_a_motion_that_ends_with_an_acceleration_the_regulator_is_that_of_rest(two_link):
+    names, none, start = two_link.joint_names, np.zeros(2), np.zeros((3, 2))
+    points = [(800 * MS, np.array([1.2, 1.0]), none, [], [])]  # a cubic
+    data = trajectory.validate(names, names, 0, points)
+    prepared = joint_pid_motion(two_link).prepare(data, start)
+    for t in (0.0, 0.8, 2.0):
+        assert_allclose(prepared.gains.at(t), prepared.at_rest.at(t), rtol=1e-6, atol=1e-9)
+    moving, resting = prepared.gains.at(0.7), prepared.at_rest.at(0.7)
+    assert np.abs(moving - resting).max() > 1e-3 * np.abs(moving).max()
+
+
+def test_where_no_regulator_holds_the_moving_arm_that_of_rest_remains(two_link, monkeypatch):
+    def none(*_):
+        raise DesignError("swings", field="feedforward")
+
+    monkeypatch.setattr(model_feedforward, "moving_plant", none)
+    names, still = two_link.joint_names, np.zeros(2)
+    data = trajectory.validate(names, names, 0, [(800 * MS, np.ones(2), still, still, [])])
+    prepared = joint_pid_motion(two_link).prepare(data, np.zeros((3, 2)))
+    assert prepared.gains is prepared.at_rest and prepared.note == "feedforward: swings"
+
+
+def test_a_slow_motion_takes_no_more_designs_than_one_of_an_arm_at_rest(two_link):
+    names, still, counts = two_link.joint_names, np.zeros(2), {}
+    for seconds in (1, 60):
+        points = [(1000 * seconds * MS, np.ones(2), still, still, [])]
+        path = path_of(trajectory.validate(names, names, 0, points), np.zeros((3, 2)))
+        counts[seconds] = [len(gains_along(two_link, path, 2e-3, m).times) for m in (True, False)]
+    assert counts[60][0] <= counts[60][1] + 2 and counts[1][0] > 2 * counts[1][1]
 
 
 def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):
@@ -124,9 +161,7 @@ def test_the_simulated_arm_comes_to_rest_on_the_reference(two_link, change):
     else:
         arm = replace(arm, gravity=(0.0, -0.98, 0.0))
     model, names, none = build(arm), two_link.joint_names, np.zeros(2)
-    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
-    settings = {"feedforward": "model", "stability_margin": -1000.0}
-    motion = design(model, *laws, {"type": "reference"}, settings).feedforward
+    motion = joint_pid_motion(model)
     reference, start, end = ReferenceGenerator(names), np.array([0.0, 0.3]), np.array([0.5, 0.5])
     reference.start(start, 0)
     data = trajectory.validate(names, names, 0, [(2000 * MS, end, none, none, [])])

@@ -62,8 +62,8 @@ DECAY = 0.3
 METHOD = "dop853"
 #: Beyond this joint error the simulated arm starts again on the reference [rad].
 LOST = 1.0
-#: Largest turn of a joint [rad], and of the lowest mode's phase [rad], between two designs along a trajectory.
-APART, PHASE = 0.12, 0.5
+#: Largest turn of a joint [rad], and change of what bends the arm [-], between two designs along a trajectory.
+APART, BENT = 0.12, 0.008
 #: Times of a trajectory at which one may be.
 GRID = 400
 #: Relative change of the plant with the joints below which one gain serves everywhere.
@@ -160,7 +160,7 @@ class Preparation:
     at_rest: Gains | None = None  # for a stop on the way
     plan: object = None  # a `preview.Plan`
     trajectory_id: int = 0  # 0 until it is accepted
-    note: str = ""  # why there is no plan though one is wanted
+    note: str = ""  # what is missing, and why: a plan, or regulators of the moving arm
 
     def at(self, elapsed, path, stamp_ns):
         """Gain at a time since the start [s]; on a path that is slowed down, what bends the arm falls as s'^2."""
@@ -183,8 +183,10 @@ def path_of(trajectory, start):
 def gains_along(model, path, period, moving=True):
     """`Gains` along a path for samples of a `period` [s], checked on the path at `CHECKS` times of each interval.
 
-    They are for the arm as it moves there, or, not `moving`, for one that rests there. An interval whose interpolated
-    gain does not hold the arm is halved, while a joint turns by more than `NEAREST` in it.
+    They are for the arm as it moves there, or, not `moving`, for one that rests there; at both ends it rests. A motion
+    bends the arm by its accelerations and squared speeds over the square of the lowest frequency with the joints
+    locked. An interval whose interpolated gain does not hold the arm is halved, while a joint turns by more than
+    `NEAREST` in it.
 
     Raises
     ------
@@ -195,15 +197,14 @@ def gains_along(model, path, period, moving=True):
     states = np.empty((grid.size, 3, model.n_joints))
     for t, state in zip(grid, states, strict=True):
         path.evaluate(min(round(t * SECOND), path.duration_ns - 1), state)
-    q = states[:, 0]
-    way = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1))])
-    count = int(np.ceil(way[-1] / APART)) + 1
-    at = {*np.searchsorted(way, np.linspace(0.0, way[-1], count)).tolist()}
-    if moving:
-        phase = grid[-1] * lowest(model, q[0])
-        times = np.linspace(0.0, grid[-1], int(np.ceil(phase / PHASE)) + 1)
-        at |= {*np.searchsorted(grid, times).tolist()}
-    else:
+    states[0, 1:] = states[-1, 1:] = 0.0
+    q, velocity, acceleration = states.transpose(1, 0, 2)
+    way, at = _length(q), set()
+    bends = np.hstack([acceleration, velocity**2]) / lowest(model, q[0]) ** 2
+    for length, step in ((way, APART), (_length(bends), BENT))[: 1 + moving]:
+        count = int(np.ceil(length[-1] / step)) + 1
+        at |= {*np.searchsorted(length, np.linspace(0.0, length[-1], count)).tolist()}
+    if not moving:
         states = states[:, :1]
     at = sorted(at)
     gains = [_regulator_of(model, states[k], period) for k in at]
@@ -223,6 +224,11 @@ def gains_along(model, path, period, moving=True):
         at.insert(i + 1, middle)
         gains.insert(i + 1, _regulator_of(model, states[middle], period))
     return Gains(grid[at], np.array(gains))
+
+
+def _length(points):
+    """Length of a way through points (k, n) up to each of them, by the coordinate that changes most, (k,)."""
+    return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points, axis=0)).max(axis=1))])
 
 
 def _regulator_of(model, state, period):
@@ -400,12 +406,15 @@ class ModelFeedforward(Feedforward):
         found = Preparation(start, None)
         if self.K is None:
             period = self.settings.period
-            found.gains = gains_along(model, path, period)
-            found.at_rest = gains_along(model, path, period, moving=False)
+            found.gains = found.at_rest = gains_along(model, path, period, moving=False)
+            try:
+                found.gains = gains_along(model, path, period)
+            except DesignError as error:  # those of rest are better than none
+                found.note = str(error)
         try:
             found.plan = self._plan(model, path, start)
         except DesignError as error:
-            found.note = str(error)
+            found.note = "; ".join(filter(None, (found.note, str(error))))
         return found
 
     def _plan(self, model, path, start):

@@ -104,7 +104,7 @@ class TrajectoryInbox:
                 plan = self._designer.prepare(feedforward, ahead, start)
                 note = getattr(plan, "note", "")
                 if note:
-                    self._node.get_logger().warning(f"trajectory without preview: {note}")
+                    self._node.get_logger().warning(f"feed-forward of a trajectory: {note}")
         except CancelledError:
             return
         except Exception as error:

@@ -50,7 +50,7 @@ class ClosedLoop:
     lost : str
         Why the last run of `follow` ended early; empty if it did not.
     unprepared : str
-        Why its trajectory went without preview; empty if it did not, or none was asked for.
+        What its trajectory went without, preview for one, and why; empty: nothing that was asked for.
     bag : LoopBag or None
         Where every sample and its answer are written.
     designed : Default or None
