@@ -380,7 +380,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
     task, say = _Task(arm, settings, uncertainty), _Progress(progress)
-    found = task.found(say.part(0.0, USUAL), gains, 0.0)
+    found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
         short = _Task(arm, settings, uncertainty, short=True)
         other = short.found(say.part(USUAL, 1.0), gains, LITTLE)
