@@ -231,6 +231,8 @@ def test_a_motion_beyond_all_bounds_has_no_preview_and_says_why(arm_r, far):
 class Swinging:
     """A motion of one joint and two modes, by the time."""
 
+    placed = False
+
     def __init__(self):
         self.position, self.velocity, self.acceleration = np.zeros((3, 1))
         self.amplitude, self.rate = np.zeros((2, 2))
@@ -243,40 +245,43 @@ class Swinging:
 
 
 def test_the_motion_is_seen_as_the_observer_sees_an_arm_that_follows_it(arm_r):
-    """By the observer's own filters, with samples that get lost; what is left falls with the period's square."""
+    """By the observer's own filters, with samples that get lost; fast beside the samples as the motion may be."""
     corners = {"joint_velocity_bandwidth": 150.0, "bandwidth": 220.0}
-    worst = []
-    for period in (2 * MS, MS):
-        motion = Swinging()
-        seen = SeenMotion(motion, *corners.values())
-        core = observe(arm_r, "filtered_derivative", corners | {"measured_velocity": False})
-        arm, last, off = ArmSample(1, 2, 2), None, 0.0
-        for k in range(400):
-            if k in (100, 101, 250):
-                continue
-            motion.at(1e-9 * k * period)
-            arm.stamp_ns, arm.session, arm.sequence = 1 + k * period, 1, k
-            arm.position[:], arm.amplitude, arm.strain = (
-                motion.position,
-                motion.amplitude.copy(),
-                None,
-            )
-            arm.velocity[:], arm.torque[:] = motion.velocity, 0.0
-            core.step(arm)
-            seen.update(0.0 if last is None else 1e-9 * (arm.stamp_ns - last))
-            last = arm.stamp_ns
-            if 1e-9 * k * period > 0.1:
-                off = max(off, np.abs(core.velocity - seen.velocity).max() / 3.0)
-                off = max(off, np.abs(core.rate - seen.rate).max() / 31.0)
-        worst.append(off)
-    assert worst[1] < 1e-3 and worst[0] / worst[1] > 3.0, worst
-    assert np.abs(motion.rate - seen.rate).max() > 1e-2  # its lag is no small thing
-    motion.position += 1.0
+    motion, period = Swinging(), 40 * MS
+    seen = SeenMotion(motion, *corners.values())
+    core = observe(arm_r, "filtered_derivative", corners | {"measured_velocity": False})
+    arm, last = ArmSample(1, 2, 2), None
+    for k in range(400):
+        if k in (100, 101, 250):
+            continue
+        motion.at(1e-9 * k * period)
+        arm.stamp_ns, arm.session, arm.sequence = 1 + k * period, 1, k
+        arm.position[:], arm.amplitude, arm.strain = motion.position, motion.amplitude.copy(), None
+        arm.velocity[:], arm.torque[:] = motion.velocity, 0.0
+        core.step(arm)
+        seen.update(0.0 if last is None else 1e-9 * (arm.stamp_ns - last))
+        last = arm.stamp_ns
+        if k > 10:  # the observer begins with an arm that rests
+            assert_allclose(core.velocity, seen.velocity, atol=1e-9)
+            assert_allclose(core.rate, seen.rate, atol=1e-9)
+    assert np.abs(motion.rate - seen.rate).max() > 1.0  # its lag is no small thing
+
+
+def test_a_motion_that_is_put_elsewhere_makes_no_speed():
+    motion = Swinging()
+    seen = SeenMotion(motion, 150.0, 220.0)
+    for k in range(20):
+        motion.at(1e-3 * k)
+        seen.update(1e-3 * (k > 0))
     before = seen.velocity.copy()
+    motion.position += 1.0
+    motion.placed = True
     seen.update(1e-3)
-    assert (
-        np.abs(seen.velocity - before).max() < 0.5
-    )  # a motion that is put elsewhere makes no speed
+    assert np.abs(seen.velocity - before).max() < 0.01
+    motion.placed = False
+    motion.position += 1e-3 * motion.velocity
+    seen.update(1e-3)
+    assert np.abs(seen.velocity - before).max() < 0.01
 
 
 def test_without_corners_the_motion_is_seen_as_it_is():

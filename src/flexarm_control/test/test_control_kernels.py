@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline, interp1d
 
 from flexarm_control import kernels
@@ -39,6 +40,38 @@ def test_between_rows_values_are_linear_and_the_last_one_is_held(x):
     COMPILED.evenly_between(values, x, out)
     wanted = interp1d(np.arange(3.0), values, axis=0)(min(x, 2.0))
     np.testing.assert_allclose(out, wanted, rtol=1e-14, atol=1e-15)
+
+
+def test_responses_of_the_bending_are_those_of_scipys_integrator():
+    m, n, count, steps, T = 2, 2, 3, 200, 1.3
+    spring, damper, by = -40.0 * np.eye(m), -0.3 * np.eye(m), RNG.normal(size=(m, 3, n))
+    spring[0, 1] = 7.0
+    shift = [lambda t, k=k: np.sin((k + 1.0) * t) for k in range(count)]
+    shift_d = [lambda t, k=k: (k + 1.0) * np.cos((k + 1.0) * t) for k in range(count)]
+    shift_dd = [lambda t, k=k: -((k + 1.0) ** 2) * np.sin((k + 1.0) * t) for k in range(count)]
+    times = np.linspace(0.0, T, 2 * steps + 1)
+    basis = np.array([[[f(t) for f in part] for t in times] for part in (shift, shift_d, shift_dd)])
+    rows, out = np.array([0, 77, steps]), np.zeros((3, 3, m, n * count))
+    every = (
+        np.ascontiguousarray(np.broadcast_to(x, (times.size, *x.shape)))
+        for x in (spring, damper, by)
+    )
+    COMPILED.responses(*every, basis, T / steps, rows, out)
+    for joint in range(n):
+        for k in range(count):
+
+            def rates(t, s, joint=joint, k=k):
+                force = by[:, :, joint] @ [shift[k](t), shift_d[k](t), shift_dd[k](t)]
+                return np.concatenate([s[m:], spring @ s[:m] + damper @ s[m:] + force])
+
+            wanted = solve_ivp(
+                rates, (0.0, T), np.zeros(2 * m), rtol=1e-10, atol=1e-12, dense_output=True
+            )
+            for row, step in enumerate(rows):
+                t = step * T / steps
+                state = wanted.sol(t)
+                found = out[row, :, :, joint * count + k].ravel()
+                np.testing.assert_allclose(found, [*state, *rates(t, state)[m:]], atol=1e-6)
 
 
 def test_polynomials_are_numpys():

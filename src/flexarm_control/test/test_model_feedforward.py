@@ -2,6 +2,7 @@
 """The feed-forward that simulates the nominal arm: no step of its torque, whatever the reference's jerk does."""
 
 import pickle
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -101,9 +102,9 @@ def test_a_stop_on_the_way_ends_with_the_regulator_of_the_arm_at_rest(two_link):
     assert_allclose(prepared.at(t, slow, 100 * MS), 0.25 * moving + 0.75 * resting)
 
 
-def joint_pid_motion(model):
+def joint_pid_motion(model, kind="model"):
     laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
-    settings = {"feedforward": "model", "stability_margin": -1000.0}
+    settings = {"feedforward": kind, "stability_margin": -1000.0}
     return design(model, *laws, {"type": "reference"}, settings).feedforward
 
 
@@ -127,6 +128,19 @@ def test_where_no_regulator_holds_the_moving_arm_that_of_rest_remains(two_link, 
     data = trajectory.validate(names, names, 0, [(800 * MS, np.ones(2), still, still, [])])
     prepared = joint_pid_motion(two_link).prepare(data, np.zeros((3, 2)))
     assert prepared.gains is prepared.at_rest and prepared.note == "feedforward: swings"
+
+
+def test_what_would_come_too_late_for_the_motion_is_left_out_and_named(two_link):
+    names, still = two_link.joint_names, np.zeros(2)
+    data = trajectory.validate(names, names, 0, [(800 * MS, np.ones(2), still, still, [])])
+    for kind in ("model", "preview"):
+        motion = joint_pid_motion(two_link, kind)
+        late = motion.prepare(data, np.zeros((3, 2)), time.monotonic())
+        assert late.gains is late.at_rest and late.gains is not None and late.plan is None
+        assert "too soon for regulators of the moving arm" in late.note
+        assert ("too soon for a plan" in late.note) == (kind == "preview")
+        early = motion.prepare(data, np.zeros((3, 2)), time.monotonic() + 600.0)
+        assert not early.note and (early.plan is not None) == (kind == "preview")
 
 
 def test_a_slow_motion_takes_no_more_designs_than_one_of_an_arm_at_rest(two_link):

@@ -8,6 +8,9 @@ import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+#: What a linear algebra library reads when it is loaded. With several threads, processes that work on small matrices
+#: slow each other down: a regulator took six times as long.
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def step_back(niceness, cpus=()):

@@ -31,7 +31,7 @@ from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.kernels import generated, native
 from flexarm_dynamics.models.chain import Chain, work_space
 from flexarm_dynamics.models.fixed_step import METHODS
-from flexarm_dynamics.models.model import Tableau, rotation
+from flexarm_dynamics.models.model import ArmModel, Tableau, rotation
 
 #: As in the other tests: the same examples on every run and every machine.
 examples = settings(max_examples=40, deadline=None, derandomize=True, database=None)
@@ -548,10 +548,11 @@ def test_forces_are_those_of_a_second_derivation(seed, layout, level):
         sums = reference.motion(at, speed * zd, zdd)
         theirs = sums["force"] + sums["gravity"] + deflected * elastic
         theirs = theirs + speed * (damping + friction)
-        ours = chain.inverse_dynamics(
-            q, speed * qd, zdd[:n], deflected * delta, speed * delta_d, zdd[n:]
-        )
+        motion = q, speed * qd, zdd[:n], deflected * delta, speed * delta_d, zdd[n:]
+        ours = chain.inverse_dynamics(*motion)
         close(ours, theirs, 1e-11, f"{speed, acceleration, deflected}")
+        close(ArmModel.inverse_dynamics(chain, *motion), theirs, 1e-11, "by the terms of (2)")
+        close(ArmModel.mass_matrix(chain, q, delta), chain.mass_matrix(q, delta), 1e-14, "M")
 
 
 @examples

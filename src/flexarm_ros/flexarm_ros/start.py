@@ -10,6 +10,8 @@ import os
 import signal
 import sys
 
+from flexarm_dynamics.processes import ONE_THREAD
+
 #: Names the process that this one is to end with, in the environment; see `end_with_parent`.
 PARENT = "FLEXARM_PARENT"
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
@@ -32,7 +34,9 @@ def end_with_parent():
 
 
 def start(module):
-    """Import a node's module and call its `main`."""
+    """Import a node's module and call its `main`; linear algebra has one thread, here and in processes it starts."""
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     faulthandler.enable()  # a crash in the middleware says where
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))

@@ -7,9 +7,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.processes import ONE_THREAD
 
-#: Set to 1 for workers: with several threads each they would slow each other down.
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 #: Value of ``--scheduler`` for processes on this machine.
 PROCESSES = "processes"
 

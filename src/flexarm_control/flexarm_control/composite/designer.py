@@ -15,9 +15,9 @@ def ready(model):
     """Does nothing: calling it starts the process, which imports this module and builds the model."""
 
 
-def prepare(model, feedforward, trajectory, start):
-    """``feedforward.prepare(trajectory, start)``, callable in the design process; its `model` is not needed."""
-    return feedforward.prepare(trajectory, start)
+def prepare(model, feedforward, *arguments):
+    """``feedforward.prepare(*arguments)``, callable in the design process; its `model` is not needed."""
+    return feedforward.prepare(*arguments)
 
 
 def find(model, settings, uncertainty):
@@ -75,12 +75,12 @@ class Designer:
             # With a model of its own: meanwhile the control path uses the other one.
             return control(build(self.model.arm), values)
 
-    def prepare(self, feedforward, trajectory, start):
+    def prepare(self, feedforward, *arguments):
         """What `Feedforward.prepare` makes of the same arguments; a `CancelledError` after `close`."""
         try:
-            return self._in_process(prepare, feedforward, trajectory, start)
+            return self._in_process(prepare, feedforward, *arguments)
         except AwayError:
-            return feedforward.prepare(trajectory, start)
+            return feedforward.prepare(*arguments)
 
     def find(self, settings, uncertainty):
         """What `default.find` makes of the same `settings` and `uncertainty`; a `CancelledError` after `close`."""

@@ -128,8 +128,6 @@ class CompositeControl:
         """A new session begins: the laws forget their own states."""
         for part in self._parts():
             part.reset()
-        if self._seen is not self.feedforward:
-            self._seen.reset()
         self._exchanged.clear()
         self._pieces.clear()
         self._last = self._before = self._source = None

@@ -43,6 +43,8 @@ class Feedforward(Component, ABC):
 
     #: Whether `prepare` has anything to do.
     plans = False
+    #: Whether the motion was put elsewhere at the present sample, in place of moving on.
+    placed = False
 
     def __init__(self, model, manifold, settings):
         super().__init__(model)
@@ -63,10 +65,11 @@ class Feedforward(Component, ABC):
     def take(self, plan, trajectory_id):
         """Follow `plan`, the result of `prepare` or None, as soon as the reference follows its trajectory."""
 
-    def prepare(self, trajectory, start):
+    def prepare(self, trajectory, start, deadline=np.inf):
         """Design work for a trajectory, off the control path; None where there is none to do.
 
-        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n).
+        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n). What
+        would not be done by the `deadline`, a time of `time.monotonic` [s], is left out.
         """
         return None
 

@@ -35,6 +35,7 @@ end. The regulator's torque must not. So the jump is added to what the regulator
 J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives; likewise for u_ref.
 """
 
+import time
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -70,7 +71,9 @@ GRID = 400
 NEGLIGIBLE = 1e-6
 #: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
 #: a joint turns by more than this in it [rad].
-CHECKS, NEAREST = 7, APART / 8.0
+CHECKS, NEAREST = 3, APART / 8.0
+#: Regulators of the moving arm take about so many times as long as those of the arm at rest [-].
+MOVING = 3.0
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
@@ -169,6 +172,18 @@ class Preparation:
             K *= moves
             K += (1.0 - moves) * self.at_rest.at(elapsed)
         return K
+
+
+def in_time(deadline, length, what):
+    """A `DesignError` where something that takes some time [s] would not be there by a time of `time.monotonic`."""
+    left = deadline - time.monotonic()
+    if length > left:
+        raise DesignError(
+            f"the motion begins too soon for {what}, which take about {length:.2g} s",
+            field="feedforward",
+            limit=f"{max(left, 0.0):.2g} s",
+            hint="send it earlier, or with stamp 0",
+        )
 
 
 def path_of(trajectory, start):
@@ -279,19 +294,20 @@ class _Run:
         Of (state, torque).
     source : _Source or None
         Of the last sample.
-    gained : bool
-        Whether there was a gain at the last sample.
+    gained, placed : bool
+        Whether there was a gain at the last sample, and whether the arm was put elsewhere then.
     """
 
     def __init__(self, size, n, rate):
         self.state, self.torque, self.driven = np.zeros(size), np.zeros(n), np.zeros(n)
-        self.fading, self.source, self.gained = Fading(size + n, rate), None, False
+        self.fading, self.source = Fading(size + n, rate), None
+        self.gained = self.placed = False
 
     def take(self, other):
         """Go on as the other one would."""
         self.state[:], self.torque[:], self.driven[:] = other.state, other.torque, other.driven
         self.fading.take(other.fading)
-        self.source, self.gained = other.source, other.gained
+        self.source, self.gained, self.placed = other.source, other.gained, other.placed
 
 
 class At:
@@ -400,24 +416,30 @@ class ModelFeedforward(Feedforward):
     def plans(self):
         return self.K is None
 
-    def prepare(self, trajectory, start):
+    @property
+    def placed(self):
+        return self._run.placed
+
+    def prepare(self, trajectory, start, deadline=np.inf):
         # A model of its own: the loop goes on with this one meanwhile.
         model, path = copy(self.model), path_of(trajectory, start)
-        found = Preparation(start, None)
+        found, begun = Preparation(start, None), time.monotonic()
         if self.K is None:
             period = self.settings.period
             found.gains = found.at_rest = gains_along(model, path, period, moving=False)
             try:
+                expected = MOVING * (time.monotonic() - begun)
+                in_time(deadline, expected, "regulators of the moving arm")
                 found.gains = gains_along(model, path, period)
             except DesignError as error:  # those of rest are better than none
                 found.note = str(error)
         try:
-            found.plan = self._plan(model, path, start)
+            found.plan = self._plan(model, path, start, deadline)
         except DesignError as error:
             found.note = "; ".join(filter(None, (found.note, str(error))))
         return found
 
-    def _plan(self, model, path, start):
+    def _plan(self, model, path, start, deadline):
         """A `Plan` that is followed in place of the slow manifold, if any; a `DesignError` where there is none."""
 
     def take(self, plan, trajectory_id):
@@ -545,8 +567,11 @@ class ModelFeedforward(Feedforward):
             fading.jump(np.concatenate([run.state, run.torque]) - wanted)
         run.source, run.gained = source, K is not None
         compiled, error, left = kernels.compiled(), self._error, fading.left
+        # The largest error of the joints, and of all.
         joints, largest = compiled.off(source.state, left, run.state, error)
-        if self._starts_again(reference, K, joints, largest):
+        first, self._first = self._first, False
+        run.placed = first or not joints < LOST  # NaN is lost, too
+        if run.placed or K is None or (largest < THERE and not some(reference.velocity)):
             run.state += error
             error[:] = 0.0
         gain = self._no_gain if K is None else K
@@ -571,13 +596,3 @@ class ModelFeedforward(Feedforward):
         self._ahead = ahead
         n, size = self.model.n_joints, run.state.size // 2
         return run.state[:n], run.state[size : size + n], ahead.acceleration
-
-    def _starts_again(self, reference, K, joints, largest):
-        """Whether the simulated arm is put on the wanted state: at first, when lost, and at rest when it is there.
-
-        `joints` and `largest` are the largest error of the joints and of all.
-        """
-        first, self._first = self._first, False
-        if first or K is None or not joints < LOST:  # NaN is lost, too
-            return True
-        return largest < THERE and not some(reference.velocity)

@@ -17,7 +17,8 @@ are linear in c to first order. The shift of least mean square,
 solves one linear system. If its torque exceeds the limit, what is beyond 0.95 of it is penalised where it is, round by
 round; if that does not end within the limit, a linear programme (HiGHS through scipy) finds the shift with the smallest
 maximum, which is rougher: its steep turns excite the modes that are not in the plan. The full equations are then
-integrated along the solution, linearised there, and solved again. A mode that the shift does not move is left out. All
+integrated along the solution, and what is left at the end is solved for again: with the derivatives there were, as long
+as that makes the next change much smaller. A mode that the shift does not move is left out. All
 of this happens when the trajectory is received, off the control path. `model` follows the motion in place of the slow
 manifold: the regulator of its simulated arm removes the remaining error. Where no shift is found the manifold remains,
 and the reason is in `Preparation.note`.
@@ -31,6 +32,7 @@ the stop, and s_path along the trajectory, the simulated arm is held to
 where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); likewise the torque.
 """
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +45,7 @@ from flexarm_dynamics.models.fixed_step import METHODS
 
 from .. import kernels
 from ..trajectory.values import SECOND
-from .model import At, ModelFeedforward
+from .model import At, ModelFeedforward, in_time
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -51,8 +53,11 @@ KNOTS_PER_PERIOD = 6.0
 MIN_COUNT, MAX_COUNT = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
-#: Rounds of linearisation at most, and change of the shift after which there is no other one [rad].
-ROUNDS, CLOSE = 6, 1e-7
+#: Rounds at most, and change of the shift after which there is no other one [rad]. The equations are linearised anew
+#: where a change is more than this part of the one before it.
+ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
+#: A plan whose last change was more than this has not been found [rad].
+FOUND = 1e-3
 #: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
 #: so many rounds at most.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
@@ -110,9 +115,9 @@ class Preview(ModelFeedforward):
         )
         none.state_at(0.0), none.torque_at(0.0)
 
-    def _plan(self, model, path, start):
+    def _plan(self, model, path, start, deadline):
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
-            return _Planner(model, path, start, self.limit).solve()
+            return _Planner(model, path, start, self.limit).solve(deadline)
 
     def _planned(self, prepared, path, stamp_ns):
         if prepared is None or prepared.plan is None or path.scaled:
@@ -186,16 +191,28 @@ class _Planner:
         # Without the first and last three: zero at either end, with velocity and acceleration.
         self.basis = np.array([everything(self.times, nu)[:, 3:-3] for nu in range(3)])
 
-    def solve(self):
-        """The plan, after up to `ROUNDS` of linearisation about the last one."""
-        n = self.model.n_joints
-        c = np.zeros((n, self.basis.shape[2]))
+    def solve(self, deadline=np.inf):
+        """The plan, after up to `ROUNDS` about the last one; a `DesignError` where there is none by the deadline."""
+        n, begun = self.model.n_joints, time.monotonic()
+        c, last, anew = np.zeros((n, self.basis.shape[2])), np.inf, True
         for _ in range(ROUNDS if self.model.n_modes else 0):
+            in_time(deadline, time.monotonic() - begun, "a plan's rounds")
+            begun = time.monotonic()
             self._along(c)
-            change = self._programme(c)
+            change = self._programme(c, anew)
             c = c + change
-            if np.abs(self.basis[0] @ change.T).max() < CLOSE:
+            size = np.abs(self.basis[0] @ change.T).max()
+            if size < CLOSE:
                 break
+            anew, last = size > SLOW * last, size
+        else:
+            if self.model.n_modes and last > FOUND:
+                raise DesignError(
+                    f"of the plan, {last:.2g} rad still change after {ROUNDS} rounds",
+                    field="preview",
+                    limit=f"{FOUND:g} rad",
+                    hint="give the motion more time",
+                )
         self._along(c)
         x, v = _finite(*self._bend())
         at = np.arange(0, self.steps + 1, self.stride)
@@ -208,47 +225,44 @@ class _Planner:
 
     def _bend(self):
         """Bending and its rate under the motion, products of deflections included, at whole steps, (steps + 1, m)."""
-        start = self.model.static_deflection(self.start[0])
-        if self.stepper is None:
-            found = self._integrated(lambda k, x, v: self._bending(*self.motion[k], x, v)[0], start)
-            return found[:, 0], found[:, 1]
         q, (n, m) = self.motion[::2], (self.model.n_joints, self.model.n_modes)
-        states, change = np.zeros((len(q), 2 * (n + m))), np.diff(q[:, 2], axis=0)
-        # The line in each step that has the acceleration's mean, by Simpson's rule, and its first moment.
-        begin = (q[:-1, 2] + 4.0 * self.motion[1::2, 2] + q[1:, 2]) / 6.0 - 0.5 * change
-        states[0, n : n + m] = start
+        states = np.zeros((len(q), 2 * (n + m)))
         states[:, :n], states[:, n + m : 2 * n + m] = q[:, 0], q[:, 1]
+        states[0, n : n + m] = self.model.static_deflection(self.start[0])
+        bent = (slice(n, n + m), slice(2 * n + m, None))
+        if self.stepper is None:
+            for i in range(self.steps):
+                x, v = (states[i, part] for part in bent)
+                for part, values in zip(bent, self._step(i, x, v), strict=True):
+                    states[i + 1, part] = values
+            return tuple(states[:, part] for part in bent)
+        # The line in each step that has the acceleration's mean, by Simpson's rule, and its first moment.
+        change = np.diff(q[:, 2], axis=0)
+        begin = (q[:-1, 2] + 4.0 * self.motion[1::2, 2] + q[1:, 2]) / 6.0 - 0.5 * change
         for i in range(self.steps):
-            state, after = states[i].copy(), states[i + 1]
+            state = states[i].copy()
             self.stepper(state, begin[i], self.h, change=change[i])
-            after[n : n + m], after[2 * n + m :] = state[n : n + m], state[2 * n + m :]
-        return states[:, n : n + m], states[:, 2 * n + m :]
+            for part in bent:
+                states[i + 1, part] = state[part]
+        return tuple(states[:, part] for part in bent)
+
+    def _step(self, i, x, v):
+        """Bending and its rate after one step more, by Runge-Kutta's method."""
+        h, (begin, middle, end) = self.h, self.motion[2 * i : 2 * i + 3]
+        a1 = self._bending(*begin, x, v)[0]
+        v2 = v + 0.5 * h * a1
+        a2 = self._bending(*middle, x + 0.5 * h * v, v2)[0]
+        v3 = v + 0.5 * h * a2
+        a3 = self._bending(*middle, x + 0.5 * h * v2, v3)[0]
+        v4 = v + h * a3
+        a4 = self._bending(*end, x + h * v3, v4)[0]
+        x, a = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4), a1 + 2.0 * a2 + 2.0 * a3 + a4
+        return x, v + h / 6.0 * a
 
     def _forces(self, at, x, v):
         """Acceleration of the bending (k, m) and joint torque (k, n) at some whole steps of the motion."""
         found = [self._bending(*self.motion[2 * k], x[k], v[k]) for k in at]
         return np.array([a for a, _ in found]), np.array([u for _, u in found])
-
-    def _integrated(self, acceleration, start):
-        """Deflection and its derivatives at whole steps, (steps + 1, 3, ...), by Runge-Kutta's method from rest.
-
-        `acceleration` takes the place in `times`, a deflection and its rate.
-        """
-        h, out = self.h, np.zeros((self.steps + 1, 3, *start.shape))
-        out[0, 0] = start
-        for i in range(self.steps):
-            x, v, k = out[i, 0], out[i, 1], 2 * i
-            a1 = out[i, 2] = acceleration(k, x, v)
-            v2 = v + 0.5 * h * a1
-            a2 = acceleration(k + 1, x + 0.5 * h * v, v2)
-            v3 = v + 0.5 * h * a2
-            a3 = acceleration(k + 1, x + 0.5 * h * v2, v3)
-            v4 = v + h * a3
-            a4 = acceleration(k + 2, x + h * v3, v4)
-            out[i + 1, 0] = x + h / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-            out[i + 1, 1] = v + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        out[-1, 2] = acceleration(2 * self.steps, out[-1, 0], out[-1, 1])
-        return out
 
     def _along(self, c):
         """Set the motion: the reference shifted by c."""
@@ -274,76 +288,65 @@ class _Planner:
     def _derivatives(self, k, x, v):
         q, qd, qdd = self.motion[k]
         n, m = self.model.n_joints, self.model.n_modes
-        t = self.model.terms(q, qd, x, v)
-        M12 = t.M[:n, n:]
+        M, (a, _) = self.model.mass_matrix(q, x), self._bending(q, qd, qdd, x, v)
         out = np.zeros((m + n, 3 * n + 3 * m))
-        out[m:, -m:] = M12
-        out[:m, 2 * n : 3 * n] = -np.linalg.solve(t.M[n:, n:], t.M[n:, :n])
-        out[m:, 2 * n : 3 * n] = t.M[:n, :n]
-        here, u = self._bending(q, qd, qdd, x, v)
-        for part, values in enumerate((q, qd, None, x, v)):
-            if values is None:
-                continue
-            first = (0, n, 0, 3 * n, 3 * n + m)[part]
+        out[:n, 2 * n : 3 * n], out[n:, 2 * n : 3 * n] = M[:n, :n], M[n:, :n]
+        out[:n, -m:] = M[:n, n:]
+        here = self.model.inverse_dynamics(q, qd, qdd, x, v, a)
+        for values, first in ((q, 0), (qd, n), (x, 3 * n), (v, 3 * n + m)):
             for j in range(values.size):
                 kept, values[j] = values[j], values[j] + SMALL
-                there, u2 = self._bending(q, qd, qdd, x, v)
+                there = self.model.inverse_dynamics(q, qd, qdd, x, v, a)
                 values[j] = kept
-                out[:m, first + j] = (there - here) / SMALL
-                # At fixed acceleration of the bending: that part comes through M12.
-                out[m:, first + j] = (u2 - u - M12 @ (there - here)) / SMALL
-        return out
+                out[:, first + j] = (there - here) / SMALL
+        # The bending accelerates so that its forces stay zero; what that takes of the torque comes through M12.
+        return np.vstack([-np.linalg.solve(M[n:, n:], out[n:]), out[:n]])
 
     def _bending(self, q, qd, qdd, x, v):
         """Acceleration of the bending, and joint torque, with the joints moved as given: (2), in full."""
-        n = self.model.n_joints
-        if self.stepper is None:
-            t = self.model.terms(q, qd, x, v)
-            M, f1, f2 = t.M, t.f1 + t.C1 @ v + t.K1 @ x, t.f2 + t.C2 @ v + t.K2 @ x
-        else:  # the same, without the arm's derivatives
-            M, f = self.model.mass_matrix(q, x), self.model.forces(q, qd, x, v)
-            f1, f2 = f[:n] + self.model.friction(qd, x, v), f[n:]
-        force = -f2 - M[n:, :n] @ qdd
-        a = np.linalg.solve(M[n:, n:], force) if force.size else force
-        return a, M[:n, :n] @ qdd + M[:n, n:] @ a + f1
+        n, model = self.model.n_joints, self.model
+        M = model.mass_matrix(q, x)
+        forces = model.inverse_dynamics(q, qd, qdd, x, v, np.zeros_like(x))
+        a = -np.linalg.solve(M[n:, n:], forces[n:]) if x.size else x
+        return a, forces[:n] + M[:n, n:] @ a
 
-    def _respond(self):
-        """Linear response of the bending to each coefficient of the shift: (steps + 1, 3, m, n count)."""
+    def _respond(self, at):
+        """Linear response of the bending to each coefficient of the shift, at some whole steps: (k, 3, m, n count)."""
         m, n, count = self.model.n_modes, self.model.n_joints, self.basis.shape[2]
-        by = self.by_joints.reshape(-1, m, 3, n)
-        force = np.einsum("tmdn,dtj->tmnj", by, self.basis).reshape(-1, m, n * count)
-
-        def acceleration(k, x, v):
-            return self.spring[k] @ x + self.damper[k] @ v + force[k]
-
-        return self._integrated(acceleration, np.zeros((m, n * count)))
+        by = np.ascontiguousarray(self.by_joints.reshape(-1, m, 3, n))
+        out = np.zeros((at.size, 3, m, n * count))
+        parts = (np.ascontiguousarray(part) for part in (self.spring, self.damper))
+        kernels.compiled().responses(*parts, by, self.basis, self.h, at, out)
+        return out
 
     def _torque(self, bending, at):
-        """Joint torque that goes with `_respond`'s columns, at some whole steps, (k, n, n count)."""
+        """Joint torque that goes with `_respond`'s columns, (k, n, n count)."""
         n, count = self.model.n_joints, self.basis.shape[2]
         by = self.torque_by_joints[2 * at].reshape(-1, n, 3, n)
         u = np.einsum("tidj,dtc->tijc", by, self.basis[:, 2 * at]).reshape(-1, n, n * count)
         for matrix, part in ((self.M12, 2), (self.C1, 1), (self.K1, 0)):
-            u += np.einsum("tij,tjc->tic", matrix[2 * at], bending[at, part])
+            u += np.einsum("tij,tjc->tic", matrix[2 * at], bending[:, part])
         return u
 
-    def _programme(self, c):
-        """Change of the shift's coefficients, (n, count)."""
+    def _programme(self, c, anew):
+        """Change of the shift's coefficients, (n, count); with what each does as it was, or found `anew`."""
         x, v = _finite(*self._bend())
-        self._linearise(x, v)
-        forced = self._respond()
-        A = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
-        b = -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
+        at = np.unique(np.append(np.arange(0, self.steps, max(1, self.steps // GRID)), self.steps))
+        if anew:
+            self._linearise(x, v)
+            forced = self._respond(at)
+            (self.torque_by,) = _finite(self._torque(forced, at))
+            self.bends = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
+        A, b = self.bends, -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
         # On one scale: deflections are thousandths. A mode that no joint moves is left as it is.
         largest = np.abs(A).max(axis=1)
         each = largest.reshape(2, -1)
         moved = np.tile((each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0), 2)
         scale = 1.0 / largest[moved]
         A, b = A[moved] * scale[:, None], b[moved] * scale
-        at = np.arange(0, self.steps + 1, max(1, self.steps // GRID))
-        (_, u), du = _finite(*self._forces(at, x, v)), self._torque(forced, at)
-        change = self._within_limits(c, A, b, u, du)
-        return self._linear_programme(c, A, b, u, du) if change is None else change
+        _, u = _finite(*self._forces(at, x, v))
+        change = self._within_limits(c, A, b, u, self.torque_by)
+        return self._linear_programme(c, A, b, u, self.torque_by) if change is None else change
 
     def _within_limits(self, c, A, b, u, du):
         """As `_least_squares`, within the torque limit; None where that is not found.

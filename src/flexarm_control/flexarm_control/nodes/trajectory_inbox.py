@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories on their way from a raw message to the controller: read, prepared, and offered or refused."""
 
+import time
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import numpy as np
@@ -16,6 +17,8 @@ from .. import trajectory
 MAX_POINTS = 10_000
 #: Trajectories that come within this time of each other, by the arm's clock, are a stream [ns].
 STREAMED = 500_000_000
+#: Of the time until a motion begins, what a plan for it may take [-].
+IN_TIME = 0.8
 
 
 def rows(msg):
@@ -101,7 +104,7 @@ class TrajectoryInbox:
         whole = ahead.stamp_ns == data.stamp_ns  # a plan is for all of it
         try:
             if feedforward is not None and feedforward.plans and start is not None and whole:
-                plan = self._designer.prepare(feedforward, ahead, start)
+                plan = self._designer.prepare(feedforward, ahead, start, self._deadline(data))
                 note = getattr(plan, "note", "")
                 if note:
                     self._node.get_logger().warning(f"feed-forward of a trajectory: {note}")
@@ -113,6 +116,13 @@ class TrajectoryInbox:
             kind = "" if isinstance(error, FlexarmError) else f"{type(error).__name__}: "
             self._node.get_logger().warning(f"trajectory on the slow manifold alone: {kind}{error}")
         self._node.hand_over(self._offer, data, plan, name)
+
+    def _deadline(self, data):
+        """Until when a plan is of use, by `time.monotonic` [s]: most of the time until the motion begins."""
+        now = self._core.reference.stamp_ns
+        if now is None or not data.stamp_ns:
+            return np.inf  # it begins when the plan is there
+        return time.monotonic() + IN_TIME * 1e-9 * (data.stamp_ns - now)
 
     def _judge_torque(self, data):
         """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""

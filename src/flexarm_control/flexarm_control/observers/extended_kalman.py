@@ -30,7 +30,7 @@ from flexarm_dynamics.parameters import Parameter, parameter
 from flexarm_dynamics.sampling import discretise
 
 from .kalman import NOISE, Kalman
-from .motion import DIFFERENCE, force_density, mass_matrix
+from .motion import DIFFERENCE, force_density
 
 
 def _flag(name, default, what):
@@ -144,8 +144,8 @@ class ExtendedKalman(Kalman):
         out[:N] = model.derivative(x[:N], net)
         if self._heavier is not None:
             s, q, delta = theta[0], x[:n], x[n:p]
-            one = (2.0 - s) * mass_matrix(model, q, delta)
-            two = (s - 1.0) * mass_matrix(self._heavier, q, delta)
+            one = (2.0 - s) * model.mass_matrix(q, delta)
+            two = (s - 1.0) * self._heavier.mass_matrix(q, delta)
             force = one @ out[p:N] + two @ self._heavier.derivative(x[:N], net)[p:]
             out[p:N] = np.linalg.solve(one + two, force)
         return out

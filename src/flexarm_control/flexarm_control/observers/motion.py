@@ -42,17 +42,10 @@ CONFIGURATIONS = 64
 EXACT = 1e-12
 
 
-def mass_matrix(model, q, delta):
-    """M of (2) with deflections, shape (n + m, n + m)."""
-    if hasattr(model, "mass_matrix"):  # of a chain: much cheaper than all terms
-        return model.mass_matrix(q, delta)
-    return model.terms(q, np.zeros_like(q), delta, np.zeros_like(delta)).M
-
-
 def force_density(model, x, density):
     """B S B^T: density of the accelerations, shape (N, N), from that of the forces (n + m,)."""
     n, size = model.n_joints, x.size // 2
-    inverse = np.linalg.inv(mass_matrix(model, x[:n], x[n:size]))
+    inverse = np.linalg.inv(model.mass_matrix(x[:n], x[n:size]))
     out = np.zeros((2 * size, 2 * size))
     out[size:, size:] = (inverse * density) @ inverse.T
     return out
@@ -116,7 +109,7 @@ class Motion:
         """The `Foreseen` step over dt [s] from a state (N,), in which a torque (n,) [N m] is expected."""
         n, size = self._n, self._size
         rate = self.model.derivative(x, torque)
-        push = dposv(mass_matrix(self.model, x[:n], x[n:size]), self._onto_joints)[1]
+        push = dposv(self.model.mass_matrix(x[:n], x[n:size]), self._onto_joints)[1]
         step = self.step_for(dt, x[:n])
         state, moved = x + step.Gamma @ rate, step.Gamma[:, size:] @ push
         return Foreseen(round(dt, 5), step, torque.copy(), state, rate, push, moved)

@@ -37,7 +37,7 @@ from flexarm_dynamics.parameters import parameter
 
 from .innovation_memory import InnovationMemory
 from .kalman import NOISE, UNSTATED_STRAIN, Kalman, position_uncertainty
-from .motion import DIFFERENCE, EXACT, Motion, mass_matrix
+from .motion import DIFFERENCE, EXACT, Motion
 
 _OF_STRAINS = {p.name: p for p in NOISE if p.name in ("strain_noise", "position_noise")}
 #: Variance of a reading that is none, over that of the gauge's noise.
@@ -296,7 +296,7 @@ class PrescribedMotion(Motion):
         model, n, p = self.model, self._n, self._size
         q, delta, qd, delta_d = x[:n], x[n:p], x[p : p + n], x[p + n : 2 * p]
         a = x[2 * p :]
-        M = mass_matrix(model, q, delta)
+        M = model.mass_matrix(q, delta)
         force = M[n:, :n] @ a + modal_forces(model, q, qd, delta, delta_d)
         bent = -np.linalg.solve(M[n:, n:], force)
         return np.concatenate([qd, delta_d, a, bent, -a / self._values["acceleration_time"]])
@@ -307,7 +307,7 @@ class PrescribedMotion(Motion):
         rest[:n] = q
         A, S = np.zeros((2, self.size, self.size))
         A[:moving, :moving] = jacobian(self.derivative, rest, DIFFERENCE)
-        inverse = np.linalg.inv(mass_matrix(self.model, q, np.zeros(p - n))[n:, n:])
+        inverse = np.linalg.inv(self.model.mass_matrix(q, np.zeros(p - n))[n:, n:])
         force = np.square(values["bending_force_noise"])
         S[p + n : 2 * p, p + n : 2 * p] = (inverse * force) @ inverse.T
         jerk = np.arange(2 * p, moving)

@@ -65,12 +65,12 @@ def derivative(state, torque, data, out):
     )  # fmt: skip
 
 
-def bias_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out):
-    """All generalised forces of (2) but the inertial ones, joint friction and the transmissions' torque."""
+def generalised_forces(data, work, q, delta, qd, delta_d, qdd, delta_dd, out):
+    """All generalised forces of (2) in a motion but joint friction and the transmissions' torque."""
     d, w = data[0], work[0]
     n = q.size
     prepare(d, w, q, delta, qd, delta_d)
-    inverse_dynamics(d, w, qd, zero, modal_zero, d.gravity, out[:n], out[n:])
+    inverse_dynamics(d, w, qd, qdd, delta_dd, d.gravity, out[:n], out[n:])
     for i in range(n):
         for j in range(d.count[i]):
             row = d.first[i] + j
@@ -226,14 +226,14 @@ def put_column(jacobian, column, axis, place, origin, t):
 
 
 def linearise(data, work, q, delta, qd, delta_d, step, zero, modal_zero, out, K, C):
-    """Derivatives of `bias_forces` by delta (K) and delta_d (C), by imaginary steps: all arrays complex."""
+    """Derivatives of `generalised_forces` by delta (K) and delta_d (C), by imaginary steps: all arrays complex."""
     for variable in range(2):
         for j in range(delta.size):
             if variable == 0:
                 delta[j] += 1j * step
             else:
                 delta_d[j] += 1j * step
-            bias_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out)
+            generalised_forces(data, work, q, delta, qd, delta_d, zero, modal_zero, out)
             for i in range(out.size):
                 if variable == 0:
                     K[i, j] = out[i].imag / step

@@ -210,7 +210,7 @@ def _outputs(data, fields, work, graph):
     directions = np.array([Dual(0.0, {j: 1.0}) for j in range(2 * m)] or [], object)
     out = np.zeros(n + m, object)
     dual = data._replace(**{name: _duals(getattr(data, name)) for name in fields})
-    chain.bias_forces(
+    chain.generalised_forces(
         (dual,), (work(object),), _duals(q), directions[:m], _duals(qd), directions[m:], zero, modal_zero, out
     )  # fmt: skip
     forces = [Dual.of(x) for x in out]

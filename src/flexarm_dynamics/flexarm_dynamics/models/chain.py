@@ -184,15 +184,19 @@ class Chain(ArmModel):
 
         Coriolis, centrifugal, gravitational and elastic forces and modal damping: all of (2) but M.
         """
-        n, m = self.n_joints, self.n_modes
-        out = np.zeros(n + m)
+        return self._forces(q, qd, None, delta, delta_d, None)
+
+    def _forces(self, q, qd, qdd, delta, delta_d, delta_dd):
+        """`inverse_dynamics` without friction; None: zero."""
+        out = np.zeros(self.n_joints + self.n_modes)
+        qdd = np.zeros(self.n_joints) if qdd is None else self._joint(qdd, "qdd")
         delta, delta_d = self._modal(delta, "delta"), self._modal(delta_d, "delta_d")
-        self.kernel.bias_forces(
-            self._data, self._work, self._joint(q, "q"), delta,
-            self._joint(qd, "qd"), delta_d, np.zeros(n), np.zeros(m), out,
+        self.kernel.generalised_forces(
+            self._data, self._work, self._joint(q, "q"), delta, self._joint(qd, "qd"), delta_d,
+            qdd, self._modal(delta_dd, "delta_dd"), out,
         )  # fmt: skip
         for j, constants in self._transmissions:
-            out[n + j] += transmissions.spring_torque(constants, delta[j], delta_d[j])
+            out[self.n_joints + j] += transmissions.spring_torque(constants, delta[j], delta_d[j])
         return out
 
     @cached_property
@@ -213,12 +217,8 @@ class Chain(ArmModel):
         return out
 
     def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
-        """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
-
-        Of a free motion the modal part is zero.
-        """
-        accelerations = np.concatenate([self._joint(qdd, "qdd"), self._modal(delta_dd, "delta_dd")])
-        out = self.forces(q, qd, delta, delta_d) + self.mass_matrix(q, delta) @ accelerations
+        """As `ArmModel.inverse_dynamics`; what is left out is zero."""
+        out = self._forces(q, qd, qdd, delta, delta_d, delta_dd)
         out[: self.n_joints] += self.friction(self._joint(qd, "qd"), delta, delta_d)
         return out
 

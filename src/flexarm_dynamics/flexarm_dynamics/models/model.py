@@ -112,6 +112,22 @@ class ArmModel(ABC):
         each = [self.terms(motion[0], motion[1]) for motion in motions]
         return Terms(*map(np.array, zip(*each, strict=True)))
 
+    def mass_matrix(self, q, delta=None):
+        """M of (2), shape (n + m, n + m); without deflections, of the straight arm."""
+        none = np.zeros(self.n_joints), None if delta is None else np.zeros(self.n_modes)
+        return self.terms(q, none[0], delta, none[1]).M
+
+    def inverse_dynamics(self, q, qd, qdd, delta, delta_d, delta_dd):
+        """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
+
+        Of a free motion the modal part is zero.
+        """
+        t = self.terms(q, qd, delta, delta_d)
+        out = t.M @ np.concatenate([qdd, delta_dd])
+        out[: self.n_joints] += t.f1 + t.C1 @ delta_d + t.K1 @ delta
+        out[self.n_joints :] += t.f2 + t.C2 @ delta_d + t.K2 @ delta
+        return out
+
     def slow_torque(self, q, qd, acceleration):
         """Torque (n,) that gives the slow subsystem (10) an acceleration at q, qd, (n,) each [N m].
 

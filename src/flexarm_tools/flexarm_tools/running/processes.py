@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.processes import ONE_THREAD
 from flexarm_ros.start import PARENT
 
 #: Package of each node's executable.
@@ -80,7 +81,7 @@ def environment(domain):
     env = dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     env.setdefault("RCUTILS_LOGGING_USE_STDOUT", "0")
     # One thread each: small matrices, and the other processes need the other cores.
-    env.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    env.update(dict.fromkeys(ONE_THREAD, "1"))
     env[PARENT] = str(os.getpid())  # nothing is left behind, even by kill -9
     return env
 
