@@ -192,12 +192,12 @@ def test_the_simulated_arm_comes_to_rest_on_the_reference(two_link, change):
 def test_jumps_add_up_and_fade_whatever_the_samples():
     fading, rng, now = Fading(2, 20.0), np.random.default_rng(0), 0.0
     jumps = {0.0: [1.0, -2.0], 0.1: [0.5, 3.0]}
-    for time in sorted([*rng.uniform(0.0, 0.4, 30), *jumps]):
-        fading.advance(time - now)
-        now = time
-        if time in jumps:
-            fading.jump(np.array(jumps[time]))
-        wanted = sum(faded(time - t, 20.0) * np.array(j) for t, j in jumps.items() if t <= time)
+    for then in sorted([*rng.uniform(0.0, 0.4, 30), *jumps]):
+        fading.advance(then - now)
+        now = then
+        if then in jumps:
+            fading.jump(np.array(jumps[then]))
+        wanted = sum(faded(then - t, 20.0) * np.array(j) for t, j in jumps.items() if t <= then)
         assert_allclose(fading.left, wanted, rtol=1e-9)
     again = pickle.loads(pickle.dumps(fading))
     again.advance(0.1)

@@ -2,13 +2,16 @@
 """The design of the composite control: its components by name, their parameters, and the checks of the whole."""
 
 from flexarm_dynamics import registry
+from flexarm_dynamics.arm.description import MAX_MODES
 from flexarm_dynamics.errors import NOT_GIVEN, ParameterError
+from flexarm_dynamics.models.levels import FINITE_SLOPE, LEVELS
 from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
 from ..feedforward.base import Settings
 from . import full_order
 from .law import CompositeControl
+from .seen import shown
 
 SLOW, FAST, MANIFOLD = "flexarm.slow_laws", "flexarm.fast_laws", "flexarm.manifolds"
 FEEDFORWARD = "flexarm.feedforwards"
@@ -22,6 +25,14 @@ PARAMETERS = (
         "Motion that the arm is held to: none, the reference and the slow manifold; model, the nominal arm"
         " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
         " end at rest. Or another of the entry-point group flexarm.feedforwards."
+    ),
+    parameter("feedforward_modes", 0, "-", 0, MAX_MODES).described(
+        "Bending modes per direction that the feed-forward knows, where they are more than in the arm file. The control"
+        " is told what the gauges show of them; 0: those of the file."
+    ),
+    parameter("feedforward_level", "file", choices=("file", *LEVELS[2:])).described(
+        "Kinematics of bending that the feed-forward knows, where it is more than the arm file states: stiffening"
+        " (links keep their length), finite_slope (large slopes, too); of model chain alone."
     ),
     parameter("motion_velocity_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
         "Corner of the filter by which the observer makes joint speeds (observer.joint_velocity_bandwidth, where"
@@ -93,9 +104,15 @@ def design(model, slow, fast, manifold=None, settings=None):
     full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
     if kind is None or slow_law.learns:
         return control
-    motion = kind(model, surface, Settings(1.0 / chosen["rate"], q))
-    corners = chosen["motion_velocity_bandwidth"], chosen["motion_rate_bandwidth"]
-    return CompositeControl(model, slow_law, fast_law, surface, motion, corners)
+    seen = chosen["motion_velocity_bandwidth"], chosen["motion_rate_bandwidth"]
+    level = chosen["feedforward_level"]
+    modes = model.fuller(chosen["feedforward_modes"])
+    fuller = modes.fuller(0, level != "file", level == FINITE_SLOPE)
+    if modes is not model:
+        seen += (shown(model, fuller),)
+    # The manifold of first order: it is what the regulator of the fuller arm is held to, which takes up the rest.
+    motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q))
+    return CompositeControl(model, slow_law, fast_law, surface, motion, seen)
 
 
 def typed(given, prefix):

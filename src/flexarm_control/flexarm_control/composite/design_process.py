@@ -32,16 +32,20 @@ class AwayError(DesignError):
 
 
 class _Pickler(pickle.Pickler):
-    """Writes every model of the arm, with whatever payload, as a name."""
+    """Writes every model of the arm, with whatever payload, and fuller ones of it, as a name."""
 
     def __init__(self, file, arm):
         super().__init__(file, protocol=-1)
         self._arm = arm
 
     def persistent_id(self, obj):
-        if isinstance(obj, ArmModel) and obj.origin[0] == self._arm:
-            return _MODEL, obj.payload_scale
-        return None
+        if not isinstance(obj, ArmModel):
+            return None
+        arm, scale = obj.origin
+        if arm == self._arm:
+            return _MODEL, scale, None
+        more = arm.most_modes, arm.foreshortening, arm.finite_slope
+        return (_MODEL, scale, more) if arm == self._arm.fuller(*more) else None
 
     def reducer_override(self, obj):
         if isinstance(obj, ArmModel):
@@ -52,17 +56,18 @@ class _Pickler(pickle.Pickler):
 class _Unpickler(pickle.Unpickler):
     def __init__(self, file, model):
         super().__init__(file)
-        self._models = {1.0: model}
+        self._models = {(1.0, None): model}
 
     def persistent_load(self, name):
-        _, scale = name
-        if scale not in self._models:
-            model = self._models[scale] = self._models[1.0].with_payload(scale)
+        _, scale, more = name
+        if (scale, more) not in self._models:
+            model = self._models[1.0, None]
+            model = model if more is None else model.fuller(*more)
+            model = self._models[scale, more] = model if scale == 1.0 else model.with_payload(scale)
             rest = np.zeros(model.n_joints)
-            model.terms(
-                rest, rest
-            )  # what they are computed from is made here, not on the control path
-        return self._models[scale]
+            # What they are computed from is made here, not on the control path.
+            model.terms(rest, rest)
+        return self._models[scale, more]
 
 
 def dumps(thing, arm):

@@ -40,8 +40,8 @@ class CompositeControl:
         The paper's, `QuasiSteady`, if not given.
     feedforward : Feedforward, optional
         The motion that the arm is held to; the reference and the manifold's, if not given.
-    corners : (float, float)
-        Of the observer's filters of joint speeds and rates, see `SeenMotion` [rad/s]; 0.0: none.
+    seen : tuple
+        What the observer does to that motion: the arguments of `SeenMotion` beside it.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class CompositeControl:
         Fraction of the fast torque that is applied, 0 to 1.
     """
 
-    def __init__(self, model, slow, fast, manifold=None, feedforward=None, corners=(0.0, 0.0)):
+    def __init__(self, model, slow, fast, manifold=None, feedforward=None, seen=(0.0, 0.0)):
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_fraction = 1.0
         self._last = None  # reference and interval of the last step
@@ -71,7 +71,8 @@ class CompositeControl:
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = self._seen = feedforward
         if feedforward is not None:
-            self._seen = SeenMotion(feedforward, *corners) if any(corners) else feedforward
+            plain = seen == (0.0, 0.0)
+            self._seen = feedforward if plain else SeenMotion(feedforward, *seen)
             response = self.manifold.error_response(feedforward.settings.configuration)
             self._response, self._bar = np.vstack(response), np.zeros(2 * model.n_modes)
         n, m = model.n_joints, model.n_modes
@@ -240,7 +241,7 @@ class CompositeControl:
             u[:] = self.slow.torque_at(q, qd, motion)
             nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
         kernels.compiled().about_motion(
-            q, qd, motion.position, seen.velocity, motion.torque, nominal, self._response, motion.amplitude,
+            q, qd, motion.position, seen.velocity, motion.torque, nominal, self._response, seen.amplitude,
             seen.rate, u, self._bar,
         )  # fmt: skip
         return u, self._bar[:m], self._bar[m:]

@@ -2,6 +2,7 @@
 """Base class of slow manifolds."""
 
 from abc import ABC, abstractmethod
+from copy import copy
 
 import numpy as np
 
@@ -56,6 +57,12 @@ class Manifold(Component, ABC):
         m, n = model.n_modes, model.n_joints
         self.amplitude, self.rate = np.zeros(m), np.zeros(m)
         self.feedforward = np.zeros(n)
+
+    def of(self, model):
+        """The same manifold of another model of the arm, with more modes; for `along` alone."""
+        other = copy(self)
+        other.model = model
+        return other
 
     @abstractmethod
     def update(self, q, qd, reference, terms, slow_torque):

@@ -18,9 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.models import levels
+from flexarm_dynamics.models.fixed_step import substeps
 from flexarm_dynamics.models.model import build
 
 from ..fading import lowest
+from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
@@ -56,6 +59,8 @@ HARDLY, FAST = 1.0, 0.5
 POOR, WORTH = 0.25, 1.2
 #: Where those reach less than this, one set for all is tried, too; the same without them [-].
 LITTLE, LEAST = 0.08, 0.05
+#: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
+QUICK = 12
 #: Of the progress, the part of the usual search.
 USUAL = 0.6
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
@@ -100,7 +105,7 @@ class Settings:
     configurations: tuple = ()
     effort: float = 1.0
     seed: int = 0
-    feedforward: str = "model"
+    feedforward: str = "preview"
 
     def __post_init__(self):
         if self.delay is None:
@@ -222,6 +227,7 @@ class Design:
             "rate": self.settings.rate,
             "stability_margin": UNCHECKED,
             "feedforward": self.settings.feedforward,
+            **of_feedforward(self.arm.known, self.settings.rate),
             "motion_velocity_bandwidth": numbers([self.sampling.joint_corner])[0],
             "motion_rate_bandwidth": numbers([self.sampling.modal_corner])[0],
             "slow.type": "joint_pid",
@@ -245,6 +251,29 @@ class Design:
 def numbers(values):
     """A list of numbers as parameters have them: six digits."""
     return [float(f"{v:.6g}") for v in np.ravel(values)]
+
+
+def of_feedforward(arm, rate):
+    """What the feed-forward is to know of an arm beyond its file, flat parameters.
+
+    One mode more per direction, for what the file's modes leave out of the links' compliance: of several links with one
+    mode each, the next frequencies are 10 to 20 % too high. And as much of the kinematics of bending as the arm's
+    loads need, within `levels.TOLERANCE` of its reach.
+    """
+    out = {
+        "feedforward_modes": arm.most_modes + 1 if arm.most_modes else 0,
+        "feedforward_level": "file",
+    }
+    if arm.model != "chain" or not out["feedforward_modes"]:
+        return out
+    first, stiffening = np.array(levels.neglected(arm)) / arm.reach
+    if first > levels.TOLERANCE:
+        out["feedforward_level"] = levels.STIFFENING
+        fullest = build(arm.fuller(out["feedforward_modes"], True, True))
+        quick = fullest.n_modes * substeps(fullest, 1.0 / rate, METHOD) <= QUICK
+        if stiffening > levels.TOLERANCE and quick:
+            out["feedforward_level"] = levels.FINITE_SLOPE
+    return out
 
 
 def observer_parameters(sampling):

@@ -6,6 +6,7 @@ the joint's fixed `origin` and turned by the joint angle about `axis`. A link ex
 joint's frame; it bends along y and z and twists about x.
 """
 
+import contextlib
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -461,6 +462,11 @@ class Arm:
         """The link called `name`."""
         return next(link for link in self.links if link.name == name)
 
+    @property
+    def most_modes(self):
+        """The most modes that it has in any direction of any link; 0 for a rigid one."""
+        return max((f.modes for link in self.links for f in link.flexible.values()), default=0)
+
     def with_modes(self, count):
         """The same arm with `count` modes in every flexible direction of every link.
 
@@ -494,6 +500,18 @@ class Arm:
         arm = replace(self, links=links)
         kept = tuple(n for n in self.observed_modes if n in arm.mode_names)
         return replace(arm, observed_modes=kept)
+
+    def fuller(self, modes, stiffens, finite_slope):
+        """The arm with more modes and more of its kinematics, as far as that can be: see `ArmModel.fuller`."""
+        arm = self
+        for count in range(modes, self.most_modes, -1):
+            with contextlib.suppress(ModelError):  # fewer frequencies were measured
+                arm = self.with_modes(count)
+                break
+        if arm.model != "chain" or not arm.most_modes:
+            return arm
+        stiffens, finite_slope = arm.foreshortening or stiffens, arm.finite_slope or finite_slope
+        return replace(arm, foreshortening=stiffens, finite_slope=finite_slope)
 
 
 def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):

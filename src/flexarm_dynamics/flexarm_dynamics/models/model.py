@@ -73,6 +73,8 @@ class ArmModel(ABC):
         self.arm = arm
         #: The arm that the mode shapes are made for, and the factor of its payload: see `with_payload`.
         self.origin = arm, 1.0
+        #: By what they know: see `fuller`.
+        self._fuller = {}
         self.joint_names = arm.joint_names
         self.mode_names = arm.mode_names
 
@@ -236,6 +238,28 @@ class ArmModel(ABC):
         """
         problem = "takes no other payload than its arm file's"
         raise ModelError(problem, field=f"model {self.arm.model}")
+
+    def fuller(self, modes, stiffens=False, finite_slope=False):
+        """A model of the same arm that knows more of it, kept; itself where there is no more to know.
+
+        Parameters
+        ----------
+        modes : int
+            In every flexible direction. An arm of which fewer frequencies were measured has as many as it can.
+        stiffens, finite_slope : bool
+            Whether links keep their length, and their slopes may be large, see `levels`; of a chain alone.
+
+        Returns
+        -------
+        ArmModel
+            With the same payload.
+        """
+        arm, scale = self.origin
+        wanted = modes, stiffens or finite_slope, finite_slope
+        if wanted not in self._fuller:
+            more = arm.fuller(*wanted)
+            self._fuller[wanted] = self if more == arm else made(more, scale)
+        return self._fuller[wanted]
 
     def friction(self, qd, delta=None, delta_d=None):
         """Friction torque of the joints, shape (n,) [N m], see `Friction`.
@@ -475,8 +499,13 @@ def build(arm):
 
 def copy(model):
     """Another model of the same arm in the same mode shapes: for another thread."""
-    arm, scale = model.origin
-    return build(arm) if scale == 1.0 else build(arm).with_payload(scale)
+    return made(*model.origin)
+
+
+def made(arm, payload_scale):
+    """The model of an arm with a payload in parts of the arm's, as `ArmModel.origin` has both."""
+    model = build(arm)
+    return model if payload_scale == 1.0 else model.with_payload(payload_scale)
 
 
 def rotation(rpy):

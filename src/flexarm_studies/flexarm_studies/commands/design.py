@@ -18,7 +18,9 @@ from .options import add_arm_arguments, angles, check_file, in_range, new_path, 
 COMMENTS = {
     "rate": "[Hz] samples per second that the design is for",
     "stability_margin": "[1/s] not checked again without filters and delay, for which these gains are not made",
-    "feedforward": "model: simulated alongside, begins at once; preview: planned first, for seconds, and ends at rest",
+    "feedforward": "preview: each motion is planned on receipt and ends at rest; model: rests a period later",
+    "feedforward_modes": "per direction, that the feed-forward knows: one more than the file",
+    "feedforward_level": "of the kinematics of bending, likewise, by the arm's loads; file: as the arm file has it",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
     "slow.damping": "[N m s/rad]",
@@ -92,9 +94,9 @@ def add_arguments(parser):
     add("--effort", type=float, default=1.0, help="of the search, 0.1 to 100 (1)")
     add(
         "--feedforward",
-        choices=("model", "preview", "none"),
-        default="model",
-        help="of the file: model, or preview, which plans each motion on receipt to end at rest (model)",
+        choices=("preview", "model", "none"),
+        default="preview",
+        help="of the file: preview, which plans each motion on receipt to end at rest, or model (preview)",
     )
 
 

@@ -50,7 +50,6 @@ from flexarm_dynamics.singular_perturbation import frequencies_and_damping
 from ..comparison.baselines import Baseline, FullStateLqr, JointPid
 from ..comparison.controllers import DAMPED, IDLE, MAX_INTEGRAL, SHAPED, UNWATCHED, Setup
 from ..comparison.tuning import Free, tune
-from .plants import most_modes
 from .trial import TOLERANCE
 
 #: Factors of the payload in the uncertain set [-].
@@ -139,7 +138,7 @@ class Task:
     def models(self):
         """The arm with each payload and one mode more in every direction."""
         arm = self.model.arm
-        more = arm.with_modes(1 + most_modes(arm))
+        more = arm.with_modes(1 + arm.most_modes)
         return [model.build(scaled(more, payload)) for payload in PAYLOADS]
 
     @cached_property

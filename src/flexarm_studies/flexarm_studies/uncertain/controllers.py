@@ -2,9 +2,9 @@
 """The controllers that are tried on the uncertain set, by name; each makes its `Setup` from a `RandomArm` or `ArmTask`.
 
 ``shipped`` is the controller file that flexarm has for a shipped arm. ``default`` and ``preview`` are what
-docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm. ``designed`` and
-``designed_preview`` are what ``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay, at start, middle
-and end of the motion, as the baselines are tuned. The baselines are tuned for each arm.
+docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm. ``designed_preview`` is what
+``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay, at start, middle and end of the motion, as the
+baselines are tuned; ``designed`` has ``feedforward: model``. The baselines are tuned for each arm.
 """
 
 from functools import partial
@@ -52,8 +52,8 @@ WORDS = {
     "shipped": "the controller file that is shipped for the arm",
     "default": "the nodes' composite control with `model_following`",
     "preview": "the same with `feedforward: preview`",
-    "designed": "`flexarm design`",
-    "designed_preview": "the same with `feedforward: preview`",
+    "designed": "the next one, with `feedforward: model`",
+    "designed_preview": "`flexarm design`",
     "pid": "joint PID",
     "pid_zv": "joint PID, ZV shaper",
     "pid_zvd": "joint PID, ZVD shaper",

@@ -75,11 +75,6 @@ VARIANTS = {
 }
 
 
-def most_modes(arm):
-    """The most modes that the arm has in any direction of any link; 0 for a rigid one."""
-    return max((f.modes for link in arm.links for f in link.flexible.values()), default=0)
-
-
 def plant_of(arm, variant):
     """The simulated arm of a `variant`.
 
@@ -89,9 +84,8 @@ def plant_of(arm, variant):
         Where the arm can't differ so: friction needs finite torque limits, more modes their measured frequencies.
     """
     plant = scaled(arm, variant.payload, variant.stiffness, variant.damping)
-    modes = most_modes(arm)
-    if modes and variant.more_modes:
-        plant = plant.with_modes(modes + variant.more_modes)
+    if arm.most_modes and variant.more_modes:
+        plant = plant.with_modes(arm.most_modes + variant.more_modes)
     if variant.accurate:
         plant = replace(plant, model="chain", foreshortening=True, finite_slope=True)
     if variant.friction:
