@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Composite control (12), and laws found by name with checked parameters."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,16 +10,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import FAST, SLOW, design, design_law
-from flexarm_control.composite.seen import SeenMotion
+from flexarm_control.composite.seen import SeenMotion, shown
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.arm_observer import design_observer, observe
 from flexarm_control.trajectory import ReferenceGenerator, validate
+from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
 from flexarm_dynamics.errors import (
     NOT_GIVEN,
     DesignError,
     ParameterError,
     UnknownComponentError,
 )
+from flexarm_dynamics.models.model import build
 
 MS = 10**6  # [ns]
 SLOW_LAW = {"type": "linear_model_following"}
@@ -292,7 +295,38 @@ def test_without_corners_the_motion_is_seen_as_it_is():
         seen.update(1e-2 * (k > 0))
     assert_array_equal(seen.velocity, motion.velocity)
     assert (seen.rate != motion.rate).all()
-    assert seen.position is motion.position and seen.amplitude is motion.amplitude
+    assert seen.position is motion.position
+    assert_array_equal(seen.amplitude, motion.amplitude)
+
+
+def test_of_more_modes_the_control_is_told_what_the_gauges_show(two_link):
+    fuller, m = two_link.fuller(3, finite_slope=True), two_link.n_modes
+    assert two_link.fuller(3, finite_slope=True) is fuller and two_link.fuller(2) is two_link
+    assert fuller.with_payload(0.5).fuller(3) is not fuller
+    T = shown(two_link, fuller)
+    amplitude = np.random.default_rng(0).normal(size=fuller.n_modes)
+    gauges = two_link.arm.gauges
+    strain = [g.gain for g in gauges] * (gauge_rows(fuller, gauges) @ amplitude)
+    assert_allclose(T @ amplitude, StrainMap(two_link).inverse @ strain, rtol=1e-12)
+    own = [fuller.mode_names.index(name) for name in two_link.mode_names]
+    assert_allclose(T[:, own], np.eye(m), atol=1e-12)
+    assert np.abs(T).sum() > m + 0.1  # the others show, too
+    bare = build(replace(two_link.arm, gauges=()))
+    assert_array_equal(shown(bare, bare.fuller(3))[:, own], np.eye(m))
+    assert shown(bare, bare.fuller(3)).sum() == m
+
+
+def test_a_motion_with_more_modes_is_shown_as_the_gauges_show_it(two_link):
+    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
+    settings = {"feedforward": "model", "stability_margin": -1000.0, "feedforward_modes": 3}
+    control = design(two_link, *laws, {"type": "reference"}, settings)
+    motion, seen = control.feedforward, control._seen
+    assert motion.model.n_modes == 6 and seen.amplitude.shape == (4,)
+    motion.amplitude[:], motion.rate[:] = np.random.default_rng(1).normal(size=(2, 6))
+    seen.update(0.0)
+    T = shown(two_link, motion.model)
+    assert_allclose(seen.amplitude, T @ motion.amplitude, rtol=1e-12)
+    assert_allclose(seen.rate, T @ motion.rate, rtol=1e-12)
 
 
 # --------------------------------------------------------------------------- exchanges without a step

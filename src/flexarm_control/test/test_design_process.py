@@ -4,6 +4,8 @@
 import os
 import pickle
 import signal
+import time
+from dataclasses import dataclass
 from threading import Thread
 from types import SimpleNamespace
 
@@ -15,7 +17,7 @@ from flexarm_control.composite.design import design
 from flexarm_control.composite.design_process import AwayError, DesignProcess
 from flexarm_control.composite.designer import Designer
 from flexarm_dynamics import processes
-from flexarm_dynamics.errors import ParameterError
+from flexarm_dynamics.errors import DesignError, ParameterError
 
 FAST, CORRECTED = {"type": "lqr"}, {"type": "corrected"}
 
@@ -53,8 +55,56 @@ def test_a_control_that_has_travelled_gives_the_same_torque(arm_r, slow, kind):
     assert np.ptp(expected) > 0.0
 
 
+@pytest.mark.parametrize("level", ["file", "stiffening", "finite_slope"])
+def test_a_feedforward_that_knows_more_than_the_file_travels_too(two_link, level):
+    laws = {"type": "joint_pid", "stiffness": [0.01], "damping": [0.01]}, {"type": "none"}
+    settings = {"feedforward": "preview", "stability_margin": -1000.0}
+    settings |= {"feedforward_modes": 3, "feedforward_level": level}
+    made = design(two_link, *laws, {"type": "reference"}, settings)
+    assert made.feedforward.model.n_modes == 6
+    data = design_process.dumps(made, two_link.arm)
+    travelled = design_process.loads(data, two_link)
+    known = travelled.feedforward.model.arm
+    assert known.foreshortening == (level != "file")
+    assert known.finite_slope == (level == "finite_slope")
+    np.testing.assert_array_equal(torques(travelled, 2, 4), torques(made, 2, 4))
+    again = design_process.loads(data, two_link)
+    assert again.feedforward.model is travelled.feedforward.model  # it takes a second to make
+
+
+@dataclass
+class Part:
+    """Of a preparation."""
+
+    left: tuple
+    note: str = ""
+
+
+def test_what_is_not_ready_when_the_motion_begins_is_left_out_and_named(arm_r):
+    answers = [Part(("moving", "plan")), TimeoutError()]
+
+    class Late(Designer):
+        def _in_process(self, function, *arguments, waits=None):
+            answer = answers.pop(0)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+    late = Late(arm_r, pytest.fail, process=False)
+    found = late.prepare(None, None, None, waits=lambda: False)
+    assert not found.left
+    assert found.note == "the motion begins before it is ready: moving, plan"
+    answers[:] = [TimeoutError()]
+    with pytest.raises(DesignError, match="begins before its regulators are ready"):
+        late.prepare(None, None, None, waits=lambda: False)
+
+
 def pid(model):
     return os.getpid()
+
+
+def sleep(model, seconds):
+    time.sleep(seconds)
 
 
 def scheduled(model):
@@ -94,11 +144,15 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         np.testing.assert_allclose(torques(made, 1, m), torques(here, 1, m), rtol=1e-12)
         with pytest.raises(ParameterError, match=r"slow\.kp"):
             worker.call(design, slow | {"kp": [-1.0]}, FAST, CORRECTED, settings)
-        (pid,) = worker._pool._processes
-        os.kill(pid, signal.SIGKILL)
+        (number,) = worker._pool._processes
+        os.kill(number, signal.SIGKILL)
         with pytest.raises(AwayError, match="has died"):
             worker.call(design, slow, FAST, CORRECTED, settings)
         assert worker.call(design, slow, FAST).feedforward is None
+        asked = []
+        with pytest.raises(TimeoutError):
+            worker.call(sleep, 0.2, waits=lambda: asked.append(1) or len(asked) < 3)
+        assert worker.call(pid, waits=lambda: True) in worker._pool._processes
     finally:
         worker.close()
 

@@ -2,7 +2,6 @@
 """The feed-forward that simulates the nominal arm: no step of its torque, whatever the reference's jerk does."""
 
 import pickle
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from flexarm_control import trajectory
 from flexarm_control.composite.design import design
 from flexarm_control.fading import Fading
 from flexarm_control.feedforward import model as model_feedforward
-from flexarm_control.feedforward.model import gains_along, path_of, regulator
+from flexarm_control.feedforward.model import PLAN, gains_along, path_of, regulator
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_control.trajectory.path import SlowedPath
 from flexarm_control.trajectory.scaling import ScaledPath, TimeLaw
@@ -130,17 +129,19 @@ def test_where_no_regulator_holds_the_moving_arm_that_of_rest_remains(two_link, 
     assert prepared.gains is prepared.at_rest and prepared.note == "feedforward: swings"
 
 
-def test_what_would_come_too_late_for_the_motion_is_left_out_and_named(two_link):
-    names, still = two_link.joint_names, np.zeros(2)
+def test_a_preparation_comes_in_parts_each_of_use_without_the_next(two_link):
+    names, still, start = two_link.joint_names, np.zeros(2), np.zeros((3, 2))
     data = trajectory.validate(names, names, 0, [(800 * MS, np.ones(2), still, still, [])])
-    for kind in ("model", "preview"):
-        motion = joint_pid_motion(two_link, kind)
-        late = motion.prepare(data, np.zeros((3, 2)), time.monotonic())
-        assert late.gains is late.at_rest and late.gains is not None and late.plan is None
-        assert "too soon for regulators of the moving arm" in late.note
-        assert ("too soon for a plan" in late.note) == (kind == "preview")
-        early = motion.prepare(data, np.zeros((3, 2)), time.monotonic() + 600.0)
-        assert not early.note and (early.plan is not None) == (kind == "preview")
+    motion = joint_pid_motion(two_link, "preview")
+    first = motion.prepare_next(data, start, None)
+    assert first.gains is first.at_rest and first.gains is not None and first.plan is None
+    second = motion.prepare_next(data, start, first)
+    assert second.gains is not second.at_rest and second.plan is None and second.left == (PLAN,)
+    third = motion.prepare_next(data, start, second)
+    assert third.plan is not None and not third.left and not third.note
+    whole = motion.prepare(data, start)
+    assert_array_equal(whole.gains.gains, third.gains.gains)
+    assert_array_equal(whole.plan.torque, third.plan.torque)
 
 
 def test_a_slow_motion_takes_no_more_designs_than_one_of_an_arm_at_rest(two_link):

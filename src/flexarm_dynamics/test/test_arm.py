@@ -87,6 +87,19 @@ def test_fewer_modes_take_the_first_of_the_measured_frequencies():
     assert arm_file.load("P3").with_modes(1).links[0].flexible["y"].frequencies == (2.12,)
 
 
+def test_a_fuller_arm_knows_as_much_more_as_it_can():
+    arm = two_links()
+    most = arm.most_modes
+    assert arm.fuller(most, False, False) == arm
+    fuller = arm.fuller(most + 1, True, False)
+    assert fuller == replace(arm.with_modes(most + 1), foreshortening=True)
+    assert fuller.fuller(0, False, True) == replace(fuller, finite_slope=True)
+    measured = arm_file.load("P3")  # as many modes as frequencies, and equations of its own
+    assert measured.fuller(measured.most_modes + 1, True, True) == measured
+    rigid = replace(arm, links=(Link("a", 1.0, 1.0), Link("b", 1.0, 1.0)))
+    assert rigid.fuller(3, True, True) == rigid
+
+
 def test_the_first_modes_are_the_same_with_more(shipped):
     few, many = shipped("one_link"), shipped("one_link", 6)
     tips = [m.mode_shapes("link1", "y")(1.0) for m in (few, many)]

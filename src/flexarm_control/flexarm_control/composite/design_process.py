@@ -23,6 +23,8 @@ from flexarm_dynamics.models.model import ArmModel
 from flexarm_dynamics.processes import end_with, step_back
 
 _MODEL = "model"
+#: How often a caller is asked whether it still waits [s].
+ASKED = 0.01
 #: What pickle raises for things that can't be sent.
 NOT_SENT = (pickle.PicklingError, TypeError, AttributeError)
 
@@ -123,22 +125,30 @@ class DesignProcess:
         self._last = None
         self._starting = Lock()
 
-    def call(self, function, *arguments):
+    def call(self, function, *arguments, waits=None):
         """``function(model, *arguments)`` in the process.
 
         The `function` is one of a module; the `arguments` and the result can be pickled, models of this arm aside.
+        Where `waits` is given, it is asked every `ASKED` whether the result is still wanted; the process ends its work.
 
         Raises
         ------
         AwayError
             When the process has died, or an argument or the result can't be sent.
+        TimeoutError
+            When the result is not wanted any more.
         Exception
             What the function raises.
         """
         try:
             data = dumps(arguments, self.model.arm)
             self._last = last = self._running().submit(_work, function, data)
-            return loads(last.result(), self.model)
+            while True:
+                try:
+                    return loads(last.result(None if waits is None else ASKED), self.model)
+                except TimeoutError:
+                    if last.done() or not waits():
+                        raise
         except BrokenProcessPool:
             self.close()
             raise AwayError(

@@ -2,7 +2,9 @@
 """Design work for one arm, off the control path: in a process of its own, or in the thread that asks for it."""
 
 from concurrent.futures import CancelledError
+from dataclasses import replace
 
+from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.model import build
 
 from ..robust import default
@@ -15,9 +17,9 @@ def ready(model):
     """Does nothing: calling it starts the process, which imports this module and builds the model."""
 
 
-def prepare(model, feedforward, *arguments):
-    """``feedforward.prepare(*arguments)``, callable in the design process; its `model` is not needed."""
-    return feedforward.prepare(*arguments)
+def prepare_next(model, feedforward, *arguments):
+    """``feedforward.prepare_next(*arguments)``, callable in the design process; its `model` is not needed."""
+    return feedforward.prepare_next(*arguments)
 
 
 def find(model, settings, uncertainty):
@@ -75,12 +77,30 @@ class Designer:
             # With a model of its own: meanwhile the control path uses the other one.
             return control(build(self.model.arm), values)
 
-    def prepare(self, feedforward, *arguments):
-        """What `Feedforward.prepare` makes of the same arguments; a `CancelledError` after `close`."""
-        try:
-            return self._in_process(prepare, feedforward, *arguments)
-        except AwayError:
-            return feedforward.prepare(*arguments)
+    def prepare(self, feedforward, trajectory, start, waits=None):
+        """What `Feedforward.prepare` makes of the same arguments; a `CancelledError` after `close`.
+
+        While ``waits()`` is true, where it is given: what is not there by then is left out, and the note names it; a
+        `DesignError` where nothing is.
+        """
+        found = None
+        while found is None or found.left:
+            try:
+                found = self._in_process(
+                    prepare_next, feedforward, trajectory, start, found, waits=waits
+                )
+            except AwayError:
+                found = feedforward.prepare_next(trajectory, start, found)
+            except TimeoutError:
+                if found is None:
+                    problem = "the motion begins before its regulators are ready"
+                    raise DesignError(problem, hint="send it earlier, or with stamp 0") from None
+                missing = f"the motion begins before it is ready: {', '.join(found.left)}"
+                note = "; ".join(filter(None, (found.note, missing)))
+                return replace(found, left=(), note=note)
+            if found is None:
+                return None
+        return found
 
     def find(self, settings, uncertainty):
         """What `default.find` makes of the same `settings` and `uncertainty`; a `CancelledError` after `close`."""
@@ -100,12 +120,12 @@ class Designer:
             self._own = build(self.model.arm)  # the control path uses the other one
         refuse_torque(self._own, trajectory, start, limit)
 
-    def _in_process(self, function, *arguments):
+    def _in_process(self, function, *arguments, waits=None):
         """``function(model, *arguments)`` in the process; an `AwayError`, with a warning, where that can't be."""
         if self._process is None:
             raise AwayError("there is no design process")
         try:
-            return self._process.call(function, *arguments)
+            return self._process.call(function, *arguments, waits=waits)
         except AwayError as error:
             if self.closed:
                 raise CancelledError from error

@@ -65,12 +65,18 @@ class Feedforward(Component, ABC):
     def take(self, plan, trajectory_id):
         """Follow `plan`, the result of `prepare` or None, as soon as the reference follows its trajectory."""
 
-    def prepare(self, trajectory, start, deadline=np.inf):
+    def prepare(self, trajectory, start):
         """Design work for a trajectory, off the control path; None where there is none to do.
 
-        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n). What
-        would not be done by the `deadline`, a time of `time.monotonic` [s], is left out.
+        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n).
         """
+        found = self.prepare_next(trajectory, start, None)
+        while found is not None and found.left:
+            found = self.prepare_next(trajectory, start, found)
+        return found
+
+    def prepare_next(self, trajectory, start, found):
+        """The next part of `prepare`, after what was `found` so far, None at first; see its `left`."""
         return None
 
     @abstractmethod

@@ -35,8 +35,7 @@ end. The regulator's torque must not. So the jump is added to what the regulator
 J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives; likewise for u_ref.
 """
 
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -72,8 +71,9 @@ NEGLIGIBLE = 1e-6
 #: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
 #: a joint turns by more than this in it [rad].
 CHECKS, NEAREST = 3, APART / 8.0
-#: Regulators of the moving arm take about so many times as long as those of the arm at rest [-].
-MOVING = 3.0
+#: Parts of a preparation after the regulators of the arm at rest, without which it is not followed as well.
+MOVING, PLAN = "regulators of the moving arm", "plan"
+PARTS = MOVING, PLAN
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
@@ -163,7 +163,8 @@ class Preparation:
     at_rest: Gains | None = None  # for a stop on the way
     plan: object = None  # a `preview.Plan`
     trajectory_id: int = 0  # 0 until it is accepted
-    note: str = ""  # what is missing, and why: a plan, or regulators of the moving arm
+    note: str = ""  # what is missing, and why
+    left: tuple = ()  # parts that are still to come
 
     def at(self, elapsed, path, stamp_ns):
         """Gain at a time since the start [s]; on a path that is slowed down, what bends the arm falls as s'^2."""
@@ -172,18 +173,6 @@ class Preparation:
             K *= moves
             K += (1.0 - moves) * self.at_rest.at(elapsed)
         return K
-
-
-def in_time(deadline, length, what):
-    """A `DesignError` where something that takes some time [s] would not be there by a time of `time.monotonic`."""
-    left = deadline - time.monotonic()
-    if length > left:
-        raise DesignError(
-            f"the motion begins too soon for {what}, which take about {length:.2g} s",
-            field="feedforward",
-            limit=f"{max(left, 0.0):.2g} s",
-            hint="send it earlier, or with stamp 0",
-        )
 
 
 def path_of(trajectory, start):
@@ -420,26 +409,27 @@ class ModelFeedforward(Feedforward):
     def placed(self):
         return self._run.placed
 
-    def prepare(self, trajectory, start, deadline=np.inf):
+    def prepare_next(self, trajectory, start, found):
         # A model of its own: the loop goes on with this one meanwhile.
         model, path = copy(self.model), path_of(trajectory, start)
-        found, begun = Preparation(start, None), time.monotonic()
-        if self.K is None:
-            period = self.settings.period
-            found.gains = found.at_rest = gains_along(model, path, period, moving=False)
-            try:
-                expected = MOVING * (time.monotonic() - begun)
-                in_time(deadline, expected, "regulators of the moving arm")
-                found.gains = gains_along(model, path, period)
-            except DesignError as error:  # those of rest are better than none
-                found.note = str(error)
+        if found is None:
+            found = Preparation(start, None, left=PARTS)
+            if self.K is None:
+                period = self.settings.period
+                found.gains = found.at_rest = gains_along(model, path, period, moving=False)
+            return found
+        part, *left = found.left
+        found = replace(found, left=tuple(left))
         try:
-            found.plan = self._plan(model, path, start, deadline)
-        except DesignError as error:
+            if part == MOVING and self.K is None:
+                found.gains = gains_along(model, path, self.settings.period)
+            elif part == PLAN:
+                found.plan = self._plan(model, path, start)
+        except DesignError as error:  # what there is so far is better than nothing
             found.note = "; ".join(filter(None, (found.note, str(error))))
         return found
 
-    def _plan(self, model, path, start, deadline):
+    def _plan(self, model, path, start):
         """A `Plan` that is followed in place of the slow manifold, if any; a `DesignError` where there is none."""
 
     def take(self, plan, trajectory_id):

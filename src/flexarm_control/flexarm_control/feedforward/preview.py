@@ -32,7 +32,6 @@ the stop, and s_path along the trajectory, the simulated arm is held to
 where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); likewise the torque.
 """
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +44,7 @@ from flexarm_dynamics.models.fixed_step import METHODS
 
 from .. import kernels
 from ..trajectory.values import SECOND
-from .model import At, ModelFeedforward, in_time
+from .model import At, ModelFeedforward
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -115,9 +114,9 @@ class Preview(ModelFeedforward):
         )
         none.state_at(0.0), none.torque_at(0.0)
 
-    def _plan(self, model, path, start, deadline):
+    def _plan(self, model, path, start):
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
-            return _Planner(model, path, start, self.limit).solve(deadline)
+            return _Planner(model, path, start, self.limit).solve()
 
     def _planned(self, prepared, path, stamp_ns):
         if prepared is None or prepared.plan is None or path.scaled:
@@ -191,13 +190,11 @@ class _Planner:
         # Without the first and last three: zero at either end, with velocity and acceleration.
         self.basis = np.array([everything(self.times, nu)[:, 3:-3] for nu in range(3)])
 
-    def solve(self, deadline=np.inf):
-        """The plan, after up to `ROUNDS` about the last one; a `DesignError` where there is none by the deadline."""
-        n, begun = self.model.n_joints, time.monotonic()
+    def solve(self):
+        """The plan, after up to `ROUNDS` about the last one."""
+        n = self.model.n_joints
         c, last, anew = np.zeros((n, self.basis.shape[2])), np.inf, True
         for _ in range(ROUNDS if self.model.n_modes else 0):
-            in_time(deadline, time.monotonic() - begun, "a plan's rounds")
-            begun = time.monotonic()
             self._along(c)
             change = self._programme(c, anew)
             c = c + change

@@ -60,6 +60,8 @@ class Manifold(Component, ABC):
 
     def of(self, model):
         """The same manifold of another model of the arm, with more modes; for `along` alone."""
+        if model is self.model:
+            return self
         other = copy(self)
         other.model = model
         return other

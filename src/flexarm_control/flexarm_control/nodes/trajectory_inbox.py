@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trajectories on their way from a raw message to the controller: read, prepared, and offered or refused."""
 
-import time
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 from rclpy.serialization import deserialize_message
@@ -17,8 +17,8 @@ from .. import trajectory
 MAX_POINTS = 10_000
 #: Trajectories that come within this time of each other, by the arm's clock, are a stream [ns].
 STREAMED = 500_000_000
-#: Of the time until a motion begins, what a plan for it may take [-].
-IN_TIME = 0.8
+#: A motion is offered at least so long before its own start [ns].
+IN_TIME = 30_000_000
 
 
 def rows(msg):
@@ -104,7 +104,9 @@ class TrajectoryInbox:
         whole = ahead.stamp_ns == data.stamp_ns  # a plan is for all of it
         try:
             if feedforward is not None and feedforward.plans and start is not None and whole:
-                plan = self._designer.prepare(feedforward, ahead, start, self._deadline(data))
+                plan = self._designer.prepare(
+                    feedforward, ahead, start, partial(self._in_time, data)
+                )
                 note = getattr(plan, "note", "")
                 if note:
                     self._node.get_logger().warning(f"feed-forward of a trajectory: {note}")
@@ -117,12 +119,10 @@ class TrajectoryInbox:
             self._node.get_logger().warning(f"trajectory on the slow manifold alone: {kind}{error}")
         self._node.hand_over(self._offer, data, plan, name)
 
-    def _deadline(self, data):
-        """Until when a plan is of use, by `time.monotonic` [s]: most of the time until the motion begins."""
+    def _in_time(self, data):
+        """Whether a plan is still of use: one with stamp 0 waits for it, another one begins without."""
         now = self._core.reference.stamp_ns
-        if now is None or not data.stamp_ns:
-            return np.inf  # it begins when the plan is there
-        return time.monotonic() + IN_TIME * 1e-9 * (data.stamp_ns - now)
+        return now is None or not data.stamp_ns or now < data.stamp_ns - IN_TIME
 
     def _judge_torque(self, data):
         """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""
