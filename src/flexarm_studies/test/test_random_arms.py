@@ -96,17 +96,11 @@ def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not
 
 def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
     _, _, found = prepared(23, Preview)
-    assert found.plan is None and found.note.startswith(
-        "preview: no motion within the torque limits"
-    )
+    assert found.plan is None and found.note.startswith("preview: of the plan,")
     assert found.gains is not None
 
 
-def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback(monkeypatch):
-    def never(*_):
-        raise AssertionError("a linear programme")
-
-    monkeypatch.setattr(preview._Planner, "_linear_programme", never)
+def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback():
     known, _, found = prepared(10, Preview)
     torque, limits = np.abs(found.plan.torque), known.arm.torque_limits
     assert (torque < 0.96 * limits).all() and (torque.max(axis=0) > 0.94 * limits).any()

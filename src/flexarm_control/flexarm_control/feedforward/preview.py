@@ -15,11 +15,12 @@ are linear in c to first order. The shift of least mean square,
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
 solves one linear system. If its torque exceeds the limit, what is beyond 0.95 of it is penalised where it is, round by
-round; if that does not end within the limit, a linear programme (HiGHS through scipy) finds the shift with the smallest
-maximum, which is rougher: its steep turns excite the modes that are not in the plan. The full equations are then
+round. (The shift with the smallest maximum within the limit, a linear programme, ends sooner, but turns steeply from
+bound to bound: what it excites beside the plan was lost on one random arm.) The full equations are then
 integrated along the solution, and what is left at the end is solved for again: with the derivatives there were, as long
-as that makes the next change much smaller. A mode that the shift does not move is left out. All
-of this happens when the trajectory is received, off the control path. `model` follows the motion in place of the slow
+as that makes the next change much smaller. A plan that still needs more torque than there is is not followed. A mode
+that the shift does not move is left out. All of this happens when the trajectory is received, off the control path.
+`model` follows the motion in place of the slow
 manifold: the regulator of its simulated arm removes the remaining error. Where no shift is found the manifold remains,
 and the reason is in `Preparation.note`.
 
@@ -37,7 +38,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline
 from scipy.linalg import eigh
-from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.fixed_step import METHODS
@@ -55,8 +55,9 @@ FASTEST = 3.0
 #: Rounds at most, and change of the shift after which there is no other one [rad]. The equations are linearised anew
 #: where a change is more than this part of the one before it.
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
-#: A plan whose last change was more than this has not been found [rad].
-FOUND = 1e-3
+#: A plan whose last change was more than this has not been found [rad], nor will be, where after so many rounds it is
+#: still more than `SLOW` of the first one.
+FOUND, HOPELESS = 1e-3, 4
 #: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
 #: so many rounds at most.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
@@ -146,7 +147,7 @@ def _finite(*arrays):
 
 
 class _Planner:
-    """One trajectory's linear programme."""
+    """Plans one trajectory."""
 
     def __init__(self, model, path, start, limit):
         self.model, self.start, self.limit = model, start, limit
@@ -193,19 +194,19 @@ class _Planner:
     def solve(self):
         """The plan, after up to `ROUNDS` about the last one."""
         n = self.model.n_joints
-        c, last, anew = np.zeros((n, self.basis.shape[2])), np.inf, True
+        c, anew, sizes = np.zeros((n, self.basis.shape[2])), True, []
         for _ in range(ROUNDS if self.model.n_modes else 0):
             self._along(c)
-            change = self._programme(c, anew)
+            change = self._change(c, anew)
             c = c + change
-            size = np.abs(self.basis[0] @ change.T).max()
-            if size < CLOSE:
+            sizes.append(np.abs(self.basis[0] @ change.T).max())
+            if sizes[-1] < CLOSE:
                 break
-            anew, last = size > SLOW * last, size
-        else:
-            if self.model.n_modes and last > FOUND:
+            anew = len(sizes) > 1 and sizes[-1] > SLOW * sizes[-2]
+            hopeless = len(sizes) >= HOPELESS and sizes[-1] > SLOW * sizes[0]
+            if sizes[-1] > FOUND and (hopeless or len(sizes) == ROUNDS):
                 raise DesignError(
-                    f"of the plan, {last:.2g} rad still change after {ROUNDS} rounds",
+                    f"of the plan, {sizes[-1]:.2g} rad still change after {len(sizes)} rounds",
                     field="preview",
                     limit=f"{FOUND:g} rad",
                     hint="give the motion more time",
@@ -214,6 +215,7 @@ class _Planner:
         x, v = _finite(*self._bend())
         at = np.arange(0, self.steps + 1, self.stride)
         a, torque = _finite(*self._forces(at, x, v))
+        self._refuse_beyond(torque)
         q, x, v = self.motion[2 * at], x[at], v[at]
         state = np.concatenate([q[:, 0], x, q[:, 1], v], axis=1)
         rates = np.concatenate([q[:, 1], v, q[:, 2], a], axis=1)
@@ -325,7 +327,7 @@ class _Planner:
             u += np.einsum("tij,tjc->tic", matrix[2 * at], bending[:, part])
         return u
 
-    def _programme(self, c, anew):
+    def _change(self, c, anew):
         """Change of the shift's coefficients, (n, count); with what each does as it was, or found `anew`."""
         x, v = _finite(*self._bend())
         at = np.unique(np.append(np.arange(0, self.steps, max(1, self.steps // GRID)), self.steps))
@@ -342,11 +344,22 @@ class _Planner:
         scale = 1.0 / largest[moved]
         A, b = A[moved] * scale[:, None], b[moved] * scale
         _, u = _finite(*self._forces(at, x, v))
-        change = self._within_limits(c, A, b, u, self.torque_by)
-        return self._linear_programme(c, A, b, u, self.torque_by) if change is None else change
+        return self._within_limits(c, A, b, u, self.torque_by)
+
+    def _refuse_beyond(self, torque):
+        """A `DesignError` for a torque, (k, n), that is beyond the limit."""
+        needed = np.abs(torque).max(axis=0)
+        if (needed > self.limit).any():
+            raise DesignError(
+                f"no motion within the torque limits leaves the arm at rest: the best takes"
+                f" {np.round(needed, 3).tolist()} N m",
+                field="preview",
+                limit=f"{np.round(self.limit, 3).tolist()} N m",
+                hint="give it more time",
+            )
 
     def _within_limits(self, c, A, b, u, du):
-        """As `_least_squares`, within the torque limit; None where that is not found.
+        """As `_least_squares`, within the torque limit as far as that is found.
 
         What is beyond `RESERVED` of the limit is penalised, at the times and joints where it is, until these no longer
         change.
@@ -361,11 +374,11 @@ class _Planner:
                 return change
             now = np.where(np.abs(share) > RESERVED, np.sign(share), 0.0)
             if (now == over).all():
-                return change if np.abs(share).max() <= 1.0 else None
+                return change
             over = now
             at = over != 0.0
             change = self._least_squares(c, A, b, by[at], RESERVED * over[at] - here[at])
-        return None
+        return change
 
     def _least_squares(self, c, A, b, rows=None, values=None):
         """The change x after which the mean square of the shift, and of its acceleration, is least, with A x = b.
@@ -383,40 +396,3 @@ class _Planner:
         kkt = np.block([[H, A.T], [A, np.zeros((held, held))]])
         right = np.concatenate([right, b])
         return np.linalg.lstsq(kkt, right, rcond=1e-12)[0][:size].reshape(n, count)
-
-    def _linear_programme(self, c, A, b, u, du):
-        """The change after which the largest shift is least, within the torque limit."""
-        n, count = c.shape
-        each = slice(None, None, max(1, self.steps // GRID))
-        rows, bounds = [], []
-        for sign in (1.0, -1.0):
-            for part, column in ((0, 0), (2, 1)):
-                N = self.basis[part][::2][each]
-                for j in range(n):
-                    row = np.zeros((N.shape[0], n * count + 2))
-                    row[:, j * count : (j + 1) * count] = sign * N
-                    row[:, n * count + column] = -1.0
-                    rows.append(row)
-                    bounds.append(-sign * N @ c[j])
-            for j in np.flatnonzero(np.isfinite(self.limit)):
-                rows.append(np.hstack([sign * du[:, j], np.zeros((len(du), 2))]))
-                bounds.append(self.limit[j] - sign * u[:, j])
-        result = linprog(
-            np.concatenate([np.zeros(n * count), [1.0, 0.1 * np.sqrt(SMOOTHNESS) / self.omega**2]]),
-            np.vstack(rows),
-            np.concatenate(bounds),
-            np.hstack([A, np.zeros((len(b), 2))]),
-            b,
-            bounds=[(None, None)] * (n * count) + [(0.0, None)] * 2,
-            method="highs",
-        )
-        if not result.success:
-            needed = np.abs(u).max(axis=0)
-            raise DesignError(
-                f"no motion within the torque limits leaves the arm at rest: the reference alone takes"
-                f" {np.round(needed, 3).tolist()} N m",
-                field="preview",
-                limit=f"{np.round(self.limit, 3).tolist()} N m",
-                hint="give it more time",
-            )
-        return result.x[: n * count].reshape(n, count)
