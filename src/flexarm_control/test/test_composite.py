@@ -329,6 +329,43 @@ def test_a_motion_with_more_modes_is_shown_as_the_gauges_show_it(two_link):
     assert_allclose(seen.rate, T @ motion.rate, rtol=1e-12)
 
 
+# --------------------------------------------------------------------------- the torque limit
+
+
+def saturated(two_link, saturation, limit=np.inf):
+    """A control with stiff joints about a motion that rests, off by 0.1 and -0.02 rad, and its torque."""
+    laws = {"type": "joint_pid", "stiffness": [5.0, 4.0], "damping": [0.1], "integral": [1.0]}
+    settings = {"feedforward": "model", "stability_margin": -1000.0, "saturation": saturation}
+    control = design(two_link, laws, {"type": "none"}, {"type": "reference"}, settings)
+    control.limit = np.full(2, limit)
+    reference, m = ReferenceGenerator(two_link.joint_names), two_link.n_modes
+    reference.start(np.array([0.3, 0.2]), 0)
+    reference.sample(MS)
+    q, still = reference.position - [0.1, -0.02], np.zeros(2)
+    torque = control.step(q, still, np.zeros(m), np.zeros(m), reference).copy()
+    motion = control.feedforward.torque.copy()
+    control.step(q, still, np.zeros(m), np.zeros(m), reference, 1e-3)
+    return control, torque, motion
+
+
+def test_one_joint_at_its_limit_scales_what_is_fed_back_to_all(two_link):
+    _, free, motion = saturated(two_link, "together")
+    limit = 0.4 * np.abs(free).max()
+    control, torque, _ = saturated(two_link, "together", limit)
+    assert np.abs(torque).max() == pytest.approx(limit, rel=1e-12)
+    fed_back = (torque - motion) / (free - motion)
+    assert_allclose(fed_back, fed_back[0], rtol=1e-12)
+    assert 0.3 < fed_back[0] < 0.5
+    assert_allclose(control.slow_torque + control.fast_torque, control.torque, rtol=1e-12)
+    assert not control.slow.integral.any()  # all of them wait
+    each, torque, _ = saturated(two_link, "each", limit)
+    assert_array_equal(torque, free)  # clipped later, by itself
+    assert (each.slow.integral != 0.0).any()
+    unlimited, torque, _ = saturated(two_link, "together", 1.01 * np.abs(free).max())
+    assert_array_equal(torque, free)
+    assert (unlimited.slow.integral != 0.0).all()
+
+
 # --------------------------------------------------------------------------- exchanges without a step
 
 

@@ -24,6 +24,7 @@ from flexarm_control.robust.design import (
     Settings,
     cancelled,
     design,
+    of_feedforward,
     units,
     what_limits,
 )
@@ -596,6 +597,21 @@ def test_filtered_derivatives_of_a_fast_arm_lag_less(two_link, stiffness, corner
     wanted = corner or 15.0 * design_module.lowest(arm)
     assert_allclose([found.joint_corner, found.modal_corner], wanted, rtol=1e-9)
     assert corner or 500.0 < wanted < 1000.0
+
+
+@pytest.mark.parametrize(
+    ("name", "modes", "level"),
+    [
+        ("two_link", 3, "finite_slope"),
+        ("long_reach", 0, "stiffening"),  # a third mode would be 2400 times as fast as the first
+        ("R", 3, "file"),  # bends by little, and its model has no other level
+        ("P3", 3, "file"),  # of which there are as many as were measured
+        ("rigid", 0, "file"),
+    ],
+)
+def test_the_feedforward_knows_more_than_the_file_where_that_is_not_too_fast(name, modes, level):
+    found = of_feedforward(arm_file.load(name).known, 500.0)
+    assert found == {"feedforward_modes": modes, "feedforward_level": level}
 
 
 def test_the_set_holds_what_it_says(two_link):

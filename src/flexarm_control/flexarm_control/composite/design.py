@@ -43,6 +43,10 @@ PARAMETERS = (
         "The same of the rates of deflections, where the observer filters them (observer.bandwidth of"
         " filtered_derivative); 0.0: none."
     ),
+    parameter("saturation", "each", choices=("each", "together")).described(
+        "What the torque limit does to the feedback about a feed-forward: each joint is clipped by itself, or what is"
+        " fed back to all joints is scaled until none is beyond its limit, which keeps its direction."
+    ),
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0).described(
         "Samples per second that the driver or simulator sends: what designs are checked at."
     ),
@@ -112,7 +116,8 @@ def design(model, slow, fast, manifold=None, settings=None):
         seen += (shown(model, fuller),)
     # The manifold of first order: it is what the regulator of the fuller arm is held to, which takes up the rest.
     motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q))
-    return CompositeControl(model, slow_law, fast_law, surface, motion, seen)
+    together = chosen["saturation"] == "together"
+    return CompositeControl(model, slow_law, fast_law, surface, motion, seen, together)
 
 
 def typed(given, prefix):

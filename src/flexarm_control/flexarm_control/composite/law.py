@@ -42,6 +42,8 @@ class CompositeControl:
         The motion that the arm is held to; the reference and the manifold's, if not given.
     seen : tuple
         What the observer does to that motion: the arguments of `SeenMotion` beside it.
+    together : bool
+        Whether a joint at its torque limit scales the feedback of all, or is clipped alone. With a feed-forward.
 
     Attributes
     ----------
@@ -55,9 +57,11 @@ class CompositeControl:
         Fraction of the fast torque that is applied, 0 to 1.
     """
 
-    def __init__(self, model, slow, fast, manifold=None, feedforward=None, seen=(0.0, 0.0)):
+    def __init__(
+        self, model, slow, fast, manifold=None, feedforward=None, seen=(0.0, 0.0), together=False
+    ):
         self.model, self.slow, self.fast = model, slow, fast
-        self.fast_fraction = 1.0
+        self.fast_fraction, self._together = 1.0, together
         self._last = None  # reference and interval of the last step
         n, rate = model.n_joints, fading_rate(model)
         self._limit = np.full(n, np.inf)
@@ -161,11 +165,35 @@ class CompositeControl:
         z_f = self._deviation(delta, delta_d, delta_bar, rate_bar)  # z - z_bar
         u_fast = np.multiply(self.fast.torque(z_f, q), self.fast_fraction, out=self.fast_torque)
         np.add(u_slow, u_fast, out=self.torque)  # (12)
+        wanted = self.torque
+        if self._together and self.feedforward is not None:
+            wanted = self._within_limit(u_slow, u_fast)
         if self._goes_over(before, (q, qd, delta, delta_d, reference, dt)):
             u_slow += self._exchanged.left
             np.add(u_slow, u_fast, out=self.torque)
-        self.slow.saw(self.torque)
+        self.slow.saw(wanted)
         return self.torque
+
+    def _within_limit(self, u_slow, u_fast):
+        """Scale what is fed back, of all joints, so that no torque is beyond its limit; what `SlowLaw.saw` is to see.
+
+        Gains from all joints to all joints are made for the direction of their torque. With one joint alone at its
+        limit the others may drive the arm on: a random arm swung up, which holds with any fraction of all gains.
+        """
+        motion, limit = self.feedforward.torque, self._limit
+        beyond = np.abs(self.torque) > limit
+        if not beyond.any():
+            return self.torque
+        wanted = self.torque.copy()
+        fed_back = wanted - motion
+        left = (np.sign(wanted) * limit - motion)[beyond] / fed_back[beyond]
+        part = min(max(left.min(), 0.0), 1.0)
+        u_slow -= motion
+        u_slow *= part
+        u_slow += motion
+        u_fast *= part
+        np.add(u_slow, u_fast, out=self.torque)
+        return np.copysign(np.inf, wanted)  # no integral has anything to gain
 
     def _goes_over(self, before, sample):
         """Whether some of the torque of the control `before`, None if there was none at this `sample`, is left."""

@@ -61,6 +61,9 @@ POOR, WORTH = 0.25, 1.2
 LITTLE, LEAST = 0.08, 0.05
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
+#: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
+#: joints locked: a plan is integrated in steps of the fastest one [-].
+SPREAD = 1000.0
 #: Of the progress, the part of the usual search.
 USUAL = 0.6
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
@@ -228,6 +231,7 @@ class Design:
             "stability_margin": UNCHECKED,
             "feedforward": self.settings.feedforward,
             **of_feedforward(self.arm.known, self.settings.rate),
+            "saturation": "together",
             "motion_velocity_bandwidth": numbers([self.sampling.joint_corner])[0],
             "motion_rate_bandwidth": numbers([self.sampling.modal_corner])[0],
             "slow.type": "joint_pid",
@@ -257,23 +261,23 @@ def of_feedforward(arm, rate):
     """What the feed-forward is to know of an arm beyond its file, flat parameters.
 
     One mode more per direction, for what the file's modes leave out of the links' compliance: of several links with one
-    mode each, the next frequencies are 10 to 20 % too high. And as much of the kinematics of bending as the arm's
-    loads need, within `levels.TOLERANCE` of its reach.
+    mode each, the next frequencies are 10 to 20 % too high. Not where that mode is too fast, `SPREAD`. And as much of
+    the kinematics of bending as the arm's loads need, within `levels.TOLERANCE` of its reach.
     """
-    out = {
-        "feedforward_modes": arm.most_modes + 1 if arm.most_modes else 0,
-        "feedforward_level": "file",
-    }
-    if arm.model != "chain" or not out["feedforward_modes"]:
-        return out
-    first, stiffening = np.array(levels.neglected(arm)) / arm.reach
-    if first > levels.TOLERANCE:
-        out["feedforward_level"] = levels.STIFFENING
-        fullest = build(arm.fuller(out["feedforward_modes"], True, True))
-        quick = fullest.n_modes * substeps(fullest, 1.0 / rate, METHOD) <= QUICK
-        if stiffening > levels.TOLERANCE and quick:
-            out["feedforward_level"] = levels.FINITE_SLOPE
-    return out
+    modes, level = 0, "file"
+    if arm.most_modes:
+        model = build(arm.fuller(arm.most_modes + 1, False, False))
+        omega = model.frequencies(np.zeros(model.n_joints), locked=True)
+        modes = arm.most_modes + 1 if omega[-1] <= SPREAD * omega[0] else 0
+    if arm.model == "chain" and arm.most_modes:
+        first, stiffening = np.array(levels.neglected(arm)) / arm.reach
+        if first > levels.TOLERANCE:
+            level = levels.STIFFENING
+            fullest = build(arm.fuller(modes, True, True))
+            quick = fullest.n_modes * substeps(fullest, 1.0 / rate, METHOD) <= QUICK
+            if stiffening > levels.TOLERANCE and quick:
+                level = levels.FINITE_SLOPE
+    return {"feedforward_modes": modes, "feedforward_level": level}
 
 
 def observer_parameters(sampling):

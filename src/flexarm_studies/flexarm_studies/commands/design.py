@@ -21,6 +21,7 @@ COMMENTS = {
     "feedforward": "preview: each motion is planned on receipt and ends at rest; model: rests a period later",
     "feedforward_modes": "per direction, that the feed-forward knows: one more than the file",
     "feedforward_level": "of the kinematics of bending, likewise, by the arm's loads; file: as the arm file has it",
+    "saturation": "a joint at its torque limit scales the feedback of all: the gains are made for its direction",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
     "slow.damping": "[N m s/rad]",
