@@ -100,6 +100,40 @@ def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
     assert found.gains is not None
 
 
+@pytest.mark.slow
+def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed():
+    case = generator.arm(7)
+    known = model.build(case.read().known)
+    modes = known.fuller(2)
+    fuller, n = modes.fuller(0, stiffens=True), known.n_joints
+    motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
+    start = np.zeros((3, n))
+    start[0] = motion.positions[0]
+    for simpler, planned in ((None, False), (known, True)):
+        settings = base.Settings(2e-3, start[0], simpler)
+        forward = Preview(fuller, reference_manifold(known).of(modes), settings)
+        forward.limit = known.arm.torque_limits
+        first = forward.prepare_next(motion, start, None)
+        found = forward.prepare_next(motion, start, replace(first, left=("plan",)))
+        assert (found.plan is not None) == planned
+    plan = found.plan
+    assert (np.abs(plan.torque) <= known.arm.torque_limits).all()
+    further = [n + i for i, name in enumerate(fuller.mode_names) if name not in known.mode_names]
+    state = plan.state_at(0.5 * plan.duration)
+    assert state.shape == (2 * (n + fuller.n_modes),)
+    assert not state[further].any() and np.abs(state[n : n + fuller.n_modes]).max() > 1e-3
+
+
+def test_a_mode_across_the_joint_is_not_planned_where_slopes_are_finite():
+    case = generator.arm(25)
+    known = model.build(case.read().known)
+    fuller = known.fuller(3, finite_slope=True)
+    motion = scenario.trajectory_of(case.motion, known, np.zeros(1))
+    start = np.stack([motion.positions[0], np.zeros(1), np.zeros(1)])
+    plan = preview._Planner(fuller, path_of(motion, start), start, known.arm.torque_limits).solve()
+    assert (np.abs(plan.torque) < 0.8 * known.arm.torque_limits).all()
+
+
 def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback():
     known, _, found = prepared(10, Preview)
     torque, limits = np.abs(found.plan.torque), known.arm.torque_limits

@@ -115,7 +115,8 @@ def design(model, slow, fast, manifold=None, settings=None):
     if modes is not model:
         seen += (shown(model, fuller),)
     # The manifold of first order: it is what the regulator of the fuller arm is held to, which takes up the rest.
-    motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q))
+    known = None if fuller is model else model
+    motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q, known))
     together = chosen["saturation"] == "together"
     return CompositeControl(model, slow_law, fast_law, surface, motion, seen, together)
 

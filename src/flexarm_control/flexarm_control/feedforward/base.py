@@ -15,6 +15,7 @@ class Settings:
 
     period: float  # of the samples [s]
     configuration: np.ndarray  # of the joints, (n,) [rad]
+    known: object = None  # the control's own `ArmModel`, where the feed-forward knows more
 
 
 class Feedforward(Component, ABC):

@@ -33,7 +33,7 @@ the stop, and s_path along the trajectory, the simulated arm is held to
 where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); likewise the torque.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline
@@ -41,6 +41,7 @@ from scipy.linalg import eigh
 
 from flexarm_dynamics.errors import DesignError
 from flexarm_dynamics.models.fixed_step import METHODS
+from flexarm_dynamics.models.model import copy
 
 from .. import kernels
 from ..trajectory.values import SECOND
@@ -71,8 +72,9 @@ SMOOTHNESS = 0.01
 STABLE = 1.5
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
-#: A mode that the shift moves by less than this of what it moves the others by is left as it is [-].
-UNMOVED = 1e-6
+#: A mode on which the shift has less force than this of that on others is left as it is: where slopes are finite, one
+#: across the joints' axes has some [-].
+UNMOVED = 1e-2
 #: Length of the plan's steps over that of those grid steps, at most [-].
 PLANNED = 0.25
 #: A longer motion is not planned [samples].
@@ -95,6 +97,16 @@ class Plan:
         kernels.compiled().cubic(motion.c, motion.x, elapsed, out)
         return out
 
+    def among(self, model, fuller):
+        """The plan of a `model` as one of a `fuller` one, whose further modes rest."""
+        n, names = model.n_joints, fuller.mode_names
+        here = np.r_[np.arange(n), [n + names.index(name) for name in model.mode_names]]
+        here = np.r_[here, here + n + len(names)]
+        x = self.motion.x
+        values, rates = np.zeros((2, x.size, 2 * (n + len(names))))
+        values[:, here], rates[:, here] = self.motion(x), self.motion(x, 1)
+        return replace(self, motion=CubicHermiteSpline(x, values, rates))
+
     def torque_at(self, elapsed):
         """Torque (n,) at a time since the start [s]."""
         out = np.empty(self.torque.shape[1])
@@ -116,8 +128,15 @@ class Preview(ModelFeedforward):
         none.state_at(0.0), none.torque_at(0.0)
 
     def _plan(self, model, path, start):
+        known = self.settings.known
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
-            return _Planner(model, path, start, self.limit).solve()
+            try:
+                return _Planner(model, path, start, self.limit).solve()
+            except DesignError:
+                if known is None:
+                    raise
+            # That of the arm as the control knows it is near one, and within the torque, as the manifold may not be.
+            return _Planner(copy(known), path, start, self.limit).solve().among(known, model)
 
     def _planned(self, prepared, path, stamp_ns):
         if prepared is None or prepared.plan is None or path.scaled:
@@ -166,6 +185,7 @@ class _Planner:
         knots = np.linspace(0.0, self.duration, count + 1)
         slow = max(1, int(np.sum(omega * knots[1] < FASTEST))) if m else 0
         self.rest = model.static_deflection(end[0])
+        self.planned = omega[:slow]
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, STABLE / omega[-1])))
@@ -339,7 +359,7 @@ class _Planner:
         A, b = self.bends, -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
         # On one scale: deflections are thousandths. A mode that no joint moves is left as it is.
         largest = np.abs(A).max(axis=1)
-        each = largest.reshape(2, -1)
+        each = largest.reshape(2, -1) * [self.planned**2, self.planned]  # as of forces
         moved = np.tile((each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0), 2)
         scale = 1.0 / largest[moved]
         A, b = A[moved] * scale[:, None], b[moved] * scale
