@@ -700,8 +700,8 @@ LAWS = [
         (
             "extended_kalman",
             "payload's scale",
-            "one = (2.0 - s) * mass_matrix(model, q, delta)",
-            "one = (1.0 - s) * mass_matrix(model, q, delta)",
+            "one = (2.0 - s) * model.mass_matrix(q, delta)",
+            "one = (1.0 - s) * model.mass_matrix(q, delta)",
             TESTS + "test_kalman.py",
         ),
         (

@@ -299,7 +299,7 @@ def test_without_corners_the_motion_is_seen_as_it_is():
     assert_array_equal(seen.amplitude, motion.amplitude)
 
 
-def test_of_more_modes_the_control_is_told_what_the_gauges_show(two_link):
+def test_of_more_modes_the_control_gets_what_the_gauges_show(two_link):
     fuller, m = two_link.fuller(3, finite_slope=True), two_link.n_modes
     assert two_link.fuller(3, finite_slope=True) is fuller and two_link.fuller(2) is two_link
     assert fuller.with_payload(0.5).fuller(3) is not fuller

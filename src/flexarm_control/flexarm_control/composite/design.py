@@ -28,7 +28,7 @@ PARAMETERS = (
     ),
     parameter("feedforward_modes", 0, "-", 0, MAX_MODES).described(
         "Bending modes per direction that the feed-forward knows, where they are more than in the arm file. The control"
-        " is told what the gauges show of them; 0: those of the file."
+        " gets what the gauges show of them; 0: those of the file."
     ),
     parameter("feedforward_level", "file", choices=("file", *LEVELS[2:])).described(
         "Kinematics of bending that the feed-forward knows, where it is more than the arm file states: stiffening"

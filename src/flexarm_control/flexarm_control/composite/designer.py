@@ -78,7 +78,9 @@ class Designer:
             return control(build(self.model.arm), values)
 
     def prepare(self, feedforward, trajectory, start, waits=None):
-        """What `Feedforward.prepare` makes of the same arguments; a `CancelledError` after `close`.
+        """What `Feedforward.prepare` of the `feedforward` makes of a `trajectory` and its `start`.
+
+        After `close` a `CancelledError`.
 
         While ``waits()`` is true, where it is given: what is not there by then is left out, and the note names it; a
         `DesignError` where nothing is.
