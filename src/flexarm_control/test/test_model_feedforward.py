@@ -131,7 +131,7 @@ def test_where_no_regulator_holds_the_moving_arm_that_of_rest_remains(two_link, 
 
 def test_a_preparation_comes_in_parts_each_of_use_without_the_next(two_link):
     names, still, start = two_link.joint_names, np.zeros(2), np.zeros((3, 2))
-    data = trajectory.validate(names, names, 0, [(800 * MS, np.ones(2), still, still, [])])
+    data = trajectory.validate(names, names, 0, [(3000 * MS, np.ones(2), still, still, [])])
     motion = joint_pid_motion(two_link, "preview")
     first = motion.prepare_next(data, start, None)
     assert first.gains is first.at_rest and first.gains is not None and first.plan is None

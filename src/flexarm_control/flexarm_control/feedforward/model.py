@@ -71,9 +71,9 @@ NEGLIGIBLE = 1e-6
 #: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
 #: a joint turns by more than this in it [rad].
 CHECKS, NEAREST = 3, APART / 8.0
-#: Parts of a preparation after the regulators of the arm at rest, without which it is not followed as well.
-MOVING, PLAN = "regulators of the moving arm", "plan"
-PARTS = MOVING, PLAN
+#: Parts of a preparation, each of use without the next.
+RESTING, MOVING, PLAN = "regulators of the arm at rest", "regulators of the moving arm", "plan"
+PARTS = RESTING, MOVING, PLAN
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
 THERE = 1e-9
 #: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
@@ -412,19 +412,16 @@ class ModelFeedforward(Feedforward):
     def prepare_next(self, trajectory, start, found):
         # A model of its own: the loop goes on with this one meanwhile.
         model, path = copy(self.model), path_of(trajectory, start)
-        if found is None:
-            found = Preparation(start, None, left=PARTS)
-            if self.K is None:
-                period = self.settings.period
-                found.gains = found.at_rest = gains_along(model, path, period, moving=False)
-            return found
-        part, *left = found.left
+        part, *left = PARTS if found is None else found.left
+        found = Preparation(start, None) if found is None else found
         found = replace(found, left=tuple(left))
         try:
-            if part == MOVING and self.K is None:
-                found.gains = gains_along(model, path, self.settings.period)
-            elif part == PLAN:
+            if part == PLAN:
                 found.plan = self._plan(model, path, start)
+            elif self.K is None:
+                found.gains = gains_along(model, path, self.settings.period, part == MOVING)
+                if found.at_rest is None:  # in a stop, those of the moving arm are better than none
+                    found.at_rest = found.gains
         except DesignError as error:  # what there is so far is better than nothing
             found.note = "; ".join(filter(None, (found.note, str(error))))
         return found

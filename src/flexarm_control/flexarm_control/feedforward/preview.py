@@ -57,8 +57,8 @@ FASTEST = 3.0
 #: where a change is more than this part of the one before it.
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
 #: A plan whose last change was more than this has not been found [rad], nor will be, where after so many rounds it is
-#: still more than `SLOW` of the first one.
-FOUND, HOPELESS = 1e-3, 4
+#: still more than `SLOW` of the first one. What is left of a smaller one is taken up by the regulator.
+FOUND, HOPELESS = 0.02, 4
 #: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
 #: so many rounds at most.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
