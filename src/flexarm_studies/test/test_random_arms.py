@@ -101,8 +101,10 @@ def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
 
 
 @pytest.mark.slow
-def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed():
-    case = generator.arm(7)
+@pytest.mark.parametrize(("number", "rests"), [(7, True), (23, False)])
+def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed(number, rests):
+    """Of arm 23 the known one has none, either: then its regulated motion."""
+    case = generator.arm(number)
     known = model.build(case.read().known)
     modes = known.fuller(2)
     fuller, n = modes.fuller(0, stiffens=True), known.n_joints
@@ -117,6 +119,7 @@ def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed():
         found = forward.prepare_next(motion, start, replace(first, left=("plan",)))
         assert (found.plan is not None) == planned
     plan = found.plan
+    assert (not found.note) == rests
     assert (np.abs(plan.torque) <= known.arm.torque_limits).all()
     further = [n + i for i, name in enumerate(fuller.mode_names) if name not in known.mode_names]
     state = plan.state_at(0.5 * plan.duration)

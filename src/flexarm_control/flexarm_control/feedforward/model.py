@@ -418,6 +418,7 @@ class ModelFeedforward(Feedforward):
         try:
             if part == PLAN:
                 found.plan = self._plan(model, path, start)
+                found.note = "; ".join(filter(None, (found.note, found.plan and found.plan.note)))
             elif self.K is None:
                 found.gains = gains_along(model, path, self.settings.period, part == MOVING)
                 if found.at_rest is None:  # in a stop, those of the moving arm are better than none

@@ -18,11 +18,13 @@ solves one linear system. If its torque exceeds the limit, what is beyond 0.95 o
 round. (The shift with the smallest maximum within the limit, a linear programme, ends sooner, but turns steeply from
 bound to bound: what it excites beside the plan was lost on one random arm.) The full equations are then
 integrated along the solution, and what is left at the end is solved for again: with the derivatives there were, as long
-as that makes the next change much smaller. A plan that still needs more torque than there is is not followed. A mode
-that the shift does not move is left out. All of this happens when the trajectory is received, off the control path.
-`model` follows the motion in place of the slow
-manifold: the regulator of its simulated arm removes the remaining error. Where no shift is found the manifold remains,
-and the reason is in `Preparation.note`.
+as that makes the next change much smaller. A mode that the shift does not move is left out. All of this happens when
+the trajectory is received, off the control path. `model` follows the motion in place of the slow manifold: the
+regulator of its simulated arm removes the remaining error.
+
+Where no shift is found within the torque, and the feed-forward knows more of the arm than the control, that of the
+arm as the control knows it is taken; where it has none, either, what `model` makes of it. The manifold, which
+the torque may not give, remains where there is nothing more to know. The reason is in `Preparation.note`.
 
 In a stop, the plan can't be followed. Its bending beside the slow manifold is a vibration, which goes on in its own
 time and ends with the plan; the regulator damps it as the joints slow down. So with the manifold's motion s_ref along
@@ -45,7 +47,7 @@ from flexarm_dynamics.models.model import copy
 
 from .. import kernels
 from ..trajectory.values import SECOND
-from .model import At, ModelFeedforward
+from .model import At, ModelFeedforward, Preparation, gains_along
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -89,6 +91,7 @@ class Plan:
     motion: CubicHermiteSpline  # (q, delta, qd, delta_d)
     torque: np.ndarray  # at the grid's times, (k, n) [N m]
     step: float  # of the grid [s]
+    note: str = ""  # why it does not end at rest, if it does not
 
     def state_at(self, elapsed):
         """State (2 (n + m),) at a time since the start [s]."""
@@ -136,7 +139,36 @@ class Preview(ModelFeedforward):
                 if known is None:
                     raise
             # That of the arm as the control knows it is near one, and within the torque, as the manifold may not be.
-            return _Planner(copy(known), path, start, self.limit).solve().among(known, model)
+            known = copy(known)
+            try:
+                plan = _Planner(known, path, start, self.limit).solve()
+            except DesignError as error:
+                plan = replace(self._regulated(known, path, start), note=str(error))
+            return plan.among(known, model)
+
+    def _regulated(self, known, path, start):
+        """What `model` makes of a path with the arm as the control knows it, as a `Plan`: within the torque, too."""
+        settings = replace(self.settings, known=None)
+        forward, period = (
+            ModelFeedforward(known, self.manifold.of(known), settings),
+            settings.period,
+        )
+        forward.limit = self.limit
+        gains = gains_along(known, path, period)
+        forward.take(Preparation(start, gains, gains), path.trajectory_id)
+        count = int(np.ceil(path.duration_ns / SECOND / period))
+        states, torque = (
+            np.zeros((count + 1, forward.state.size)),
+            np.zeros((count + 1, start.shape[1])),
+        )
+        rates = np.zeros_like(states)
+        for k in range(count + 1):
+            forward.update(At(path, round(k * period * SECOND)), period if k else 0.0)
+            states[k], torque[k] = forward.state, forward.torque
+            rates[k] = known.derivative(states[k], torque[k])
+        states, rates = _finite(states, rates)
+        motion = CubicHermiteSpline(period * np.arange(count + 1), states, rates)
+        return Plan(count * period, motion, torque, period)
 
     def _planned(self, prepared, path, stamp_ns):
         if prepared is None or prepared.plan is None or path.scaled:
