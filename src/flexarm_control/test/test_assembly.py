@@ -57,7 +57,7 @@ class Away:
 
     closed = False
 
-    def call(self, function, *arguments):
+    def call(self, function, *arguments, waits=None):
         raise AwayError("it has died")
 
     def close(self):
