@@ -50,8 +50,9 @@ BESIDE = 1e-3
 MAX_POINTS = 20_000
 #: How far a first point at time 0 may be from where the joints are [rad].
 START_TOLERANCE = 0.05
-#: Attempts to slow a motion down into its limits, and by how much more than needed.
-ATTEMPTS, MARGIN = 60, 1.0 + 1e-9
+#: Attempts to slow a motion down into its limits, and by how much more than needed: twice as much each time, up to the
+#: most. What is shaped with a slow mode comes near its limit by a thousandth at a time.
+ATTEMPTS, MARGIN, MOST = 60, 1e-9, 1e-3
 #: Places in each piece at which its speed and acceleration are looked at, as fractions of its length.
 PLACES = np.linspace(0.0, 1.0 - 1e-6, 9)
 #: Points of a stop, its shortest duration [s], and the ratio of the durations that are tried.
@@ -353,12 +354,12 @@ class TrajectoryShaper:
                 hint="give velocities, or no limits.acceleration",
             )
         stretch = 1.0
-        for _ in range(ATTEMPTS):
+        for attempt in range(ATTEMPTS):
             motion = _joined(before, begin, start, times * stretch, _slower(fields, stretch))
             excess = self._excess(motion, quiet, start)
             if excess <= 1.0 + SPEED_ROUNDING:
                 return motion, stretch
-            stretch *= excess * MARGIN
+            stretch *= excess * (1.0 + min(MARGIN * 2.0**attempt, MOST))
         raise TrajectoryError(
             "times slower is still too fast",
             field="trajectory",
