@@ -4,13 +4,20 @@
 import itertools
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from harness import PATIENT, Arm, trajectory
 from in_process import InProcess
+from rclpy.serialization import serialize_message
 
 from flexarm_control.motions import profiles
+from flexarm_control.nodes.trajectory_inbox import TrajectoryInbox
+from flexarm_control.trajectory import ReferenceGenerator
+from flexarm_control.trajectory.streams import PLAIN
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.models.model import build
 from flexarm_msgs.msg import CompositeState, JointTorque
 
 J = ["joint1"]
@@ -362,3 +369,43 @@ def test_a_new_trajectory_takes_over_with_a_continuous_reference_velocity(arm, f
     assert slope.max() <= 1.01 * acceleration < 50.0  # a restart from rest jumps by 500 rad/s^2
     assert arm.state.reference_position[0] == goal
     assert arm.state.supervisor_state == CompositeState.HOLDING
+
+
+# Plans -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stamp", [0, 500 * MS])
+def test_a_plan_is_waited_for_until_the_motions_own_start_or_until_it_is_there(stamp):
+    """By the arm's clock: one that stands still, as in lockstep, leaves all the time."""
+    model = build(arm_file.load("two_link"))
+    reference = ReferenceGenerator(model.joint_names)
+    reference.start(np.zeros(2), 10 * MS)
+    waited, offered = [], []
+
+    class Designing:
+        """Makes a plan for ever; the arm's clock goes on."""
+
+        def prepare(self, feedforward, ahead, start, waits):
+            for now in (20, 400, 469, 471, 600):
+                reference.sample(now * MS)
+                waited.append(waits())
+            return SimpleNamespace(note="a plan is missing")
+
+    noted = []
+    logger = SimpleNamespace(warning=noted.append, info=noted.append)
+    node = SimpleNamespace(
+        active=True, hand_over=lambda _, *given: offered.append(given), get_logger=lambda: logger
+    )
+    core = SimpleNamespace(
+        model=model,
+        held=None,
+        streaming=PLAIN,
+        reference=reference,
+        torque_allowed=np.full(2, np.inf),
+    )
+    inbox = TrajectoryInbox(node, core, Designing())
+    message = trajectory(["joint1", "joint2"], (1.0, [0.1, 0.1]), stamp=stamp)
+    inbox._read_and_prepare(serialize_message(message), SimpleNamespace(plans=True))
+    inbox.close()
+    assert waited == ([True] * 5 if stamp == 0 else [True, True, True, False, False])
+    assert offered[0][1].note == "a plan is missing" and "a plan is missing" in noted[0]

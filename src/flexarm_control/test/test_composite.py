@@ -270,12 +270,18 @@ def test_the_motion_is_seen_as_the_observer_sees_an_arm_that_follows_it(arm_r):
     assert np.abs(motion.rate - seen.rate).max() > 1.0  # its lag is no small thing
 
 
-def test_a_motion_that_is_put_elsewhere_makes_no_speed():
+def swung(*corners, step, count):
+    """A motion after some samples, and as it is seen."""
     motion = Swinging()
-    seen = SeenMotion(motion, 150.0, 220.0)
-    for k in range(20):
-        motion.at(1e-3 * k)
-        seen.update(1e-3 * (k > 0))
+    seen = SeenMotion(motion, *corners)
+    for k in range(count):
+        motion.at(step * k)
+        seen.update(step * (k > 0))
+    return motion, seen
+
+
+def test_a_motion_that_is_put_elsewhere_makes_no_speed():
+    motion, seen = swung(150.0, 220.0, step=1e-3, count=20)
     before = seen.velocity.copy()
     motion.position += 1.0
     motion.placed = True
@@ -288,11 +294,7 @@ def test_a_motion_that_is_put_elsewhere_makes_no_speed():
 
 
 def test_without_corners_the_motion_is_seen_as_it_is():
-    motion = Swinging()
-    seen = SeenMotion(motion, 0.0, 100.0)
-    for k in range(5):
-        motion.at(1e-2 * k)
-        seen.update(1e-2 * (k > 0))
+    motion, seen = swung(0.0, 100.0, step=1e-2, count=5)
     assert_array_equal(seen.velocity, motion.velocity)
     assert (seen.rate != motion.rate).all()
     assert seen.position is motion.position

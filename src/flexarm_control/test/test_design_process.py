@@ -4,7 +4,6 @@
 import os
 import pickle
 import signal
-import time
 from dataclasses import dataclass
 from threading import Thread
 from types import SimpleNamespace
@@ -103,8 +102,10 @@ def pid(model):
     return os.getpid()
 
 
-def sleep(model, seconds):
-    time.sleep(seconds)
+def read(model, path):
+    """What someone writes there; until then it takes."""
+    with open(path) as pipe:
+        return pipe.read()
 
 
 def scheduled(model):
@@ -133,7 +134,9 @@ def test_a_model_of_another_arm_is_not_sent(arm_r, arm_p3):
 
 
 @pytest.mark.slow
-def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_has_died(arm_r):
+def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_has_died(
+    arm_r, tmp_path
+):
     worker = DesignProcess(arm_r, niceness=3)
     try:
         assert worker.call(scheduled) == (os.SCHED_BATCH, os.nice(0) + 3)
@@ -149,9 +152,12 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         with pytest.raises(AwayError, match="has died"):
             worker.call(design, slow, FAST, CORRECTED, settings)
         assert worker.call(design, slow, FAST).feedforward is None
-        asked = []
-        with pytest.raises(TimeoutError):
-            worker.call(sleep, 0.2, waits=lambda: asked.append(1) or len(asked) < 3)
+        pipe, asked = tmp_path / "pipe", []
+        os.mkfifo(pipe)
+        with pytest.raises(TimeoutError, match="not wanted any more"):
+            worker.call(read, pipe, waits=lambda: asked.append(1) or len(asked) < 3)
+        assert len(asked) == 3
+        pipe.write_text("now")  # what nobody waits for is done before the next
         assert worker.call(pid, waits=lambda: True) in worker._pool._processes
     finally:
         worker.close()

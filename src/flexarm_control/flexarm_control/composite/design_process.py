@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import pickle
 import signal
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from threading import Lock
 
@@ -129,7 +129,8 @@ class DesignProcess:
         """``function(model, *arguments)`` in the process.
 
         The `function` is one of a module; the `arguments` and the result can be pickled, models of this arm aside.
-        Where `waits` is given, it is asked every `ASKED` whether the result is still wanted; the process ends its work.
+        Where `waits` is given, it is asked every `ASKED` whether the result is still wanted. The process goes on with
+        what is not wanted any more until that is done.
 
         Raises
         ------
@@ -143,12 +144,10 @@ class DesignProcess:
         try:
             data = dumps(arguments, self.model.arm)
             self._last = last = self._running().submit(_work, function, data)
-            while True:
-                try:
-                    return loads(last.result(None if waits is None else ASKED), self.model)
-                except TimeoutError:
-                    if last.done() or not waits():
-                        raise
+            while waits is not None and not wait([last], ASKED).done:
+                if not waits():
+                    raise TimeoutError("the result is not wanted any more")
+            return loads(last.result(), self.model)
         except BrokenProcessPool:
             self.close()
             raise AwayError(

@@ -81,6 +81,7 @@ class CompositeControl:
             self._response, self._bar = np.vstack(response), np.zeros(2 * model.n_modes)
         n, m = model.n_joints, model.n_modes
         self.slow_torque, self.fast_torque, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._wanted = np.zeros(n)
         self.quasi_steady, self.deviation = np.zeros(m), np.zeros(2 * m)
 
     @property
@@ -178,22 +179,13 @@ class CompositeControl:
         """Scale what is fed back, of all joints, so that no torque is beyond its limit; what `SlowLaw.saw` is to see.
 
         Gains from all joints to all joints are made for the direction of their torque. With one joint alone at its
-        limit the others may drive the arm on: a random arm swung up, which holds with any fraction of all gains.
+        limit the others may drive the arm on. Meanwhile all integrals wait: with less of all gains a loop may hold
+        without them alone.
         """
-        motion, limit = self.feedforward.torque, self._limit
-        beyond = np.abs(self.torque) > limit
-        if not beyond.any():
-            return self.torque
-        wanted = self.torque.copy()
-        fed_back = wanted - motion
-        left = (np.sign(wanted) * limit - motion)[beyond] / fed_back[beyond]
-        part = min(max(left.min(), 0.0), 1.0)
-        u_slow -= motion
-        u_slow *= part
-        u_slow += motion
-        u_fast *= part
-        np.add(u_slow, u_fast, out=self.torque)
-        return np.copysign(np.inf, wanted)  # no integral has anything to gain
+        scaled = kernels.compiled().together(
+            self.feedforward.torque, self._limit, u_slow, u_fast, self.torque, self._wanted
+        )
+        return self._wanted if scaled else self.torque
 
     def _goes_over(self, before, sample):
         """Whether some of the torque of the control `before`, None if there was none at this `sample`, is left."""

@@ -9,6 +9,7 @@ the arm follows the motion both are equal, and no error is left.
 The positions of the samples are what is filtered, as in the observer, and not the speeds between them: a torque that is
 held over a sample makes light hubs and fast modes swing within it, and the mean of the speeds at its ends is another.
 With it an arm on its motion was pushed off by 5 degrees.
+
 A feed-forward may know more modes than the observer does (`feedforward_modes`). What the gauges would show of its
 amplitudes :math:`\delta'` is then, with their rows R (module `flexarm_dynamics.arm.strain_map`),
 

@@ -148,20 +148,14 @@ class Preview(ModelFeedforward):
 
     def _regulated(self, known, path, start):
         """What `model` makes of a path with the arm as the control knows it, as a `Plan`: within the torque, too."""
-        settings = replace(self.settings, known=None)
-        forward, period = (
-            ModelFeedforward(known, self.manifold.of(known), settings),
-            settings.period,
-        )
+        settings, period = replace(self.settings, known=None), self.settings.period
+        forward = ModelFeedforward(known, self.manifold.of(known), settings)
         forward.limit = self.limit
         gains = gains_along(known, path, period)
         forward.take(Preparation(start, gains, gains), path.trajectory_id)
         count = int(np.ceil(path.duration_ns / SECOND / period))
-        states, torque = (
-            np.zeros((count + 1, forward.state.size)),
-            np.zeros((count + 1, start.shape[1])),
-        )
-        rates = np.zeros_like(states)
+        states, rates = np.zeros((2, count + 1, forward.state.size))
+        torque = np.zeros((count + 1, known.n_joints))
         for k in range(count + 1):
             forward.update(At(path, round(k * period * SECOND)), period if k else 0.0)
             states[k], torque[k] = forward.state, forward.torque

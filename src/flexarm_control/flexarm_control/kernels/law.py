@@ -53,6 +53,33 @@ def deviation(delta, delta_d, delta_bar, rate_bar, quasi_steady, z_f):
         z_f[m + i] = delta_d[i] - rate_bar[i]
 
 
+def together(motion, limit, slow, fast, torque, wanted):
+    """Scale what is fed back of all joints until no torque is beyond its limit; whether one was.
+
+    Parameters
+    ----------
+    motion, limit : ndarray, shape (n,)
+        What is not fed back of the torque, and the largest torques [N m].
+    slow, fast, torque : ndarray, shape (n,)
+        Their sum; all are overwritten.
+    wanted : ndarray, shape (n,)
+        Filled with the torque's signs times infinity, where one was beyond its limit.
+    """
+    part, beyond = 1.0, False
+    for i in range(torque.size):
+        if abs(torque[i]) > limit[i]:
+            beyond = True
+            bound = limit[i] if torque[i] > 0.0 else -limit[i]
+            part = min(part, max((bound - motion[i]) / (torque[i] - motion[i]), 0.0))
+    if beyond:
+        for i in range(torque.size):
+            wanted[i] = np.copysign(np.inf, torque[i])
+            slow[i] = motion[i] + part * (slow[i] - motion[i])
+            fast[i] *= part
+            torque[i] = slow[i] + fast[i]
+    return beyond
+
+
 def cubic(coefficients, knots, t, out):
     """Fill `out`, (n,), with a piecewise cubic at t; its first and last pieces go on beyond its ends.
 

@@ -264,19 +264,20 @@ def of_feedforward(arm, rate):
     mode each, the next frequencies are 10 to 20 % too high. Not where that mode is too fast, `SPREAD`. And as much of
     the kinematics of bending as the arm's loads need, within `levels.TOLERANCE` of its reach.
     """
-    modes, level = 0, "file"
-    if arm.most_modes:
-        model = build(arm.fuller(arm.most_modes + 1, False, False))
-        omega = model.frequencies(np.zeros(model.n_joints), locked=True)
-        modes = arm.most_modes + 1 if omega[-1] <= SPREAD * omega[0] else 0
-    if arm.model == "chain" and arm.most_modes:
-        first, stiffening = np.array(levels.neglected(arm)) / arm.reach
-        if first > levels.TOLERANCE:
+    if not arm.most_modes:
+        return {"feedforward_modes": 0, "feedforward_level": "file"}
+    modes = arm.most_modes + 1
+    model = build(arm.fuller(modes, False, False))
+    omega = model.frequencies(np.zeros(model.n_joints), locked=True)
+    if omega[-1] > SPREAD * omega[0]:
+        modes = 0
+    level = levels.level_of(levels.simulated(arm, negligible=levels.TOLERANCE * arm.reach))
+    if level == levels.FINITE_SLOPE:
+        model = build(arm.fuller(modes, True, True))
+        if model.n_modes * substeps(model, 1.0 / rate, METHOD) > QUICK:
             level = levels.STIFFENING
-            fullest = build(arm.fuller(modes, True, True))
-            quick = fullest.n_modes * substeps(fullest, 1.0 / rate, METHOD) <= QUICK
-            if stiffening > levels.TOLERANCE and quick:
-                level = levels.FINITE_SLOPE
+    if level == levels.level_of(arm):
+        level = "file"
     return {"feedforward_modes": modes, "feedforward_level": level}
 
 

@@ -93,7 +93,7 @@ class Drive:
     velocity: np.ndarray | None = None
 
 
-def simulated(arm, level=AUTO, drive=None):
+def simulated(arm, level=AUTO, drive=None, negligible=NEGLIGIBLE):
     """The arm as it is simulated.
 
     Parameters
@@ -101,10 +101,12 @@ def simulated(arm, level=AUTO, drive=None):
     arm : Arm
     level : str
         One of `LEVELS`. With `auto` the lowest one, yet not below its file's flags, that leaves out less than
-        `NEGLIGIBLE` under the largest loads that are known: gravity with the joints straight or one of them at right
+        `negligible` under the largest loads that are known: gravity with the joints straight or one of them at right
         angles, and the torques of the `drive`, or of the joints' limits, suddenly applied. Without limits, loads are
         unknown: `finite_slope`. Models other than `chain` have their own kinematics, and stay as they are.
     drive : Drive, optional
+    negligible : float
+        At the tip [m].
 
     Returns
     -------
@@ -118,9 +120,9 @@ def simulated(arm, level=AUTO, drive=None):
     if arm.model != "chain" or arm.finite_slope or not _bends(arm):
         return arm
     first, stiffening = neglected(arm, drive)
-    if stiffening > NEGLIGIBLE:
+    if stiffening > negligible:
         return at_level(arm, FINITE_SLOPE)
-    return arm if first <= NEGLIGIBLE else at_level(arm, STIFFENING)
+    return arm if first <= negligible else at_level(arm, STIFFENING)
 
 
 def _bends(arm):
