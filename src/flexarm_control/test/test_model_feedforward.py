@@ -167,6 +167,27 @@ def test_a_motion_that_the_first_sample_is_in_begins_at_rest(arm_r):
     assert_allclose(motion.torque, 0.0, atol=1e-9)
 
 
+def test_a_motion_says_where_it_was_put_elsewhere(arm_r):
+    """At first, and when its simulated arm is lost; looked ahead or not."""
+    motion = design(arm_r, SLOW, FAST, CORRECTED, {"feedforward": "model"}).feedforward
+    reference, placed = ReferenceGenerator(arm_r.joint_names, period=0.5), []
+    reference.start(np.zeros(1), 0)
+    reference.offer(
+        trajectory.validate(
+            arm_r.joint_names, arm_r.joint_names, 0, [(MS * 900, [1.0], [0.0], [0.0], [])]
+        )
+    )
+    for k in range(12):
+        reference.sample(k * MS)
+        if k == 6:
+            motion.state[0] += 2.0
+        motion.update(reference, 1e-3 if k else 0.0)
+        placed.append(motion.placed)
+        if k % 2 and k != 5:
+            motion.look_ahead(reference, 1e-3)
+    assert placed == [k in (0, 6) for k in range(12)]
+
+
 @pytest.mark.parametrize("change", ["friction", "weight"])
 def test_the_simulated_arm_comes_to_rest_on_the_reference(two_link, change):
     """Neither Coulomb friction nor what the manifold leaves out of the weight holds it beside."""
