@@ -1033,8 +1033,8 @@ LIMITS = [
         (
             "levels",
             "level: lower than its loads need",
-            "    if stiffening > NEGLIGIBLE:\n",
-            "    if stiffening < NEGLIGIBLE:\n",
+            "    if stiffening > negligible:\n",
+            "    if stiffening < negligible:\n",
         ),
         (
             "levels",

@@ -163,7 +163,7 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         with pytest.raises(TimeoutError, match="not wanted any more"):
             worker.call(read, pipe, waits=waits)
         assert len(asked) == 3
-        pipe.write_text("now")  # what nobody waits for is done before the next
+        pipe.write_text("now")  # what no thread waits for is done before the next
         assert worker.call(pid, waits=lambda: True) in worker._pool._processes
     finally:
         worker.close()
