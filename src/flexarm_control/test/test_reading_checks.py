@@ -217,17 +217,33 @@ def test_an_arm_with_one_gauge_can_have_the_wrong_sign():
     """The only hypothesis has no other to be compared with."""
     text = arm_file.find("R").read_text().replace("modes: 2", "modes: 1")
     arm = arm_file.parse(text[: text.rindex("  - {name: middle")])
+    assert wirings_of_a_swing(arm, lambda rows: -rows) == {None, 0}
+
+
+def test_strains_that_are_too_large_are_no_exchanged_gauges():
+    """Of a link with one mode, whose exchanged gauges make its amplitude smaller and do nothing else."""
+    text = arm_file.find("R").read_text().replace("modes: 2", "modes: 1")
+    arm = arm_file.parse(text.replace("position: 2.0", "position: 2.2"))
+
+    def larger(rows):
+        return rows * (rows @ rows) / (rows @ rows[::-1])
+
+    assert wirings_of_a_swing(arm, larger) == {None}
+
+
+def wirings_of_a_swing(arm, read):
+    """What is found while an arm with one mode swings; `read` makes the readings of an amplitude from its strains."""
     m = models.build(arm)
     map_ = StrainMap(m)
-    law = StrainLaw(Channels(m, map_), map_, 0.3)
+    law, rows = StrainLaw(Channels(m, map_), map_, 0.3), map_.rows[:, 0]
     terms, found = m.terms(np.zeros(1), np.zeros(1)), set()
-    gain = 9.0 / (terms.K2 - 9.0 * terms.M[1:, 1:])[0, 0] * terms.M[1, 0] * map_.rows[0, 0]
+    gain = 9.0 / (terms.K2 - 9.0 * terms.M[1:, 1:])[0, 0] * terms.M[1, 0]
     for k in range(2000):
         swing = 0.2 * np.sin(3.0 * PERIOD * k)
-        read = np.array([-gain * swing])
-        _, wiring = law.update(np.array([swing]), read, np.zeros(1), PERIOD, np.zeros(1))
+        strain = read(rows) * gain * swing
+        _, wiring = law.update(np.array([swing]), strain, np.zeros(1), PERIOD, np.zeros(rows.size))
         found.add(wiring)
-    assert found == {None, 0}
+    return found
 
 
 # --------------------------------------------------------------------------- rates

@@ -23,7 +23,8 @@ A hypothesis T may have begun a moment ago. The low pass is linear, so with the 
 moment, :math:`F[\varepsilon 1_{t\ge t_0}]`, it would have given
 :math:`F[\varepsilon] + (T - 1)F[\varepsilon 1_{t\ge t_0}]`. Each hypothesis is judged from the beginning, and for
 `ONSETS` moments, `EVERY` apart, that move on with time: so the filter's memory of right strains does not delay the
-answer. What an offset of a single gauge explains as well is left to `zero_drift`.
+answer. What an offset of a single gauge explains as well is left to `zero_drift`, and what a positive factor of all
+strains explains as well is no wiring: play and a wrong payload make that, and exchanged gauges of a link with one mode.
 
 A hypothesis is no answer where its strains are small beside what a free oscillation moves: what
 gauges read that are exchanged says nothing of that, so it is judged as the hypothesis reads them. Arms with light
@@ -54,6 +55,9 @@ MISFIT, PERSISTENT = 0.12, 3
 FIT, RATIO = 0.05, 5.0
 #: And smaller than that of every other hypothesis by this factor [-], in so many comparisons in a row.
 DISTINCT, CONFIRMED = 3.0, 3
+#: Nor does a wiring win where the misfit is below `FIT` with all strains of a link larger or smaller by a factor up to this
+#: [-]: a payload, a play or a stiffness that the file has not makes that.
+SCALE = 2.0
 #: Strains are judged when z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
 CLEAR, DRIVEN = 8.0, 0.5
 #: And the strains are at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
@@ -62,8 +66,8 @@ STRAINED = 0.2
 WHITE = np.sqrt(3.0 / 16.0)
 #: Moments at which a wrong wiring may have begun, and the time between them [s].
 ONSETS, EVERY = 8, 0.03
-#: Of times [s].
-ROUNDING = 1e-9
+#: Of times [s], and of squares that are divided by.
+ROUNDING, TINY = 1e-9, 1e-300
 #: Counts of an encoder are not white: largest second derivative of a low-passed step, over its size and corner^2 [-].
 STEP = 0.3
 
@@ -256,7 +260,8 @@ class StrainLaw:
         offset = concerned * residual.mean(axis=0) ** 2
         left = concerned @ (residual**2).mean(axis=0) - offset.max()
         other = np.delete(rest, best).min(initial=left / (concerned @ total))
-        if not (gain[best] > RATIO and DISTINCT * rest[best] < other):
+        distinct = DISTINCT * rest[best] < other and _scaled(z * concerned, p * concerned) > FIT
+        if not (gain[best] > RATIO and distinct):
             best = None
         self._same = self._same + 1 if best == self._best and best is not None else 1
         self._best = best
@@ -272,6 +277,13 @@ class StrainLaw:
         )
         known = (total > DRIVEN**2 * (still + swing)) & (still > STRAINED**2 * total)
         return np.where(known, misfit / np.where(known, total, 1.0), np.inf)
+
+
+def _scaled(z, p):
+    """Misfit that is left when the strains are a factor within `SCALE` larger or smaller."""
+    zz, pp, zp = (float(np.sum(part)) for part in (z * z, p * p, z * p))
+    factor = min(max(-zp / zz, 1.0 / SCALE), SCALE) if zz > 0.0 else 1.0
+    return (factor**2 * zz + 2.0 * factor * zp + pp) / max(factor**2 * zz + pp, TINY)
 
 
 def corner_of(model):
