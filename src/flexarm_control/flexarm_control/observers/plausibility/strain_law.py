@@ -55,8 +55,8 @@ MISFIT, PERSISTENT = 0.12, 3
 FIT, RATIO = 0.05, 5.0
 #: And smaller than that of every other hypothesis by this factor [-], in so many comparisons in a row.
 DISTINCT, CONFIRMED = 3.0, 3
-#: Nor does a wiring win where the misfit is below `FIT` with all strains of a link larger or smaller by a factor up to this
-#: [-]: a payload, a play or a stiffness that the file has not makes that.
+#: Nor does a wiring win where the misfit is below `FIT` with all strains of a link larger or smaller, by a factor up to
+#: this [-]: a payload, a play or a stiffness that the file has not makes that.
 SCALE = 2.0
 #: Strains are judged when z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
 CLEAR, DRIVEN = 8.0, 0.5
