@@ -103,9 +103,9 @@ def pid(model):
 
 
 def read(model, path):
-    """What someone writes there; until then it takes."""
+    """The line that someone writes there; until then it takes."""
     with open(path) as pipe:
-        return pipe.read()
+        return pipe.readline()
 
 
 def scheduled(model):
@@ -137,7 +137,9 @@ def test_a_model_of_another_arm_is_not_sent(arm_r, arm_p3):
 def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_has_died(
     arm_r, tmp_path
 ):
-    worker = DesignProcess(arm_r, niceness=3)
+    worker, pipe = DesignProcess(arm_r, niceness=3), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    held = os.fdopen(os.open(pipe, os.O_RDWR), "w", buffering=1)
     try:
         assert worker.call(scheduled) == (os.SCHED_BATCH, os.nice(0) + 3)
         slow, settings = {"type": "linear_model_following"}, {"feedforward": "model"}
@@ -152,8 +154,7 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         with pytest.raises(AwayError, match="has died"):
             worker.call(design, slow, FAST, CORRECTED, settings)
         assert worker.call(design, slow, FAST).feedforward is None
-        pipe, asked = tmp_path / "pipe", []
-        os.mkfifo(pipe)
+        asked = []
 
         def waits():
             asked.append(1)
@@ -163,10 +164,13 @@ def test_the_process_has_a_low_priority_designs_refuses_and_comes_again_when_it_
         with pytest.raises(TimeoutError, match="not wanted any more"):
             worker.call(read, pipe, waits=waits)
         assert len(asked) == 3
-        pipe.write_text("now")  # what no thread waits for is done before the next
+        held.write("now\n")
+        # What no thread waits for is done before the next.
         assert worker.call(pid, waits=lambda: True) in worker._pool._processes
     finally:
+        held.write("a failed test must not leave it reading\n")
         worker.close()
+        held.close()
 
 
 @pytest.mark.slow
