@@ -30,7 +30,7 @@ from flexarm_control.robust.design import (
 )
 from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
-from flexarm_control.robust.search import start
+from flexarm_control.robust.search import nearby, start
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
     STICKING,
@@ -229,6 +229,54 @@ def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designe
     found = design(designed.arm, QUICK)
     corner = found.sampling.torque_corner
     assert np.isfinite(corner) and found.omega_c == min(designed.omega_c, corner)
+
+
+def test_a_slow_design_goes_on_from_gains_nearby_and_is_no_slower_for_it(designed, monkeypatch):
+    monkeypatch.setattr(design_module, "SLOW", 10.0)
+    fractions = []
+    found = design(designed.arm, QUICK, progress=lambda fraction, _: fractions.append(fraction))
+    assert found.decay >= designed.decay
+    assert found.sampling == designed.sampling
+    assert found.evaluations > designed.evaluations
+    assert fractions == sorted(fractions) and 1.0 in fractions[:-1]
+
+
+def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):
+    at = ((0.0, 0.4), (0.0, 1.0))
+    settings = Settings(rate=500.0, delay=0.002, effort=0.02, configurations=at)
+    task = design_module._Task(two_link.arm, settings, Uncertainty())
+    found = task.found(None, None, -np.inf)
+    monkeypatch.setattr(design_module, "TRIES", 100)
+    monkeypatch.setattr(design_module, "SLOW", 10.0)
+    better = task.from_nearby(None, found)
+    assert len(better.K) == 2
+    assert better.decay > 1.02 * found.decay > 0.0
+
+
+class Scripted:
+    """A search that ends at the values of a list, one after the other, each at itself in all places."""
+
+    def __init__(self, values):
+        self.values, self.begun = iter(values), []
+
+    def value(self, x):
+        return -0.1
+
+    def refined(self, x, budget):
+        self.begun.append(x)
+        value = next(self.values)
+        return value, np.full(3, value)
+
+
+def test_searches_nearby_begin_at_the_best_so_far_and_end_when_it_is_enough():
+    search = Scripted((-0.12, -0.11, -0.15, -0.3, -0.4))
+    assert_allclose(nearby(search, np.ones(3), 5, 0.25), -0.3)
+    first, *others = search.begun
+    assert_allclose(first, 1.0)
+    near = np.array([-0.12, -0.12, -0.15])[:, None]
+    away = np.array(others) / near - 1.0
+    assert (away != 0.0).all() and (np.abs(away) < 0.5).all()
+    assert_allclose(nearby(Scripted((-0.05,)), np.ones(3), 1, 0.25), 1.0)
 
 
 def test_gradients_are_those_of_differences(two_link):

@@ -30,7 +30,7 @@ from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
 from .loop import Sampling
 from .noise import Noise
-from .search import ROUNDS, STARTS, TOGETHER, Search, follow, race, start
+from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
 from .uncertain import (
     Uncertainty,
     configurations,
@@ -59,13 +59,15 @@ HARDLY, FAST = 1.0, 0.5
 POOR, WORTH = 0.25, 1.2
 #: Where those reach less than this, one set for all is tried, too; the same without them [-].
 LITTLE, LEAST = 0.08, 0.05
+#: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times [-].
+SLOW, TRIES = 0.2, 6
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
 #: joints locked: a plan is integrated in steps of the fastest one [-].
 SPREAD = 1000.0
-#: Of the progress, the part of the usual search.
-USUAL = 0.6
+#: Of the progress, the end of the usual search, and of what is tried where that reaches little.
+USUAL, OTHERWISE = 0.6, 0.8
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
 #: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
@@ -417,11 +419,13 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
         short = _Task(arm, settings, uncertainty, short=True)
-        other = short.found(say.part(USUAL, 1.0), gains, LITTLE)
+        other = short.found(say.part(USUAL, OTHERWISE), gains, LITTLE)
         if max(found.decay, other.decay) < LEAST:
-            found = task.found_alone(say.part(USUAL, 1.0), gains, found)
+            found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
+    if found.decay < SLOW * task.speed:
+        found = task.from_nearby(say.part(OTHERWISE, 1.0), found)
     say.part(0.0, 1.0)(1.0, found.decay)
     return task.design(found)
 
@@ -528,7 +532,7 @@ class _Task:
 
     def _together(self, K, sampling, used):
         """`_Sets` that hold between the configurations, too, from gains K (1 or k, n, 3n + 2m) that hold in them."""
-        loops, weights = held_loops(self.nominal, self.at, sampling, self.uncertainty, len(K))
+        loops, weights = self._held(sampling, len(K))
         search = whole = self._together_search(loops, weights, sampling)
         x, relaxed = whole.slowest.scaled(K), set()
         for _ in range(ROUNDS):
@@ -540,6 +544,23 @@ class _Task:
                 break
             search = self._together_search(asked, weights, sampling)
         return self._sets(whole, x, used)
+
+    def from_nearby(self, progress, found):
+        """The best of `found` and of what the search reaches from gains nearby, see `nearby`."""
+        sampling, count = found.sampling, round(TRIES * self.settings.effort)
+        if len(self.at) == 1:
+            search, _ = self._search(sampling.torque_corner / self.omega_1, self.at)
+            x = search.slowest.scaled(found.K[0])
+        else:
+            search = self._together_search(*self._held(sampling, len(found.K)), sampling)
+            x = search.slowest.scaled(found.K)
+        x = nearby(search, x, count, SLOW * self.speed, self.settings.seed, progress)
+        better = self._sets(search, x, found.evaluations + search.evaluations)
+        return better if better.decay > found.decay else found
+
+    def _held(self, sampling, count):
+        """Loops at and between the configurations, and the weights of `count` sets of gains in each."""
+        return held_loops(self.nominal, self.at, sampling, self.uncertainty, count)
 
     def _together_search(self, loops, weights, sampling):
         wanted = self._wanted(sampling.torque_corner)

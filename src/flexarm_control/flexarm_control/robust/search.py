@@ -21,6 +21,8 @@ FIRST, MIDDLE, LAST = 80, 120, 320
 #: The same for gains at and between several configurations together, in each of so many rounds: after each, loops whose
 #: decay is within this factor of the least are asked this part from then on.
 TOGETHER, ROUNDS, NEAR, RELAXED = 120, 3, 1.15, 0.4
+#: Evaluations of all loops from each start nearby, and how far these are from the best, in parts of each gain [-].
+AGAIN, APART = 240, 0.1
 #: Loops with more states get fewer evaluations.
 SIZE = 65
 #: A width goes on for as long as it gains this fraction.
@@ -195,6 +197,37 @@ def follow(search, starts, effort=1.0):
     found = [search.refined(x, effort * FIRST, WIDTHS[:2]) for x in starts]
     value, x = min(found, key=lambda one: one[0])
     return x if value < -search.enough else search.refined(x, effort * MIDDLE)[1]
+
+
+def nearby(search, x, count, enough, seed=0, progress=None):
+    """The best scaled gains of searches that begin at x, then `count` - 1 times at random near the best so far.
+
+    The slowest pole of many loops has kinks, in which a search ends far from what gains a tenth away lead to.
+
+    Parameters
+    ----------
+    search : Search
+    x : ndarray
+    count : int
+    enough : float
+        Decay at which no further search begins [-].
+    seed : int
+    progress : callable, optional
+        Called with a fraction of the work and the decay that is reached.
+
+    Returns
+    -------
+    ndarray
+    """
+    random, best = np.random.default_rng(seed), (search.value(x), x)
+    for k in range(count):
+        if best[0] < -enough:
+            break
+        away = APART * random.standard_normal(x.size) if k else 0.0
+        best = min(best, search.refined(best[1] * (1.0 + away), AGAIN), key=lambda found: found[0])
+        if progress is not None:
+            progress((k + 1) / count, -best[0])
+    return best[1]
 
 
 def start(model, at, scale, a, late, corner=np.inf):
