@@ -159,7 +159,7 @@ def test_what_no_gains_hold_is_refused_from_the_cache_too(made):
         with pytest.raises(
             DesignError, match="controller of rigid: no gains hold all of it"
         ) as error:
-            default.default(ARM, TASK[0], wide)
+            default.default(ARM, replace(TASK[0], effort=0.01), wide)
         texts.append(str(error.value))
     assert len(made) == 1 and texts[0] == texts[1]
 
