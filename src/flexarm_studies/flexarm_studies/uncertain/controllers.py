@@ -52,7 +52,7 @@ WORDS = {
     "shipped": "the controller file that is shipped for the arm",
     "default": "the nodes' composite control with `model_following`",
     "preview": "the same with `feedforward: preview`",
-    "designed": "the next one, with `feedforward: model`",
+    "designed": "`flexarm design --feedforward model`",
     "designed_preview": "`flexarm design`",
     "pid": "joint PID",
     "pid_zv": "joint PID, ZV shaper",
