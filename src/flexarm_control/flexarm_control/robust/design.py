@@ -59,8 +59,10 @@ HARDLY, FAST = 1.0, 0.5
 POOR, WORTH = 0.25, 1.2
 #: Where those reach less than this, one set for all is tried, too; the same without them [-].
 LITTLE, LEAST = 0.08, 0.05
-#: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times [-].
-SLOW, TRIES = 0.2, 6
+#: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times, and
+#: looks at arms of which payload or stiffness alone differs, too. Then once more, for the loops that do not limit the
+#: others, of which this part is asked from then on [-].
+SLOW, TRIES, KEPT = 0.2, 6, 0.65
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
@@ -425,6 +427,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
     if found.decay < SLOW * task.speed:
+        task = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, 1.0), found)
     say.part(0.0, 1.0)(1.0, found.decay)
     return task.design(found)
@@ -468,7 +471,7 @@ class _Task:
     """One design: what is searched, in one set of gains or in several; `short`: with low passes that end the reach."""
 
     def __init__(self, arm, settings, uncertainty, short=False):
-        self._short = short
+        self.short = short
         self._low_passes = LOW_PASS[1:] if short else LOW_PASS
         self.arm, self.settings, self.uncertainty = arm, settings, uncertainty
         self.nominal = nominal = build(arm.known)
@@ -546,17 +549,19 @@ class _Task:
         return self._sets(whole, x, used)
 
     def from_nearby(self, progress, found):
-        """The best of `found` and of what the search reaches from gains nearby, see `nearby`."""
-        sampling, count = found.sampling, round(TRIES * self.settings.effort)
-        if len(self.at) == 1:
-            search, _ = self._search(sampling.torque_corner / self.omega_1, self.at)
-            x = search.slowest.scaled(found.K[0])
-        else:
-            search = self._together_search(*self._held(sampling, len(found.K)), sampling)
-            x = search.slowest.scaled(found.K)
-        x = nearby(search, x, count, SLOW * self.speed, self.settings.seed, progress)
-        better = self._sets(search, x, found.evaluations + search.evaluations)
-        return better if better.decay > found.decay else found
+        """The best of what the search reaches from the gains that were `found` and nearby, see `nearby`."""
+        loops, weights = self._held(found.sampling, len(found.K))
+        whole = self._together_search(loops, weights, found.sampling)
+        x, used = whole.slowest.scaled(found.K), found.evaluations
+        count, enough = round(TRIES * self.settings.effort), SLOW * self.speed
+        if count:
+            x = nearby(whole, x, count, enough, self.settings.seed, progress)
+            asked, _ = whole.relaxed(x, part=KEPT)
+            if asked is not None and whole.value(x) > -enough:
+                others = self._together_search(asked, weights, found.sampling)
+                x = nearby(others, x, count, enough, self.settings.seed, progress)
+                used += others.evaluations
+        return self._sets(whole, x, used + whole.evaluations)
 
     def _held(self, sampling, count):
         """Loops at and between the configurations, and the weights of `count` sets of gains in each."""
@@ -570,7 +575,7 @@ class _Task:
 
     def _wanted(self, corner):
         """What is asked of poles when the torque passes a low pass of a `corner`."""
-        reach = min(self.wanted.omega_c, corner) if self._short else self.wanted.omega_c
+        reach = min(self.wanted.omega_c, corner) if self.short else self.wanted.omega_c
         return replace(self.wanted, omega_c=reach)
 
     def _searches(self, at, gains):

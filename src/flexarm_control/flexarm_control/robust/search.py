@@ -23,6 +23,8 @@ FIRST, MIDDLE, LAST = 80, 120, 320
 TOGETHER, ROUNDS, NEAR, RELAXED = 120, 3, 1.15, 0.4
 #: Evaluations of all loops from each start nearby, and how far these are from the best, in parts of each gain [-].
 AGAIN, APART = 240, 0.1
+#: So many of them in a row may bring less than this fraction: then there are no more.
+PATIENCE, MORE = 3, 0.01
 #: Loops with more states get fewer evaluations.
 SIZE = 65
 #: A width goes on for as long as it gains this fraction.
@@ -88,7 +90,7 @@ class Search:
         """The slowest pole of all loops, with the penalties."""
         return self._with_penalty(self._each(x), x)
 
-    def relaxed(self, x, kept=()):
+    def relaxed(self, x, kept=(), part=RELAXED):
         """The loops, of which those that limit the others are asked less, and their numbers; without loops at an end.
 
         The slowest pole of all decides what a search looks for. Where a mode that torque hardly moves or a joint that
@@ -100,6 +102,8 @@ class Search:
             Scaled gains that the search has reached.
         kept : collection of int
             Numbers of loops that have been relaxed before.
+        part : float
+            Of what was asked of them [-].
         """
         each = self._each(x)
         worst = max(each)
@@ -107,7 +111,7 @@ class Search:
         if not -self.enough < worst < 0.0 or not near:
             return None, near
         return [
-            replace(loop, fraction=RELAXED * loop.fraction) if k in near else loop
+            replace(loop, fraction=part * loop.fraction) if k in near else loop
             for k, loop in enumerate(self.slowest.loops)
         ], near
 
@@ -219,12 +223,14 @@ def nearby(search, x, count, enough, seed=0, progress=None):
     -------
     ndarray
     """
-    random, best = np.random.default_rng(seed), (search.value(x), x)
+    random, best, waited = np.random.default_rng(seed), (search.value(x), x), 0
     for k in range(count):
-        if best[0] < -enough:
+        if best[0] < -enough or waited == PATIENCE:
             break
         away = APART * random.standard_normal(x.size) if k else 0.0
-        best = min(best, search.refined(best[1] * (1.0 + away), AGAIN), key=lambda found: found[0])
+        found = search.refined(best[1] * (1.0 + away), AGAIN)
+        waited = 0 if not k or best[0] - found[0] > MORE * abs(best[0]) else waited + 1
+        best = min(best, found, key=lambda one: one[0])
         if progress is not None:
             progress((k + 1) / count, -best[0])
     return best[1]

@@ -34,6 +34,8 @@ class Uncertainty:
         Of the torque on its way to the arm [-].
     delay : float
         So much later than the stated delay a torque may come, in periods [-].
+    edges : bool
+        Whether it is also looked at arms of which payload or stiffness alone differs.
     """
 
     payload: tuple = (0.7, 1.3)
@@ -41,6 +43,7 @@ class Uncertainty:
     damping: tuple = (0.3, 3.0)
     gain: tuple = (0.6, 1.7)
     delay: float = 1.0
+    edges: bool = False
 
 
 def configurations(arm, seed=0):
@@ -117,7 +120,8 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     with less gain, and one that is later. An arm with Coulomb friction also sticks, each of the three: its friction is
     a damper, as steep at rest as its smoothing makes it, and less for larger movements, by the first harmonic. What is
     stable with every part of it does not hunt. Joint speeds are filtered derivatives in all of them, as the observer's
-    are (`observer.measured_velocity`): a loop with measured speeds is another one.
+    are (`observer.measured_velocity`): a loop with measured speeds is another one. With ``uncertainty.edges`` also arms
+    of which payload or stiffness alone differs, with the delay.
 
     Parameters
     ----------
@@ -142,13 +146,20 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
         f"payload x {p:g}, stiffness x {k:g}": build(scaled(arm, p, k, d0))
         for p, k in ((1.0, 1.0), (p1, k0), (p0, k1))
     }
+    edges = {
+        f"payload x {p:g}, stiffness x {k:g}": build(scaled(arm, p, k, d0))
+        for p, k in ((p1, 1.0), (p0, 1.0), (1.0, k0), (1.0, k1))
+        if uncertainty.edges
+    }
     stated = next(iter(plants.values()))
     at_once = replace(sampling, delay=0.0)
     kinds = {"": (sampling, 1.0), ", no delay": (at_once, UNLIKELY)}
     out, here = [], "" if first == 1 else f", at configuration {first}"
     for i, q in enumerate(at, first):
-        for name, plant in plants.items():
+        for name, plant in (plants | edges).items():
             for words, (samples, fraction) in kinds.items():
+                if words and name in edges:
+                    continue
                 name_here = f"{name}{words}, at configuration {i}"
                 try:
                     out.append(sampled_loop(nominal, plant, q, samples, 1.0, name_here, fraction))
