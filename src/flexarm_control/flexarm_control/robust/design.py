@@ -60,9 +60,9 @@ POOR, WORTH = 0.25, 1.2
 #: Where those reach less than this, one set for all is tried, too; the same without them [-].
 LITTLE, LEAST = 0.08, 0.05
 #: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times, and
-#: looks at arms of which payload or stiffness alone differs, too. Then once more, for the loops that do not limit the
-#: others, of which this part is asked from then on [-].
-SLOW, TRIES, KEPT = 0.2, 6, 0.65
+#: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
+#: others, which keep this decay [-].
+SLOW, TRIES, KEPT = 0.2, 6, 0.055
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
@@ -556,7 +556,7 @@ class _Task:
         count, enough = round(TRIES * self.settings.effort), SLOW * self.speed
         if count:
             x = nearby(whole, x, count, enough, self.settings.seed, progress)
-            asked, _ = whole.relaxed(x, part=KEPT)
+            asked, _ = whole.relaxed(x, least=KEPT)
             if asked is not None and whole.value(x) > -enough:
                 others = self._together_search(asked, weights, found.sampling)
                 x = nearby(others, x, count, enough, self.settings.seed, progress)

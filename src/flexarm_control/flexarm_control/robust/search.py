@@ -90,7 +90,7 @@ class Search:
         """The slowest pole of all loops, with the penalties."""
         return self._with_penalty(self._each(x), x)
 
-    def relaxed(self, x, kept=(), part=RELAXED):
+    def relaxed(self, x, kept=(), least=0.0):
         """The loops, of which those that limit the others are asked less, and their numbers; without loops at an end.
 
         The slowest pole of all decides what a search looks for. Where a mode that torque hardly moves or a joint that
@@ -102,14 +102,16 @@ class Search:
             Scaled gains that the search has reached.
         kept : collection of int
             Numbers of loops that have been relaxed before.
-        part : float
-            Of what was asked of them [-].
+        least : float
+            Decay that they keep beside others that reach no more than now; where it is more than `RELAXED` [-].
         """
         each = self._each(x)
         worst = max(each)
         near = {k for k, v in enumerate(each) if v > NEAR * worst and k not in kept}
         if not -self.enough < worst < 0.0 or not near:
             return None, near
+        others = -max((v for k, v in enumerate(each) if k not in near), default=-np.inf)
+        part = max(RELAXED, min(least / others, 1.0)) if others > 0.0 else RELAXED
         return [
             replace(loop, fraction=part * loop.fraction) if k in near else loop
             for k, loop in enumerate(self.slowest.loops)
