@@ -433,6 +433,24 @@ LAWS = [
         ),
         ("search", "the worst loops are not chosen", "if value > most and", "if value < most and"),
         (
+            "search",
+            "searches nearby begin where the first one did",
+            "search.refined(best[1] * (1.0 + away), AGAIN)",
+            "search.refined(x * (1.0 + away), AGAIN)",
+        ),
+        (
+            "search",
+            "searches nearby go on when none brings anything",
+            "else waited + 1",
+            "else waited",
+        ),
+        (
+            "uncertain",
+            "no arm of which payload or stiffness alone differs",
+            "        if uncertainty.edges\n",
+            "        if False\n",
+        ),
+        (
             "decay",
             "the smooth maximum is none",
             "worst + w * np.log(total)",
