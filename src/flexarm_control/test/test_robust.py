@@ -30,7 +30,7 @@ from flexarm_control.robust.design import (
 )
 from flexarm_control.robust.loop import Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
-from flexarm_control.robust.search import nearby, start
+from flexarm_control.robust.search import Search, nearby, start
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
     STICKING,
@@ -256,6 +256,23 @@ def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, 
     assert better.decay > 1.02 * found.decay > 0.0
 
 
+@pytest.mark.parametrize(("least", "part"), [(0.0, 0.4), (0.06, 0.4), (0.15, 0.75), (0.3, 1.0)])
+def test_loops_that_limit_the_others_keep_the_least_decay_that_is_given(
+    two_link, monkeypatch, least, part
+):
+    """A part of what was asked, by which they are as far as the others when they have that decay."""
+    at = np.array([[0.0, 0.4], [0.0, 1.0], [0.0, 0.7]])
+    loops = [sampled_loop(two_link, two_link, q, Sampling(2e-3, 2e-3, 300.0, 300.0)) for q in at]
+    slowest = Slowest(loops, Wanted(2.75, 200.0, 3e-3), units(two_link, at, 2.75))
+    search = Search(slowest, None, 0.6)
+    monkeypatch.setattr(search, "_each", lambda x: [-0.2, -0.1, -0.25])
+    asked, near = search.relaxed(None, least=least)
+    assert near == {1}
+    assert_allclose(
+        [a.fraction / b.fraction for a, b in zip(asked, loops, strict=True)], [1.0, part, 1.0]
+    )
+
+
 class Scripted:
     """A search that ends at the values of a list, one after the other, each at itself in all places."""
 
@@ -273,22 +290,26 @@ class Scripted:
 
 def test_searches_nearby_end_when_three_bring_nothing():
     search = Scripted((-0.12, -0.12, -0.11, -0.12, -0.3))
-    assert_allclose(nearby(search, np.ones(3), 9, 0.25), -0.12)
+    assert_allclose(nearby(search, np.ones(3), 9, 0.25)[1], -0.12)
     assert len(search.begun) == 4
     search = Scripted((-0.12, -0.11, -0.15, -0.15, -0.14, -0.151, -0.3))
-    assert_allclose(nearby(search, np.ones(3), 9, 0.25), -0.151)
+    assert_allclose(nearby(search, np.ones(3), 9, 0.25)[1], -0.151)
     assert len(search.begun) == 6
 
 
 def test_searches_nearby_begin_at_the_best_so_far_and_end_when_it_is_enough():
     search = Scripted((-0.12, -0.11, -0.15, -0.3, -0.4))
-    assert_allclose(nearby(search, np.ones(3), 5, 0.25), -0.3)
+    value, x = nearby(search, np.ones(3), 5, 0.25)
+    assert value == -0.3
+    assert_allclose(x, -0.3)
     first, *others = search.begun
     assert_allclose(first, 1.0)
     near = np.array([-0.12, -0.12, -0.15])[:, None]
     away = np.array(others) / near - 1.0
     assert (away != 0.0).all() and (np.abs(away) < 0.5).all()
-    assert_allclose(nearby(Scripted((-0.05,)), np.ones(3), 1, 0.25), 1.0)
+    value, x = nearby(Scripted((-0.05,)), np.ones(3), 1, 0.25)
+    assert value == -0.1
+    assert_allclose(x, 1.0)
 
 
 def test_gradients_are_those_of_differences(two_link):

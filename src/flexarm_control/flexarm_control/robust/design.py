@@ -553,14 +553,13 @@ class _Task:
         loops, weights = self._held(found.sampling, len(found.K))
         whole = self._together_search(loops, weights, found.sampling)
         x, used = whole.slowest.scaled(found.K), found.evaluations
-        count, enough = round(TRIES * self.settings.effort), SLOW * self.speed
-        if count:
-            x = nearby(whole, x, count, enough, self.settings.seed, progress)
-            asked, _ = whole.relaxed(x, least=KEPT)
-            if asked is not None and whole.value(x) > -enough:
-                others = self._together_search(asked, weights, found.sampling)
-                x = nearby(others, x, count, enough, self.settings.seed, progress)
-                used += others.evaluations
+        rest = round(TRIES * self.settings.effort), SLOW * self.speed, self.settings.seed, progress
+        value, x = nearby(whole, x, *rest)
+        asked, _ = whole.relaxed(x, least=KEPT)
+        if asked is not None and value > -SLOW * self.speed:
+            others = self._together_search(asked, weights, found.sampling)
+            _, x = nearby(others, x, *rest)
+            used += others.evaluations
         return self._sets(whole, x, used + whole.evaluations)
 
     def _held(self, sampling, count):

@@ -206,7 +206,7 @@ def follow(search, starts, effort=1.0):
 
 
 def nearby(search, x, count, enough, seed=0, progress=None):
-    """The best scaled gains of searches that begin at x, then `count` - 1 times at random near the best so far.
+    """The best (value, scaled gains) of searches from x, then `count` - 1 times from random gains near the best so far.
 
     The slowest pole of many loops has kinks, in which a search ends far from what gains a tenth away lead to.
 
@@ -220,10 +220,6 @@ def nearby(search, x, count, enough, seed=0, progress=None):
     seed : int
     progress : callable, optional
         Called with a fraction of the work and the decay that is reached.
-
-    Returns
-    -------
-    ndarray
     """
     random, best, waited = np.random.default_rng(seed), (search.value(x), x), 0
     for k in range(count):
@@ -235,7 +231,7 @@ def nearby(search, x, count, enough, seed=0, progress=None):
         best = min(best, found, key=lambda one: one[0])
         if progress is not None:
             progress((k + 1) / count, -best[0])
-    return best[1]
+    return best
 
 
 def start(model, at, scale, a, late, corner=np.inf):
