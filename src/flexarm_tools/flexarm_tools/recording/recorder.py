@@ -24,8 +24,8 @@ PUBLISHERS = {
 }
 
 
-#: Messages that a publisher keeps for a recorder that falls behind.
-KEPT = 1000
+#: Messages that a publisher keeps for a recorder that falls behind: ten seconds of a sample each millisecond.
+KEPT = 10_000
 
 
 def keep_for_recording(node):
