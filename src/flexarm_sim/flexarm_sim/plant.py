@@ -41,7 +41,7 @@ class Plant:
         self.substeps = integrators.substeps(model, period, integrator)
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
-        self._damping, self._implicit = Damping(model), integrators.METHODS[integrator] is None
+        self._damping, self.implicit = Damping(model), integrators.METHODS[integrator] is None
         self._safe = self._damped(np.inf, np.inf)
         brake = self._brake_torques()
         refinement = self._refinement()
@@ -50,7 +50,7 @@ class Plant:
         self._drives = None  # of `advance_damped`: damping, friction table and substeps
         self._brakes = None
         if brake.any():
-            self._brakes = Brakes(model, period, brake, self._safe, self._implicit, refinement)
+            self._brakes = Brakes(model, period, brake, self._safe, self.implicit, refinement)
 
     def reset(self, position=None, delta=None):
         """Put the arm at rest at `position` [rad], bent by `delta`; by default as its weight bends it, joints held."""
@@ -155,7 +155,7 @@ class Plant:
         A joint before a flexible link turns with little inertia while the link bends. Its damping may be faster
         than the highest mode, for which the substeps are chosen.
         """
-        if self._implicit:
+        if self.implicit:
             return 1
         n = self.model.n_joints
         damped = np.linalg.inv(self._mass_matrix())[:n, :n] @ np.diag(damping)

@@ -66,12 +66,14 @@ FOUND, HOPELESS = 0.02, 4
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
 #: Number of times at which shift and torque are bounded.
 GRID = 100
-#: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s].
-KNOTS, SMALL = 80, 1e-6
+#: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s]. With fewer the
+#: rounds hardly converge where torque binds: two random arms seemed to have no plan.
+KNOTS, SMALL = 400, 1e-6
 #: Weight of the shift's acceleration, over the square of the lowest bending frequency, beside the shift.
 SMOOTHNESS = 0.01
-#: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin [rad].
-STABLE = 1.5
+#: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin; and where the
+#: arm's own motion makes that mode faster, and the first one too much [rad].
+STABLE, STABLER = 1.5, 0.75
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A mode on which the shift has less force than this of that on others is left as it is: where slopes are finite, one
@@ -134,17 +136,24 @@ class Preview(ModelFeedforward):
         known = self.settings.known
         with np.errstate(over="ignore", invalid="ignore"):  # `_finite` checks the results
             try:
-                return _Planner(model, path, start, self.limit).solve()
+                return self._solved(model, path, start)
             except DesignError:
                 if known is None:
                     raise
             # That of the arm as the control knows it is near one, and within the torque, as the manifold may not be.
             known = copy(known)
             try:
-                plan = _Planner(known, path, start, self.limit).solve()
+                plan = self._solved(known, path, start)
             except DesignError as error:
                 plan = replace(self._regulated(known, path, start), note=str(error))
             return plan.among(known, model)
+
+    def _solved(self, model, path, start):
+        """The `Plan` of a model; with shorter steps where it goes beyond all bounds."""
+        try:
+            return _Planner(model, path, start, self.limit).solve()
+        except Unbounded:
+            return _Planner(model, path, start, self.limit, STABLER).solve()
 
     def _regulated(self, known, path, start):
         """What `model` makes of a path with the arm as the control knows it, as a `Plan`: within the torque, too."""
@@ -182,19 +191,23 @@ class Preview(ModelFeedforward):
         return stop[0] + left * (state - motion[0]), stop[1] + left * (torque - motion[1])
 
 
+class Unbounded(DesignError):
+    """A motion that has no finite numbers."""
+
+
 def _finite(*arrays):
     """The arrays, if all of their numbers are finite."""
     if not all(np.isfinite(a).all() for a in arrays):
-        raise DesignError(
+        raise Unbounded(
             "the arm does not stand this motion", field="preview", hint="give it more time"
         )
     return arrays
 
 
 class _Planner:
-    """Plans one trajectory."""
+    """Plans one trajectory, in steps in which the fastest mode turns by at most a `phase` [rad]."""
 
-    def __init__(self, model, path, start, limit):
+    def __init__(self, model, path, start, limit, phase=STABLE):
         self.model, self.start, self.limit = model, start, limit
         self.stepper = model.driven_stepper(METHODS["rk4"])
         n, m = model.n_joints, model.n_modes
@@ -214,7 +227,7 @@ class _Planner:
         self.planned = omega[:slow]
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
-        self.steps = int(np.ceil(self.duration / min(step, STABLE / omega[-1])))
+        self.steps = int(np.ceil(self.duration / min(step, phase / omega[-1])))
         # The plan has fewer, where the fastest mode, which is not planned, needs short steps.
         self.stride = max(1, int(PLANNED * step * self.steps / self.duration))
         self.steps = self.stride * int(np.ceil(self.steps / self.stride))

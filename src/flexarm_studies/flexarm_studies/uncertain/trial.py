@@ -48,6 +48,8 @@ RATE = 1000.0
 MAX_ERROR = 2.0
 #: Substeps per sample up to which the explicit method is taken, and longest step of the implicit one [s].
 EXPLICIT, STEP = 4, 1e-4
+#: A run of the implicit method that is lost is repeated in steps so many times as short.
+SHORTER = 3
 #: Largest angle by which friction moves a hub in one step [rad].
 KICK = np.radians(0.01)
 
@@ -106,12 +108,9 @@ def run(case, setup, variant, seed=0):
         Ready for JSON: those of `judged`, ``lost`` with the reason where the arm was lost, or ``refused`` alone.
     """
     try:
-        loop = _prepared(case, setup, variant, seed)
-        wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
-        motion = wanted if setup.motion is None else setup.motion(loop.model)
-        loop.simulator.reset(wanted.positions[0])
-        end = 1e-9 * int(wanted.times_ns[-1])
-        record = loop.follow(motion, end + window_of(case))
+        loop, record, wanted, end = _followed(case, setup, variant, seed)
+        if loop.lost and loop.simulator.plant.implicit:
+            loop, record, wanted, end = _followed(case, setup, variant, seed, SHORTER)
     except FlexarmError as error:
         return {"refused": str(error)}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -121,6 +120,17 @@ def run(case, setup, variant, seed=0):
     if variant.sensors:
         found["noise_tip"] = of_noise_alone(case, setup, variant, wanted.positions[-1], seed)
     return found
+
+
+def _followed(case, setup, variant, seed, shorter=1):
+    """The loop after its run with steps `shorter` times as short, the record, the motion that was wanted, its end [s]."""
+    loop = _prepared(case, setup, variant, seed)
+    loop.simulator.plant.substeps *= shorter
+    wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
+    motion = wanted if setup.motion is None else setup.motion(loop.model)
+    loop.simulator.reset(wanted.positions[0])
+    end = 1e-9 * int(wanted.times_ns[-1])
+    return loop, loop.follow(motion, end + window_of(case)), wanted, end
 
 
 def of_noise_alone(case, setup, variant, q, seed=0):
