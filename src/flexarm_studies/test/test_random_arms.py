@@ -17,7 +17,7 @@ from flexarm_control.feedforward.preview import Preview
 from flexarm_control.robust.design import Settings, design
 from flexarm_control.trajectory import ReferenceGenerator, specs
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models import model
 from flexarm_studies.loop import scenario
@@ -57,8 +57,8 @@ def reference_manifold(known):
     ).manifold
 
 
-def prepared(number, kind):
-    """The arm's model, the path of its motion, and what a feed-forward makes of it; which it can follow."""
+def prepared(number, kind, torque=1.0):
+    """The arm's model, its motion's path, and what a feed-forward makes of it with a part of the torque limits."""
     case = generator.arm(number)
     known = model.build(case.read().known)
     n = known.n_joints
@@ -67,7 +67,7 @@ def prepared(number, kind):
     start[0] = motion.positions[0]
     settings = base.Settings(2e-3, start[0])
     forward = kind(known, reference_manifold(known), settings)
-    forward.limit = known.arm.torque_limits
+    forward.limit = torque * known.arm.torque_limits
     found = forward.prepare(motion, start)
     reference = ReferenceGenerator(known.joint_names)
     reference.start(start[0], 0)
@@ -95,36 +95,71 @@ def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not
 
 
 def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
-    _, _, found = prepared(23, Preview)
-    assert found.plan is None and found.note.startswith("preview: of the plan,")
+    _, _, found = prepared(10, Preview, torque=0.3)
+    assert found.plan is None and found.note.startswith("preview: ")
     assert found.gains is not None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "rests"), [(7, True), (23, False)])
-def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed(number, rests):
-    """Of arm 23 the known one has none, either: then its regulated motion."""
-    case = generator.arm(number)
+def test_a_plan_that_torque_binds_converges_where_it_is_linearised_often_enough(monkeypatch):
+    known, _, found = prepared(10, Preview, torque=0.5)
+    share = np.abs(found.plan.torque) / (0.5 * known.arm.torque_limits)
+    assert share.max() <= 1.0 and share.max(axis=0).min() > 0.94
+    monkeypatch.setattr(preview, "KNOTS", 80)
+    assert prepared(10, Preview, torque=0.5)[2].plan is None
+
+
+def planned(monkeypatch, both=False, simpler=True):
+    """What is planned for arm 10 with a mode more, where no plan of it is found; of `both`: nor of the known arm."""
+    solve, case = preview._Planner.solve, generator.arm(10)
     known = model.build(case.read().known)
-    modes = known.fuller(2)
-    fuller, n = modes.fuller(0, stiffens=True), known.n_joints
+    fuller, n = known.fuller(known.arm.most_modes + 1), known.n_joints
+
+    def refuses(self):
+        if both or self.model.n_modes > known.n_modes:
+            raise DesignError("there is none", field="preview")
+        return solve(self)
+
+    monkeypatch.setattr(preview._Planner, "solve", refuses)
     motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
     start = np.zeros((3, n))
     start[0] = motion.positions[0]
-    for simpler, planned in ((None, False), (known, True)):
-        settings = base.Settings(2e-3, start[0], simpler)
-        forward = Preview(fuller, reference_manifold(known).of(modes), settings)
-        forward.limit = known.arm.torque_limits
-        first = forward.prepare_next(motion, start, None)
-        found = forward.prepare_next(motion, start, replace(first, left=("plan",)))
-        assert (found.plan is not None) == planned
-    plan = found.plan
-    assert (not found.note) == rests
+    settings = base.Settings(2e-3, start[0], known if simpler else None)
+    forward = Preview(fuller, reference_manifold(known).of(fuller), settings)
+    forward.limit = known.arm.torque_limits
+    first = forward.prepare_next(motion, start, None)
+    return known, fuller, forward.prepare_next(motion, start, replace(first, left=("plan",)))
+
+
+@pytest.mark.parametrize(("both", "note"), [(False, ""), (True, "preview: there is none")])
+def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed(both, note, monkeypatch):
+    """Where the known one has none, either: its regulated motion."""
+    known, fuller, found = planned(monkeypatch, both)
+    plan, n = found.plan, known.n_joints
+    assert found.note == note
     assert (np.abs(plan.torque) <= known.arm.torque_limits).all()
     further = [n + i for i, name in enumerate(fuller.mode_names) if name not in known.mode_names]
     state = plan.state_at(0.5 * plan.duration)
     assert state.shape == (2 * (n + fuller.n_modes),)
     assert not state[further].any() and np.abs(state[n : n + fuller.n_modes]).max() > 1e-3
+
+
+def test_without_a_known_arm_there_is_no_other_plan(monkeypatch):
+    assert planned(monkeypatch, simpler=False)[2].plan is None
+
+
+def test_a_plan_beyond_all_bounds_is_made_again_in_shorter_steps(monkeypatch):
+    solve, steps = preview._Planner.solve, []
+
+    def diverges_at_first(self):
+        steps.append(self.steps)
+        if len(steps) == 1:
+            raise preview.Unbounded("not finite", field="preview")
+        return solve(self)
+
+    monkeypatch.setattr(preview._Planner, "solve", diverges_at_first)
+    _, _, found = prepared(10, Preview)
+    assert found.plan is not None and not found.note
+    assert len(steps) == 2 and steps[1] >= 1.9 * steps[0]
 
 
 def test_a_mode_across_the_joint_is_not_planned_where_slopes_are_finite():
@@ -275,6 +310,26 @@ def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
     assert not any(g.bits for g in plant.gauges) and not any(j.encoder_counts for j in plant.joints)
     noisy = plants.plant_of(arm, plants.VARIANTS["noisy"])
     assert noisy.gauges == arm.gauges and noisy.joints == arm.joints
+
+
+@pytest.mark.parametrize(("implicit", "steps"), [(True, [1, trial.SHORTER]), (False, [1])])
+def test_a_run_that_is_lost_is_lost_in_shorter_steps_too(implicit, steps, monkeypatch):
+    followed, tried = trial._followed, []
+
+    def loses_at_first(*given):
+        loop, *found = followed(*given)
+        tried.append(given[4] if len(given) > 4 else 1)
+        loop.lost = "the strain jumped" if len(tried) == 1 else ""
+        loop.simulator.plant.implicit = implicit
+        substeps.append(loop.simulator.plant.substeps)
+        return loop, *found
+
+    substeps = []
+    monkeypatch.setattr(trial, "_followed", loses_at_first)
+    case = arm_like_r()
+    found = trial.run(case, CONTROLLERS["default"](case), plants.VARIANTS["exact"])
+    assert tried == steps and ("lost" in found) == (not implicit)
+    assert [n / substeps[0] for n in substeps] == steps
 
 
 @pytest.mark.slow

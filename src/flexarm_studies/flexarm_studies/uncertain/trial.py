@@ -123,7 +123,7 @@ def run(case, setup, variant, seed=0):
 
 
 def _followed(case, setup, variant, seed, shorter=1):
-    """The loop after its run with steps `shorter` times as short, the record, the motion that was wanted, its end [s]."""
+    """The loop after its run with steps `shorter` times as short, the record, the motion that was wanted, its end."""
     loop = _prepared(case, setup, variant, seed)
     loop.simulator.plant.substeps *= shorter
     wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
