@@ -104,7 +104,7 @@ def test_a_plan_that_torque_binds_converges_where_it_is_linearised_often_enough(
     known, _, found = prepared(10, Preview, torque=0.5)
     share = np.abs(found.plan.torque) / (0.5 * known.arm.torque_limits)
     assert share.max() <= 1.0 and share.max(axis=0).min() > 0.94
-    monkeypatch.setattr(preview, "KNOTS", 80)
+    monkeypatch.setattr(preview, "KNOTS", (80, 80))
     assert prepared(10, Preview, torque=0.5)[2].plan is None
 
 

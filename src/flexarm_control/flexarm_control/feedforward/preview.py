@@ -60,15 +60,16 @@ FASTEST = 3.0
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
 #: A plan whose last change was more than this has not been found [rad], nor will be, where after so many rounds it is
 #: still more than `SLOW` of the first one. What is left of a smaller one is taken up by the regulator.
-FOUND, HOPELESS = 0.02, 4
+FOUND, HOPELESS = 0.02, 5
 #: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
 #: so many rounds at most.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
 #: Number of times at which shift and torque are bounded.
 GRID = 100
-#: Number of times at which the equations are linearised, and the step of the differences [rad], [rad/s]. With fewer the
-#: rounds hardly converge where torque binds: two random arms seemed to have no plan.
-KNOTS, SMALL = 400, 1e-6
+#: Number of times at which the equations are linearised, at first and anew, and the step of the differences [rad],
+#: [rad/s]. With no more than at first the rounds hardly converge where torque binds: two random arms seemed to have no
+#: plan.
+KNOTS, SMALL = (80, 400), 1e-6
 #: Weight of the shift's acceleration, over the square of the lowest bending frequency, beside the shift.
 SMOOTHNESS = 0.01
 #: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin; and where the
@@ -253,15 +254,15 @@ class _Planner:
     def solve(self):
         """The plan, after up to `ROUNDS` about the last one."""
         n = self.model.n_joints
-        c, anew, sizes = np.zeros((n, self.basis.shape[2])), True, []
+        c, knots, sizes = np.zeros((n, self.basis.shape[2])), KNOTS[0], []
         for _ in range(ROUNDS if self.model.n_modes else 0):
             self._along(c)
-            change = self._change(c, anew)
+            change = self._change(c, knots)
             c = c + change
             sizes.append(np.abs(self.basis[0] @ change.T).max())
             if sizes[-1] < CLOSE:
                 break
-            anew = len(sizes) > 1 and sizes[-1] > SLOW * sizes[-2]
+            knots = KNOTS[1] if len(sizes) > 1 and sizes[-1] > SLOW * sizes[-2] else 0
             hopeless = len(sizes) >= HOPELESS and sizes[-1] > SLOW * sizes[0]
             if sizes[-1] > FOUND and (hopeless or len(sizes) == ROUNDS):
                 raise DesignError(
@@ -326,14 +327,14 @@ class _Planner:
         """Set the motion: the reference shifted by c."""
         self.motion = self.reference + np.einsum("dtj,nj->tdn", self.basis, c)
 
-    def _linearise(self, x, v):
+    def _linearise(self, x, v, knots):
         """Derivatives of the bending's acceleration and of the joint torque along a motion, at all times.
 
         By deflection and its rate, and by the joints' position, velocity and acceleration: differences of (2) in
-        full, at `KNOTS` times and linear between.
+        full, at so many times (`knots`) and linear between.
         """
         n, m = self.model.n_joints, self.model.n_modes
-        at = 2 * np.unique(np.linspace(0, self.steps, KNOTS).astype(int))
+        at = 2 * np.unique(np.linspace(0, self.steps, knots).astype(int))
         (found,) = _finite(np.array([self._derivatives(k, x[k // 2], v[k // 2]) for k in at]))
         flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
         everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
@@ -386,12 +387,12 @@ class _Planner:
             u += np.einsum("tij,tjc->tic", matrix[2 * at], bending[:, part])
         return u
 
-    def _change(self, c, anew):
-        """Change of the shift's coefficients, (n, count); with what each does as it was, or found `anew`."""
+    def _change(self, c, knots):
+        """Change of the shift's coefficients, (n, count); with what each does as it was, or found at `knots` times."""
         x, v = _finite(*self._bend())
         at = np.unique(np.append(np.arange(0, self.steps, max(1, self.steps // GRID)), self.steps))
-        if anew:
-            self._linearise(x, v)
+        if knots:
+            self._linearise(x, v, knots)
             forced = self._respond(at)
             (self.torque_by,) = _finite(self._torque(forced, at))
             self.bends = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
