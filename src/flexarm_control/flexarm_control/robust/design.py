@@ -67,7 +67,7 @@ SLOW, TRIES, KEPT = 0.2, 6, 0.055
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
 #: joints locked: a plan is integrated in steps of the fastest one [-].
-SPREAD = 1000.0
+SPREAD = 2000.0
 #: Of the progress, the end of the usual search, and of what is tried where that reaches little.
 USUAL, OTHERWISE = 0.6, 0.8
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
