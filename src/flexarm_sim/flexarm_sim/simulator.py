@@ -39,7 +39,7 @@ PARAMETERS = (
     ),
     parameter("integrator", "dop853", choices=tuple(integrators.METHODS), read_only=True).described(
         "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode; implicit damps modes"
-        " too fast for the period, in one step."
+        " too fast for the period, in one step, which may be too long for a bent arm or a light hub (docs/dynamics.md)."
     ),
     parameter("initial_position", [0.0], "rad", -100.0, 100.0, length="joints").described(
         "Joint angles after a start or reset."

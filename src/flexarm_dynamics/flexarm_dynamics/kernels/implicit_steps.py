@@ -17,7 +17,7 @@ def spring_terms(c, state, row, step):
 
 
 def implicit_step(state, torque, change, step, substeps, stages, net, extra, friction, data):
-    r"""Advance `state` in place by a linearly implicit method that damps stiff modes: stable at any step.
+    r"""Advance `state` in place by a linearly implicit method that damps stiff modes: at rest stable at any step.
 
     A W-method of order two (Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), ROS2, gamma = 1 - 1/sqrt 2,
     L-stable in the terms taken implicitly: modal stiffness, modal damping and joint friction):
