@@ -8,17 +8,17 @@ the end of the reference. A heavier payload sags more, which joint torques can't
 error. Joint errors and vibration are. The tip is settled when it is within `TOLERANCE` of the reach from there, and
 stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
 
-Integration: dop853 where a few substeps are short enough for the highest mode. Else the implicit method in substeps of
-`STEP`: a mode of 625 Hz turns by 0.1 rad in one, and it takes faster ones out, as the current loop of a drive does. Those
-would cost a hundred substeps per sample, and the table a day. The steps are shorter where Coulomb friction would move a
-light hub farther than `KICK` in one: it turns around at the end of a step alone, and a joint would hunt that does not.
-Longer steps make arms worse than they are: in steps of 0.25 ms one hunted for ever that comes to rest in steps of 0.18 ms;
-in steps of 0.1 ms another one hunted by 0.09 deg on all plants, in steps of 0.05 ms by 0.04 deg, and rests within 0.00001
-deg in steps of 0.033 ms and of any less.
+Integration: dop853 where a few substeps are short enough for the highest mode, and for the friction of light hubs: it
+damps a joint that turns around at the rate :math:`f_cH/v_s`, with the inverse H of the mass matrix. Else the implicit
+method in substeps of `STEP`: a mode of 625 Hz turns by 0.1 rad in one, and it takes faster ones out, as the current
+loop of a drive does. Those would cost a hundred substeps per sample, and the table a day. The steps are shorter where
+Coulomb friction would move a light hub farther than `KICK` in one: it turns around at the end of a step alone. In
+longer steps joints hunt that come to rest: one by 0.25 deg in implicit steps of 0.25 ms, not in steps of 0.18 ms;
+another one by 0.09 deg in steps of 2 ms of dop853, by 0.04 deg in steps of 1 ms, not in steps of 0.67 ms.
 
-What the loads of a motion add to the stiffness of a bent arm the implicit method takes explicitly: in steps that are too
-long it makes a fast mode grow that decays. Such an arm is lost, by the method and not by its control. So a run that is
-lost is repeated in steps `SHORTER` times as short, and the arm is lost where it is lost then, too.
+What the loads of a motion add to the stiffness of a bent arm the implicit method takes explicitly: in steps that are
+too long it makes a fast mode grow that decays. Such an arm is lost, by the method and not by its control. So a run
+that is lost is repeated in steps `SHORTER` times as short, and the arm is lost where it is lost then, too.
 """
 
 from dataclasses import dataclass, replace
@@ -53,6 +53,8 @@ RATE = 1000.0
 MAX_ERROR = 2.0
 #: Substeps per sample up to which the explicit method is taken, and longest step of the implicit one [s].
 EXPLICIT, STEP = 4, 2.5e-5
+#: Rate at which friction damps a joint that turns around, times a step of dop853, at most [-].
+DAMPED = 1.0
 #: A run of the implicit method that is lost is repeated in steps so many times as short.
 SHORTER = 3
 #: Largest angle by which friction moves a hub in one step [rad].
@@ -177,7 +179,8 @@ def loop_of(case, setup, variant, seed=0):
         given["publish_joint_velocity"] = False
     rate = variant.rate or given.get("rate", RATE)
     plant = plant_of(known, variant)
-    explicit = substeps(model.build(plant), 1.0 / rate, undamped=True) <= EXPLICIT
+    count = _explicit_substeps(model.build(plant), 1.0 / rate)
+    explicit = count <= EXPLICIT
     given["level"] = levels.level_of(plant)
     given["integrator"] = "dop853" if explicit else "implicit"
     scenario = scenarios.Scenario(
@@ -193,8 +196,22 @@ def loop_of(case, setup, variant, seed=0):
     loop.MAX_ERROR = MAX_ERROR
     if not explicit:
         step = longest_step(loop.simulator.plant_model, loop.simulator.position)
-        loop.simulator.plant.substeps = int(np.ceil(1.0 / rate / step - 1e-9))
+        count = int(np.ceil(1.0 / rate / step - 1e-9))
+    loop.simulator.plant.substeps = count
     return loop
+
+
+def _explicit_substeps(plant, period):
+    """Substeps per period that dop853 needs for modes and friction."""
+    _, coulomb, smoothing = plant.friction_table().T
+    damped = np.max(_mobility(plant, np.zeros(plant.n_joints)) * coulomb / smoothing, initial=0.0)
+    return max(substeps(plant, period, undamped=True), int(np.ceil(damped * period / DAMPED)))
+
+
+def _mobility(plant, q):
+    """Diagonal of the inverse mass matrix, of the joints (n,) [1/(kg m^2)]."""
+    n = plant.n_joints
+    return np.diag(np.linalg.inv(plant.terms(q, np.zeros(n)).M))[:n]
 
 
 def longest_step(model, q):
@@ -207,9 +224,7 @@ def longest_step(model, q):
     q : ndarray, shape (n,)
         Where it begins [rad].
     """
-    n = model.n_joints
-    mobility = np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n]
-    kick = np.max(model.friction_table()[:, 1] * mobility, initial=0.0)
+    kick = np.max(model.friction_table()[:, 1] * _mobility(model, q), initial=0.0)
     return min(STEP, np.sqrt(KICK / kick)) if kick > 0.0 else STEP
 
 
