@@ -13,6 +13,8 @@ from .damping import DAMP_SPEED, Damping
 
 #: The safe action is integrated in more substeps if rate * substep of its damping exceeds this [-].
 DAMP_RATE_PER_STEP = 2.0
+#: The same for the joints' own friction, with at most so many times as many substeps: in longer ones light joints hunt.
+FRICTION_RATE_PER_STEP, MOST = 1.0, 16
 
 
 class Plant:
@@ -41,7 +43,10 @@ class Plant:
         self.substeps = integrators.substeps(model, period, integrator)
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
+        viscous, coulomb, smoothing = self._friction.T
         self._damping, self.implicit = Damping(model), integrators.METHODS[integrator] is None
+        turning = self._refined(viscous + coulomb / smoothing, FRICTION_RATE_PER_STEP)
+        self.substeps *= min(turning, MOST)
         self._safe = self._damped(np.inf, np.inf)
         brake = self._brake_torques()
         refinement = self._refinement()
@@ -149,8 +154,8 @@ class Plant:
             viscous + np.where(coulomb > self._friction[:, 1], coulomb / speed, 0.0)
         )
 
-    def _refined(self, damping):
-        """Factor of the substeps of an explicit method that keeps it stable under a damping (n,) [N m s/rad].
+    def _refined(self, damping, most=DAMP_RATE_PER_STEP):
+        """Factor of an explicit method's substeps, so that a damping (n,) [N m s/rad] has at most a rate per substep.
 
         A joint before a flexible link turns with little inertia while the link bends. Its damping may be faster
         than the highest mode, for which the substeps are chosen.
@@ -160,7 +165,7 @@ class Plant:
         n = self.model.n_joints
         damped = np.linalg.inv(self._mass_matrix())[:n, :n] @ np.diag(damping)
         fastest = np.abs(np.linalg.eigvals(damped)).max()
-        return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
+        return max(1, math.ceil(fastest * self.period / self.substeps / most))
 
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:

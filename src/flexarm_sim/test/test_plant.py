@@ -226,3 +226,35 @@ def test_the_safe_action_is_stable_where_a_joint_alone_is_light(rate, method):
     for _ in range(5000):
         fine.advance_safely()
     assert_allclose(plant.q, fine.q, atol=1e-5)
+
+
+def light_elbow(coulomb):
+    """The two-link arm with Coulomb friction [N m] at its elbow of 0.23 g m^2."""
+    shoulder, elbow = (arm := arm_file.load("two_link")).joints
+    rubbing = replace(elbow, friction=replace(elbow.friction, coulomb=coulomb))
+    return model.build(replace(arm, joints=(shoulder, rubbing)))
+
+
+def test_friction_of_a_light_joint_shortens_the_steps_of_explicit_methods():
+    counts = [
+        [Plant(light_elbow(coulomb), 1e-3, method).substeps for coulomb in (0.0, 0.01, 10.0)]
+        for method in ("dop853", "implicit")
+    ]
+    assert counts[1] == [1, 1, 1]
+    none, some, much = counts[0]
+    assert 4 * none <= some <= 6 * none and much == 16 * none
+
+
+def test_a_light_joint_with_friction_moves_as_in_short_steps():
+    def after(period, substeps=None):
+        plant = Plant(light_elbow(0.03), period)
+        plant.substeps = substeps or plant.substeps
+        plant.qd[1] = 0.005
+        for _ in range(round(0.1 / period)):
+            plant.advance(np.zeros(2))
+        return plant.qd.copy()
+
+    exact = after(5e-5)
+    assert_allclose(after(1e-3), exact, atol=1e-12)
+    # In the steps that its modes allow the joint hunts, three times as fast as it began.
+    assert np.abs(after(1e-3, substeps=1) - exact).max() > 0.01
