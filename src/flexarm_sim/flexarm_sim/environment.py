@@ -80,7 +80,7 @@ class ArmVectorEnv(object if gymnasium is None else gymnasium.vector.VectorEnv):
         models = models_of(arms, num_envs)
         different, first = {id(m): m for m in models}, models[0]
         states = np.zeros((num_envs, 2 * (first.n_joints + first.n_modes)))
-        substeps = max(integrators.substeps(m, period, method) for m in different.values())
+        substeps = max(integrators.plant_substeps(m, period, method) for m in different.values())
         self.arms = Arms(models, states, period / substeps, substeps, method, workers)
         self._n, self._modes = first.n_joints, slice(first.n_joints, first.n_joints + first.n_modes)
         bent = {key: _tip_deflection(m) / m.arm.reach for key, m in different.items()}

@@ -7,7 +7,48 @@ from scipy.integrate import solve_ivp
 from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models.fixed_step import MAX_SUBSTEPS, METHODS, PHASE_PER_STEP, substeps
 
-__all__ = ["MAX_SUBSTEPS", "METHODS", "PHASE_PER_STEP", "integrate", "substeps"]
+__all__ = [
+    "MAX_SUBSTEPS", "METHODS", "PHASE_PER_STEP", "integrate", "plant_substeps", "straight_mass_matrix", "substeps",
+    "turning_rate",
+]  # fmt: skip
+
+#: Rate at which friction damps a joint that turns around, times a substep of an explicit method, at most; and so many
+#: times as many substeps at most: in longer ones light joints hunt [-].
+FRICTION_PER_STEP, MOST = 2.0, 16
+
+
+def straight_mass_matrix(model):
+    """Mass matrix of the straight arm, (n + m, n + m)."""
+    none = np.zeros(model.n_joints)
+    if hasattr(model, "mass_matrix"):  # of a chain: all terms would compile its complex recursion
+        return model.mass_matrix(none)
+    return model.terms(none, none).M
+
+
+def turning_rate(model):
+    r"""Fastest rate at which friction damps a joint that turns around [1/s].
+
+    The largest eigenvalue of :math:`H\,\mathrm{diag}\bigl(f_v + (\max(f_c, f_b) + c\,u_{max})/v_0\bigr)`, with the
+    joints' block H of the straight arm's inverse mass matrix; see `description.Friction`.
+    """
+    levels = []
+    for joint in model.arm.joints:
+        f, limit = joint.friction, joint.limits.torque
+        load = f.load * limit if np.isfinite(limit) else 0.0
+        levels.append(f.viscous + (max(f.coulomb, f.breakaway) + load) / f.smoothing)
+    if not any(levels):
+        return 0.0
+    H = np.linalg.inv(straight_mass_matrix(model))[: len(levels), : len(levels)]
+    return float(np.abs(np.linalg.eigvals(H @ np.diag(levels))).max())
+
+
+def plant_substeps(model, period, method="dop853"):
+    """`substeps` per sample of a `period` [s], and so many that friction does not make light joints hunt."""
+    count = substeps(model, period, method)
+    if METHODS[method] is None:
+        return count
+    more = int(np.ceil(turning_rate(model) * period / count / FRICTION_PER_STEP))
+    return count * min(max(more, 1), MOST)
 
 
 def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):

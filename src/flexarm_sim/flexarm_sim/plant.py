@@ -13,8 +13,6 @@ from .damping import DAMP_SPEED, Damping
 
 #: The safe action is integrated in more substeps if rate * substep of its damping exceeds this [-].
 DAMP_RATE_PER_STEP = 2.0
-#: The same for the joints' own friction, with at most so many times as many substeps: in longer ones light joints hunt.
-FRICTION_RATE_PER_STEP, MOST = 1.0, 16
 
 
 class Plant:
@@ -33,6 +31,10 @@ class Plant:
     ----------
     state : ndarray, shape (2 (n + m),)
         (q, delta, qd, delta_d) [rad, m, rad/s, m/s].
+    substeps : int
+        Per period, while there is torque.
+    implicit : bool
+        Whether the integrator is.
     """
 
     def __init__(self, model, period, integrator="dop853"):
@@ -40,17 +42,15 @@ class Plant:
         self.model, self.period = model, period
         self.state = np.zeros(2 * (n + m))
         self.q, self.delta, self.qd, self.delta_d = np.split(self.state, [n, n + m, 2 * n + m])
-        self.substeps = integrators.substeps(model, period, integrator)
+        self.substeps = integrators.substeps(model, period, integrator)  # of the modes alone
         self._advance = model.stepper(integrators.METHODS[integrator])
         self._friction = model.friction_table()
-        viscous, coulomb, smoothing = self._friction.T
         self._damping, self.implicit = Damping(model), integrators.METHODS[integrator] is None
-        turning = self._refined(viscous + coulomb / smoothing, FRICTION_RATE_PER_STEP)
-        self.substeps *= min(turning, MOST)
         self._safe = self._damped(np.inf, np.inf)
         brake = self._brake_torques()
         refinement = self._refinement()
-        self._safe_substeps = self.substeps * refinement
+        self.substeps = integrators.plant_substeps(model, period, integrator)
+        self._safe_substeps = self.substeps * self._refinement()
         self._no_torque = np.zeros(n)
         self._drives = None  # of `advance_damped`: damping, friction table and substeps
         self._brakes = None
@@ -154,8 +154,8 @@ class Plant:
             viscous + np.where(coulomb > self._friction[:, 1], coulomb / speed, 0.0)
         )
 
-    def _refined(self, damping, most=DAMP_RATE_PER_STEP):
-        """Factor of an explicit method's substeps, so that a damping (n,) [N m s/rad] has at most a rate per substep.
+    def _refined(self, damping):
+        """Factor of the substeps of an explicit method that keeps it stable under a damping (n,) [N m s/rad].
 
         A joint before a flexible link turns with little inertia while the link bends. Its damping may be faster
         than the highest mode, for which the substeps are chosen.
@@ -163,9 +163,11 @@ class Plant:
         if self.implicit:
             return 1
         n = self.model.n_joints
-        damped = np.linalg.inv(self._mass_matrix())[:n, :n] @ np.diag(damping)
+        damped = np.linalg.inv(integrators.straight_mass_matrix(self.model))[:n, :n] @ np.diag(
+            damping
+        )
         fastest = np.abs(np.linalg.eigvals(damped)).max()
-        return max(1, math.ceil(fastest * self.period / self.substeps / most))
+        return max(1, math.ceil(fastest * self.period / self.substeps / DAMP_RATE_PER_STEP))
 
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:
@@ -173,14 +175,5 @@ class Plant:
         # Not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
 
-    def _mass_matrix(self):
-        """Of the straight arm, (n + m, n + m)."""
-        model, none = self.model, np.zeros(self.model.n_joints)
-        if hasattr(
-            model, "mass_matrix"
-        ):  # of a chain: all terms would compile its recursion on complex numbers
-            return model.mass_matrix(none)
-        return model.terms(none, none).M
-
     def _inertia(self):
-        return np.diag(self._mass_matrix())[: self.model.n_joints]
+        return np.diag(integrators.straight_mass_matrix(self.model))[: self.model.n_joints]

@@ -38,7 +38,8 @@ PARAMETERS = (
         "Control rate: samples per second of simulated time."
     ),
     parameter("integrator", "dop853", choices=tuple(integrators.METHODS), read_only=True).described(
-        "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode; implicit damps modes"
+        "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode and, up to 16 times as many,"
+        " for the friction of light joints; implicit damps modes"
         " too fast for the period, in one step, which may be too long for a bent arm or a light hub (docs/dynamics.md)."
     ),
     parameter("initial_position", [0.0], "rad", -100.0, 100.0, length="joints").described(

@@ -148,19 +148,24 @@ def test_without_a_known_arm_there_is_no_other_plan(monkeypatch):
     assert planned(monkeypatch, simpler=False)[2].plan is None
 
 
-def test_a_plan_beyond_all_bounds_is_made_again_in_shorter_steps(monkeypatch):
-    solve, steps = preview._Planner.solve, []
+@pytest.mark.parametrize("stabler", [preview.STABLER, preview.STABLE])
+def test_a_plan_beyond_all_bounds_is_made_again_in_shorter_steps_if_there_are(stabler, monkeypatch):
+    bend, steps = preview._Planner._bend, []
 
     def diverges_at_first(self):
         steps.append(self.steps)
-        if len(steps) == 1:
-            raise preview.Unbounded("not finite", field="preview")
-        return solve(self)
+        x, v = bend(self)
+        return (x, v) if self.steps > steps[0] else (np.full_like(x, np.inf), v)
 
-    monkeypatch.setattr(preview._Planner, "solve", diverges_at_first)
+    monkeypatch.setattr(preview._Planner, "_bend", diverges_at_first)
+    monkeypatch.setattr(preview, "STABLER", stabler)
     _, _, found = prepared(10, Preview)
-    assert found.plan is not None and not found.note
-    assert len(steps) == 2 and steps[1] >= 1.9 * steps[0]
+    if stabler < preview.STABLE:
+        assert found.plan is not None and not found.note
+        assert steps[1] >= 1.9 * steps[0]
+    else:
+        assert found.plan is None and "does not stand this motion" in found.note
+        assert len(steps) == 1
 
 
 def test_a_mode_across_the_joint_is_not_planned_where_slopes_are_finite():
@@ -313,23 +318,28 @@ def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
     assert noisy.gauges == arm.gauges and noisy.joints == arm.joints
 
 
-@pytest.mark.parametrize(("implicit", "steps"), [(True, [1, trial.SHORTER]), (False, [1])])
-def test_a_run_that_is_lost_is_lost_in_shorter_steps_too(implicit, steps, monkeypatch):
-    followed, tried = trial._followed, []
+@pytest.mark.parametrize(
+    ("implicit", "losses", "steps", "lost"),
+    [(True, 1, [1, 3], False), (True, 2, [1, 3], True), (False, 1, [1], True)],
+    ids=["the method's fault", "lost", "explicit"],
+)
+def test_a_run_that_is_lost_is_lost_in_shorter_steps_too(
+    implicit, losses, steps, lost, monkeypatch
+):
+    followed, tried, counts = trial._followed, [], []
 
-    def loses_at_first(*given):
-        loop, *found = followed(*given)
-        tried.append(given[4] if len(given) > 4 else 1)
-        loop.lost = "the strain jumped" if len(tried) == 1 else ""
+    def loses_at_first(case, setup, variant, seed, shorter):
+        loop, *found = followed(case, setup, variant, seed, shorter)
+        tried.append(shorter)
+        loop.lost = "the strain jumped" if len(tried) <= losses else ""
         loop.simulator.plant.implicit = implicit
         counts.append(loop.simulator.plant.substeps)
         return loop, *found
 
-    counts = []
     monkeypatch.setattr(trial, "_followed", loses_at_first)
     case = arm_like_r()
     found = trial.run(case, CONTROLLERS["default"](case), plants.VARIANTS["exact"])
-    assert tried == steps and ("lost" in found) == (not implicit)
+    assert tried == steps and ("lost" in found) == lost
     assert [n / counts[0] for n in counts] == steps
 
 

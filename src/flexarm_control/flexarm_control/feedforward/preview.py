@@ -83,7 +83,7 @@ UNMOVED = 1e-2
 #: Length of the plan's steps over that of those grid steps, at most [-].
 PLANNED = 0.25
 #: A longer motion is not planned [samples].
-MAX_STEPS = 20_000
+MAX_STEPS = 40_000
 
 
 @dataclass(frozen=True)
@@ -151,10 +151,14 @@ class Preview(ModelFeedforward):
 
     def _solved(self, model, path, start):
         """The `Plan` of a model; with shorter steps where it goes beyond all bounds."""
+        planner = _Planner(model, path, start, self.limit)
         try:
-            return _Planner(model, path, start, self.limit).solve()
+            return planner.solve()
         except Unbounded:
-            return _Planner(model, path, start, self.limit, STABLER).solve()
+            finer = _Planner(model, path, start, self.limit, STABLER)
+            if finer.steps == planner.steps:
+                raise
+            return finer.solve()
 
     def _regulated(self, known, path, start):
         """What `model` makes of a path with the arm as the control knows it, as a `Plan`: within the torque, too."""

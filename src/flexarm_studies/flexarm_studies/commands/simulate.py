@@ -13,7 +13,7 @@ import numpy as np
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import levels, model
-from flexarm_sim.integrators import METHODS, substeps
+from flexarm_sim.integrators import METHODS, plant_substeps, substeps
 
 from .. import tables
 from ..identification.prescribed import prescribed_torque
@@ -219,7 +219,7 @@ def _free(arm_model, drive, q, times, options):
     state[:n] = q
     if drive is None:
         drive = tables.Steps(np.zeros(1), np.zeros((1, n)))
-    longest = options.step / substeps(arm_model, options.step, options.method)
+    longest = options.step / plant_substeps(arm_model, options.step, options.method)
     yield state, drive.right_of(times[0])
     for begin, end in itertools.pairwise(times):
         inner = drive.times[(drive.times > begin + 1e-12) & (drive.times < end - 1e-12)]

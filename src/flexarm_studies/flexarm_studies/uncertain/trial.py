@@ -29,7 +29,7 @@ import numpy as np
 from flexarm_dynamics.arm.description import Arm
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import levels, model
-from flexarm_sim.integrators import substeps
+from flexarm_sim.integrators import substeps, turning_rate
 
 from ..loop import scenario as scenarios
 from ..loop.metrics import joint_error, residual_vibration, tip_path
@@ -115,9 +115,11 @@ def run(case, setup, variant, seed=0):
         Ready for JSON: those of `judged`, ``lost`` with the reason where the arm was lost, or ``refused`` alone.
     """
     try:
-        loop, record, wanted, end = _followed(case, setup, variant, seed)
+        shorter = 1
+        loop, record, wanted, end = _followed(case, setup, variant, seed, shorter)
         if loop.lost and loop.simulator.plant.implicit:
-            loop, record, wanted, end = _followed(case, setup, variant, seed, SHORTER)
+            shorter = SHORTER
+            loop, record, wanted, end = _followed(case, setup, variant, seed, shorter)
     except FlexarmError as error:
         return {"refused": str(error)}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -125,11 +127,12 @@ def run(case, setup, variant, seed=0):
     if loop.lost:
         return found | {"lost": loop.lost}
     if variant.sensors:
-        found["noise_tip"] = of_noise_alone(case, setup, variant, wanted.positions[-1], seed)
+        last = wanted.positions[-1]
+        found["noise_tip"] = of_noise_alone(case, setup, variant, last, seed, shorter)
     return found
 
 
-def _followed(case, setup, variant, seed, shorter=1):
+def _followed(case, setup, variant, seed, shorter):
     """The loop after its run with steps `shorter` times as short, the record, the motion that was wanted, its end."""
     loop = _prepared(case, setup, variant, seed)
     loop.simulator.plant.substeps *= shorter
@@ -140,14 +143,15 @@ def _followed(case, setup, variant, seed, shorter=1):
     return loop, loop.follow(motion, end + window_of(case)), wanted, end
 
 
-def of_noise_alone(case, setup, variant, q, seed=0):
+def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
     """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
 
     Over the last `REST` period, as ``residual_tip`` of a run of the same case, setup and variant; None where the arm
-    can't be held.
+    can't be held. The steps are `shorter` times as short as usual.
     """
     try:
         loop = _prepared(case, setup, variant, seed)
+        loop.simulator.plant.substeps *= shorter
         loop.simulator.reset(q)
         length = HOLD * window_of(case)
         points = {"times": list(SHORT), "positions": [q, q]}
@@ -203,9 +207,8 @@ def loop_of(case, setup, variant, seed=0):
 
 def _explicit_substeps(plant, period):
     """Substeps per period that dop853 needs for modes and friction."""
-    _, coulomb, smoothing = plant.friction_table().T
-    damped = np.max(_mobility(plant, np.zeros(plant.n_joints)) * coulomb / smoothing, initial=0.0)
-    return max(substeps(plant, period, undamped=True), int(np.ceil(damped * period / DAMPED)))
+    turning = int(np.ceil(turning_rate(plant) * period / DAMPED))
+    return max(substeps(plant, period, undamped=True), turning)
 
 
 def _mobility(plant, q):
