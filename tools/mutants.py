@@ -1136,7 +1136,56 @@ LIMITS = [
     ],
 ]
 
-MUTANTS = KERNELS + MODELS + LAWS + LIMITS
+RANDOM_ARMS = "flexarm_studies/test/test_random_arms.py"
+STEPS = [
+    *of(
+        "flexarm_control",
+        "feedforward",
+        RANDOM_ARMS,
+        (
+            "preview",
+            "a plan that does not converge has no more derivatives",
+            "KNOTS, SMALL = (80, 400), 1e-6",
+            "KNOTS, SMALL = (80, 80), 1e-6",
+        ),
+        (
+            "preview",
+            "a plan beyond all bounds is not made again",
+            "if finer.steps == planner.steps:",
+            "if True:",
+        ),
+    ),
+    *of(
+        "flexarm_sim",
+        "",
+        "flexarm_sim/test/test_plant.py",
+        (
+            "integrators",
+            "friction asks for no shorter steps",
+            "return count * min(max(more, 1), MOST)",
+            "return count",
+        ),
+        (
+            "integrators",
+            "breakaway is no friction",
+            "max(f.coulomb, f.breakaway)",
+            "f.coulomb",
+        ),
+    ),
+    *of(
+        "flexarm_studies",
+        "uncertain",
+        RANDOM_ARMS,
+        (
+            "trial",
+            "an arm that its integrator loses is lost",
+            "if loop.lost and loop.simulator.plant.implicit:",
+            "if False:",
+        ),
+    ),
+]
+
+MUTANTS = KERNELS + MODELS + LAWS + LIMITS + STEPS
 
 
 def places(mutant, root=ROOT):
