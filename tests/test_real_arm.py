@@ -107,8 +107,6 @@ def test_commands_of_a_section_work_as_they_are_typed(heading, typed, desk, monk
     monkeypatch.setattr(ring_damping, "MIN_RING_DOWNS", 1)
     for words in SECTIONS[heading]:
         words = [SHORTER.get(word, word) for word in words]
-        if "design" in words and heading == "Your own arm":
-            words += ["--effort", "0.1"]  # its gains are not looked at
         printed = typed(words)
         for option, name in itertools.pairwise(words):
             if option in ("--out", "--report", "--state", ">"):
