@@ -200,7 +200,8 @@ def loop_of(case, setup, variant, seed=0):
     loop.MAX_ERROR = MAX_ERROR
     if not explicit:
         step = longest_step(loop.simulator.plant_model, loop.simulator.position)
-        count = int(np.ceil(1.0 / rate / step - 1e-9))
+        # Play in a transmission may need more.
+        count = max(loop.simulator.plant.substeps, int(np.ceil(1.0 / rate / step - 1e-9)))
     loop.simulator.plant.substeps = count
     return loop
 
