@@ -520,6 +520,25 @@ def test_arms_that_miss_are_listed_with_what_they_miss():
     assert found == {"planar1_0_1": ["4"], "planar1_0_2": ["lost"], "planar1_0_3": ["1 (0.031°)"]}
 
 
+def test_arms_that_vibrate_with_noise_are_listed_with_what_limits_them():
+    rows = []
+    for n, noisy in ((0, 2e-4), (1, 2.9e-4), (25, 4e-4)):
+        arm = {"arm": generator.arm(n).name, "decay": 0.3}
+        rows.append(row(n, "designed", 1.0, residual_tip=1e-5, **arm))
+        more = {"variant": "noisy", "residual_tip": noisy, "noise_tip": 1e-4 if n else 1e-5}
+        rows.append(row(n, "designed", 1.0, **more, **arm))
+    loud = {arm: cells for arm, _, *cells in report.loud(rows, 0)}
+    assert list(loud) == ["planar1g_0_0", "spatial1g_0_25"]
+    for cells in loud.values():
+        assert len(cells) == len(report.LOUDER) - 2
+    assert loud["planar1g_0_0"][:3] == ["2.0e-04", "1.0e-05", "1.0e-05"]
+    assert loud["planar1g_0_0"][-1] is None
+    # An arm that turns about one axis and bends across both: no torque reaches one direction.
+    assert loud["spatial1g_0_25"][-1] == pytest.approx(loud["spatial1g_0_25"][-2], rel=0.01)
+    assert report.LOUD in report.text(rows, 0)
+    assert report.LOUD not in report.text(rows[2:4], 0)
+
+
 def test_arms_are_chosen_by_their_numbers(tmp_path, capsys):
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)

@@ -14,8 +14,9 @@ from flexarm_dynamics.models import model
 from flexarm_studies import workers
 from flexarm_studies.comparison import cases, command
 from flexarm_studies.comparison.controllers import Setup
+from flexarm_studies.random_arms import generator
 from flexarm_studies.store import Store, gather
-from flexarm_studies.uncertain import baselines, plants, report, runs
+from flexarm_studies.uncertain import baselines, limits, plants, report, runs
 from flexarm_studies.uncertain.trial import ArmTask, loop_of
 
 R = cases.CASES[0]
@@ -27,6 +28,33 @@ def arm():
 
 
 # --------------------------------------------------------------------------- plants
+
+
+def test_friction_holds_a_clamped_beam_up_to_its_closed_form():
+    """EI times the square of the wave number is the moment at the root per deflection of the tip of any mode."""
+    beam = arm_file.load("one_link")
+    none = replace(beam.payload, mass=0.0, inertia=np.zeros((3, 3)))
+    joint = replace(beam.joints[0], friction=replace(beam.joints[0].friction, coulomb=0.1))
+    plant = model.build(replace(beam, payload=none, joints=(joint,)))
+    length, stiffness = beam.links[0].length, beam.links[0].stiffness["y"]
+    for mode, root in zip(limits.ringing(plant, np.zeros(1)), (1.8751041, 4.6940911), strict=True):
+        moment = stiffness * (root / length) ** 2
+        assert mode.reached
+        assert mode.held == pytest.approx(0.1 / moment / np.sqrt(2.0) / length, rel=1e-6)
+        assert mode.frequency == pytest.approx(
+            root**2 * np.sqrt(stiffness / beam.links[0].mass_per_length) / length**2 / 2.0 / np.pi
+        )
+
+
+def test_no_torque_reaches_the_bending_along_a_joints_axis():
+    case = generator.arm(25)  # it turns about one axis and bends across both
+    plant = model.build(case.read())
+    modes = limits.ringing(plant, np.zeros(1))
+    hidden = [mode for mode in modes if not mode.reached]
+    assert 2 * len(hidden) == len(modes)
+    assert all(mode.held == np.inf for mode in hidden)
+    u = np.linalg.inv(plant.terms(np.zeros(1), np.zeros(1)).M)[1:, 0]
+    assert np.sum(np.abs(u) > 1e-9 * np.abs(u).max()) == len(modes) - len(hidden)
 
 
 def test_the_nominal_plant_is_the_model_but_for_its_sensors(arm):

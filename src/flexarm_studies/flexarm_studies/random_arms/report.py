@@ -6,9 +6,15 @@ from collections import Counter
 
 import numpy as np
 
+from flexarm_dynamics.models import model
+
 from .. import markdown
+from ..loop import scenario as scenarios
+from ..uncertain import plants
 from ..uncertain.controllers import BASELINES
+from ..uncertain.limits import ringing
 from ..uncertain.trial import JOINT_REST
+from . import generator
 
 #: Markers of a seed's table.
 BEGIN, END = "<!-- random arms, seed {}: begin -->", "<!-- random arms, seed {}: end -->"
@@ -26,6 +32,15 @@ MISSES = (
     " largest joint error at rest where it is more than wanted."
 )
 MISSED = "arm", "design", "decay"  # and the plants
+LOUD = (
+    "Arms whose tip vibrates more than that with noise, rms over the reach. *Exact*: the same arm without noise and"
+    " delay. *Held*: vibration of the lowest mode that torque reaches, below which friction holds the joints. A smaller"
+    " one decays with the links' own damping alone, unless the control overcomes the friction."
+)
+LOUDER = (
+    "arm", "design", "noisy", "noise alone", "exact", "held", "lowest mode that torque reaches [Hz]",
+    "that no torque reaches [Hz]",
+)  # fmt: skip
 #: Least decay that is wanted of every design, over the first locked frequency [-].
 LEAST = 0.05
 #: Settling times closer than this are equal [s].
@@ -128,6 +143,40 @@ def missed(rows):
             yield arm, controller, group[0].get("decay"), *map(_in_words, group)
 
 
+def loud(rows, seed):
+    """Cells of the table of the designs in `rows` that vibrate more with noise than is wanted, and what limits them.
+
+    Returns
+    -------
+    iterator of tuple
+        Of `LOUDER`.
+    """
+    exact = {
+        (row["number"], row["controller"]): row.get("residual_tip")
+        for row in rows
+        if row["variant"] == "exact"
+    }
+    for row in rows:
+        if "decay" not in row or not row.get("noise_tip") or _quiet(row):
+            continue
+        case = generator.arm(row["number"], seed)
+        plant = model.build(plants.plant_of(case.read(), plants.VARIANTS[row["variant"]]))
+        path = scenarios.trajectory_of(case.motion, plant, np.zeros(plant.n_joints))
+        modes = ringing(plant, np.array(path.positions[-1]))
+        free = next((mode.frequency for mode in modes if not mode.reached), None)
+        lowest = next(mode for mode in modes if mode.reached)
+        own = exact.get((row["number"], row["controller"]))
+        sizes = row["residual_tip"], row["noise_tip"], own, lowest.held
+        words = (None if size is None else f"{size:.1e}" for size in sizes)
+        yield row["arm"], row["controller"], *words, lowest.frequency, free
+
+
+def _quiet(row):
+    """Whether a run with noise vibrates at most `NOISE` times as much as noise alone makes the arm, or not at all."""
+    found, alone = row.get("residual_tip"), row.get("noise_tip")
+    return None not in (found, alone) and found <= max(NOISE * alone, STILL)
+
+
 def _in_words(row):
     if outcome(row) != "works":
         return outcome(row)
@@ -167,10 +216,6 @@ def reached(rows):
         sooner = row["settling_s"] <= best[place] + EQUAL
         return sooner and row["residual_tip"] <= max(smallest.get(place, np.inf), STILL)
 
-    def quiet(row):
-        found, alone = row.get("residual_tip"), row.get("noise_tip")
-        return None not in (found, alone) and found <= max(NOISE * alone, STILL)
-
     table = [
         line("neither refused nor lost", "all", lambda row: outcome(row) == "works"),
         line(
@@ -206,7 +251,7 @@ def reached(rows):
         line(
             f"noisy: residual at most {NOISE:g} times what noise alone makes",
             "all",
-            quiet,
+            _quiet,
             lambda row: "noise_tip" in row or (row["variant"] == "noisy"),
         ),
     ]
@@ -274,6 +319,8 @@ def text(rows, seed):
         lines += ["", *markdown.table(DECAYS, designs)]
         variants = dict.fromkeys(row["variant"] for row in rows)
         lines += ["", MISSES, "", *markdown.table((*MISSED, *variants), missed(rows))]
+        if found := list(loud(rows, seed)):
+            lines += ["", LOUD, "", *markdown.table(LOUDER, found)]
     return "\n".join([*lines, "", *reasons(rows)])
 
 
