@@ -228,7 +228,12 @@ class InProcess(Nodes):
         self.domain = self._domain.__enter__()
 
     def start(self, name, parameters=None, *, key=None, file=None, remaps=()):
-        """Make a node and activate it, unless `autostart` is false."""
+        """Make a node and activate it, unless `autostart` is false.
+
+        A controller designs in a thread: a process of its own would take seconds to start.
+        """
+        if name == "controller":
+            parameters = {"design_process": False, **(parameters or {})}
         return self.start_with(arguments(parameters, file, remaps), name, key)
 
     def start_with(self, args, name, key=None):

@@ -101,12 +101,13 @@ def loaded_cpu():
         busy.wait()
 
 
-def test_six_runs_give_the_same_samples_bit_for_bit_with_one_cpu_loaded(tmp_path):
+def test_five_runs_give_the_same_samples_bit_for_bit_with_and_without_one_cpu_loaded(tmp_path):
+    runs = record(tmp_path / "0", 0.2, repeats=2)
     with loaded_cpu():
-        runs = record(tmp_path / "0", 0.2, repeats=3) + record(tmp_path / "1", 0.2, repeats=2)
+        runs += record(tmp_path / "1", 0.2, repeats=2)
     runs.append((in_this_process(0.2), None))
     first, *others = (without_identity(samples) for samples, _ in runs)
-    assert len(others) == 5 and all(len(messages) == 301 for messages in first.values())
+    assert len(others) == 4 and all(len(messages) == 301 for messages in first.values())
     for i, again in enumerate(others, 1):
         for topic, messages in first.items():
             assert again[topic] == messages, f"run {i}, {topic}"
