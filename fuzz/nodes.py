@@ -8,13 +8,14 @@ from array import array
 from pathlib import Path
 from random import Random
 
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import SetBool, Trigger
 
 from flexarm_dynamics.arm import arm_file
 from flexarm_msgs.msg import ArmState, CompositeState, JointTorque
 from flexarm_ros.messages import set_stamp
+from flexarm_ros.session import plain
 
 from . import odd
 from .files import Parameters, declared
@@ -169,15 +170,20 @@ class Nodes:
 
     def _parameters(self):
         """Values of the controller's and observer's own parameters that may be changed."""
-        out = {}
+        wanted = {"observer": [], "controller": []}
         for prefix, group in declared().items():
             node = "observer" if prefix == "observer." else "controller"
             if prefix == "simulator ":
                 continue
             for p in group:
                 if not p.read_only and (p.kind not in ("string_array",)):
-                    name = prefix.replace("controller ", "") + p.name
-                    out[node, name] = self.bench.get(node, name)
+                    wanted[node].append(prefix.replace("controller ", "") + p.name)
+        out = {}
+        for node, names in wanted.items():
+            # Where one name is not declared, there is no value in the answer.
+            answer = self.bench.call(GetParameters, f"{node}/get_parameters", names=names)
+            for name, value in zip(names, answer.values, strict=True):
+                out[node, name] = plain(value)
         return out
 
     def parameters(self, count, tally):

@@ -30,9 +30,24 @@ def kept(tmp_path_factory):
     return tmp_path_factory.mktemp("designs")
 
 
+@pytest.fixture(scope="module")
+def searched():
+    """A search for gains that runs once for equal tasks: what is kept of designs is tested, and not the search."""
+    found, real = {}, default.design
+
+    def once(*task):
+        key = cache.key(*task)
+        if key not in found:
+            found[key] = real(*task)
+        return found[key]
+
+    return once
+
+
 @pytest.fixture(autouse=True)
-def designs(kept, monkeypatch):
+def designs(kept, searched, monkeypatch):
     monkeypatch.setattr(cache, "cache_directory", lambda: kept)
+    monkeypatch.setattr(default, "design", searched)
 
 
 @pytest.fixture
@@ -158,8 +173,8 @@ def test_laws_chosen_by_hand_and_the_papers_arms_need_no_design(path, made):
 
 def test_what_no_gains_hold_is_no_configuration(path):
     with InProcess() as nodes:
-        own = {**QUICK, **PATIENT, "design.gain": [0.001, 1000.0], "autostart": False}
-        nodes.start("controller", {"arm": path, **own})
+        own = {"design.gain": [0.001, 1000.0], "design.configurations": [0.5], "autostart": False}
+        nodes.start("controller", {"arm": path, **QUICK, **PATIENT, **own})
         nodes.nodes["controller"].trigger_configure()
         failure = nodes.nodes["controller"].failure
         assert "no gains hold all of it" in failure and "grow at" in failure
@@ -187,6 +202,7 @@ def test_while_a_design_is_made_the_node_says_so_and_answers(path, no_designs, m
         assert answers[0].level == WARN and "designing the control of" in answers[0].message
         assert "1 s so far" in answers[0].message
         assert "no torque meanwhile" in nodes.log("controller")
+        assert not nodes.nodes["controller"].failure and nodes.nodes["controller"].design
 
 
 def test_a_node_that_designs_serves_and_ends(bench, tmp_path):

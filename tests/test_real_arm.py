@@ -48,17 +48,25 @@ def command_with(*words):
     return next(c for commands in SECTIONS.values() for c in commands if set(words) <= set(c))
 
 
+@pytest.fixture(scope="session")
+def others(real_arm, tmp_path_factory):
+    """Folder of one's own recording and of another one of the arm."""
+    folder = tmp_path_factory.mktemp("recordings")
+    rows = np.loadtxt(real_arm / "exp1.csv", delimiter=",")
+    np.savetxt(folder / "run.csv", rows, fmt="%.9g", delimiter=",")
+    rows[:, 10:14] += (30.0, -20.0, 10.0, 5.0)  # another zero of each gauge
+    np.savetxt(folder / "exp2.csv", rows, fmt="%.9g", delimiter=",")
+    return folder
+
+
 @pytest.fixture
-def desk(real_arm, tmp_path, monkeypatch):
+def desk(real_arm, others, tmp_path, monkeypatch):
     """The repository's directory as the page has it, with the recording, another one, and one's own."""
     for name in ("config", "examples"):
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / "results").mkdir()
-    (tmp_path / "exp1.csv").symlink_to(real_arm / "exp1.csv")
-    rows = np.loadtxt(real_arm / "exp1.csv", delimiter=",")
-    np.savetxt(tmp_path / "run.csv", rows, fmt="%.9g", delimiter=",")
-    rows[:, 10:14] += (30.0, -20.0, 10.0, 5.0)  # another zero of each gauge
-    np.savetxt(tmp_path / "exp2.csv", rows, fmt="%.9g", delimiter=",")
+    for path in (real_arm / "exp1.csv", others / "run.csv", others / "exp2.csv"):
+        (tmp_path / path.name).symlink_to(path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -16,6 +16,9 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, ParameterError
 from flexarm_dynamics.models.model import build
 
+# Designs that are equal are made once in a process.
+pytestmark = pytest.mark.xdist_group("test_default")
+
 #: A rigid arm's design takes a fraction of a second.
 ARM = arm_file.load("rigid")
 TASK = Settings(rate=500.0, effort=0.1), Uncertainty()
@@ -153,13 +156,13 @@ def test_nothing_is_left_beside_the_design_and_a_full_disk_does_no_harm(empty_ca
 
 
 def test_what_no_gains_hold_is_refused_from_the_cache_too(made):
-    wide = replace(TASK[1], gain=(0.001, 1000.0))
-    texts = []
+    task = replace(TASK[0], effort=0.01, configurations=((0.5, 0.5), (1.0, -1.0)))
+    wide, texts = replace(TASK[1], gain=(0.001, 1000.0)), []
     for _ in range(2):
         with pytest.raises(
             DesignError, match="controller of rigid: no gains hold all of it"
         ) as error:
-            default.default(ARM, replace(TASK[0], effort=0.01), wide)
+            default.default(ARM, task, wide)
         texts.append(str(error.value))
     assert len(made) == 1 and texts[0] == texts[1]
 

@@ -237,9 +237,12 @@ PLANAR = [
     (5, "from_frequencies", "z"),
 ]
 planar_arms = pytest.mark.parametrize(("seed", "shapes", "plane"), PLANAR)
+#: sympy takes seconds for its equations: of all processes that run tests, one derives them.
+derived_once = pytest.mark.xdist_group("planar")
 STATES = 5
 
 
+@derived_once
 @planar_arms
 def test_planar_equations_of_motion(seed, shapes, plane):
     arm = Planar(seed, shapes, plane)
@@ -268,6 +271,7 @@ def test_planar_equations_of_motion(seed, shapes, plane):
         assert_vector(ours, velocity, 1e-7, "tip velocity")
 
 
+@derived_once
 @planar_arms
 def test_planar_velocity_and_elastic_forces_by_themselves(seed, shapes, plane):
     """Without gravity: elastic forces alone, then each rate alone and each pair, so that no term hides another."""
@@ -287,6 +291,7 @@ def test_planar_velocity_and_elastic_forces_by_themselves(seed, shapes, plane):
             assert_vector(ours, h, 1e-10, f"h of rates {i}, {j}", scale)
 
 
+@derived_once
 @pytest.mark.parametrize("plane", ["y", "z"])
 def test_planar_motion_stays_planar(plane):
     """Links that bend and twist out of the plane too: a mirror-symmetric motion excites none of it."""
@@ -308,6 +313,7 @@ def test_planar_motion_stays_planar(plane):
         assert np.abs(whole[out_of_plane]).max() < 1e-12 * np.abs(theirs).max()
 
 
+@derived_once
 @planar_arms
 def test_planar_control_model(seed, shapes, plane):
     """Without deflections `terms` is the linearisation about them (docstring of `ArmModel.terms`)."""

@@ -116,13 +116,14 @@ def test_speed_against_robustness_as_a_table_a_drawing_and_json(tmp_path, capsys
 
 
 def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
-    # No arm bears a torque that may be a hundredth or a hundred times what is sent.
-    wide = ["--gain", "0.01:100", "--effort", "0.1"]
+    # No arm bears a torque that may be a thousandth or a thousand times what is sent, not even in one place.
+    wide = ["--gain", "0.001:1000", "--effort", "0.1", "--at", "0.5,0.5"]
     assert main(["design", "two_link", *wide]) != 0
     printed = capsys.readouterr().err
     assert (
         "no gains hold all of it" in printed
         and "grow at" in printed
+        and "with gain x" in printed
         and ("sample faster" in printed or "narrow" in printed)
     )
 
